@@ -1,0 +1,71 @@
+# make demo   track the packaged clip with the shipped weights      make test   everything CI runs
+# Sets itself up in $(VENV) with pip; a second run does not touch the network.
+
+PYTHON ?= python3
+VENV ?= .venv
+WORKERS ?= 2
+DEMO_OUT ?= outputs/demo
+
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt
+BASE := $(VENV)/.installed-base
+ALL := $(VENV)/.installed-all
+CHECK_RENDERER := $(BIN)/python -c "from quest.render_device import prepare_renderer; prepare_renderer()"
+
+export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
+
+.PHONY: demo test lint format types pytest render-deps clean help
+.DELETE_ON_ERROR:
+
+help:
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | render-deps | clean"
+
+demo: $(BASE)
+	$(BIN)/quest track sample --out $(DEMO_OUT)
+	@echo "Watch $(DEMO_OUT)/overlay.mp4; $(DEMO_OUT)/tracks.parquet has one row per frame and entity."
+
+test: lint types pytest
+
+lint: $(ALL)
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+
+format: $(ALL)
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+types: $(ALL)
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do.
+pytest: $(ALL) render-deps
+	$(BIN)/python -m pytest -n $(WORKERS) --jaxtyping-packages=quest,beartype.beartype
+	$(BIN)/python -m pytest -n $(WORKERS)
+
+render-deps: $(BASE)
+	@$(CHECK_RENDERER) 2>/dev/null || { \
+	  if ! command -v apt-get >/dev/null; then \
+	    echo "no Vulkan driver and no apt-get here: install Chromium or Google Chrome (for SwiftShader) and the" >&2; \
+	    echo "Vulkan loader with your package manager, then run 'quest doctor'" >&2; exit 1; fi; \
+	  sudo=; [ "$$(id -u)" = 0 ] || sudo=sudo; \
+	  echo "no Vulkan driver can render here: installing SwiftShader (Debian's chromium) and the Vulkan loader"; \
+	  $$sudo apt-get update -qq && \
+	  $$sudo env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends chromium libvulkan1 >/dev/null && \
+	  $(CHECK_RENDERER); }
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11 or newer is needed; name one with: make PYTHON=/path/to/python3" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(BASE): pyproject.toml constraints.txt | $(BIN)/python
+	$(PIP) --editable .
+	@touch $@
+
+$(ALL): pyproject.toml constraints.txt $(BASE)
+	$(PIP) --editable ".[sim,train,dev]"
+	@touch $@
+
+clean:
+	rm -rf build dist outputs .pytest_cache .ruff_cache .hypothesis src/*.egg-info
+	find src tests -name __pycache__ -type d -exec rm -rf {} +

@@ -1,0 +1,36 @@
+"""QueST follows entities on articulated objects in RGB-D video with persistent semantic queries."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from quest.errors import QuestError
+from quest.types import LABELS, Camera, Clip, Frame, Query, State, Tracks
+
+if TYPE_CHECKING:
+    from quest.track import Stream, StreamState, Tracker, load
+
+__version__ = "0.1.0"
+__all__ = [
+    "LABELS",
+    "Camera",
+    "Clip",
+    "Frame",
+    "Query",
+    "QuestError",
+    "State",
+    "Stream",
+    "StreamState",
+    "Tracker",
+    "Tracks",
+    "load",
+]
+
+
+def __getattr__(name: str) -> object:
+    """The tracker is imported when it is first asked for, because it brings torch."""
+    if name in {"Stream", "StreamState", "Tracker", "load"}:
+        from quest import track
+
+        return getattr(track, name)
+    raise AttributeError(f"module 'quest' has no attribute {name!r}")

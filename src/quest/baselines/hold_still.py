@@ -1,0 +1,67 @@
+"""The baseline that any tracker has to beat: the first position for ever."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+
+from quest.baselines.point_queries import check_point_queries, depth_flags, lift_pixels, query_names
+from quest.geometry import project, transform
+from quest.types import Clip, Query, State, Tracks
+
+
+class HoldStill:
+    """Answers every frame with the position of the query.
+
+    The pixel is lifted once, at the query's frame; the world point then stays, and a moving camera sees it elsewhere.
+    Without depth the pixel stays.
+    """
+
+    name = "hold-still"
+    protocols = ("point",)
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """Hold the position of each point query.
+
+        Args:
+            clip: frames; depth is needed at the queries' frames for world points.
+            queries: point queries.
+
+        Returns:
+            One track per query; NaN before its frame. Missing depth is told in ``frame_flags``.
+
+        Raises:
+            ConfigError: a query that is not a point.
+            InputError: a query outside the clip.
+        """
+        first, uv_first = check_point_queries(clip, queries, tracker=self.name)
+        assert queries is not None
+        t, k = len(clip), len(queries)
+        asked = np.arange(t)[:, None] >= first
+        uv_px = np.broadcast_to(uv_first, (t, k, 2)).astype(np.float32)
+        at_first = lift_pixels(clip, uv_px)[first, np.arange(k)]
+        point_world = np.where(asked[..., None], at_first, np.nan).astype(np.float32)
+        flags = depth_flags(clip, queries, point_world)
+        seen = _project(clip, point_world)
+        uv_px = np.where(np.isfinite(seen), seen, uv_px)
+        return Tracks(
+            names=query_names(queries),
+            labels=tuple(q.label for q in queries),
+            uv_px=np.where(asked[..., None], uv_px, np.nan).astype(np.float32),
+            point_world=point_world,
+            confidence=asked.astype(np.float32),
+            visible=asked,
+            state=np.where(asked, State.TRACKING.value, State.LOST.value),
+            stamp_s=clip.stamp_s,
+            frame_flags=flags,
+        )
+
+
+def _project(clip: Clip, point_world: Float32[np.ndarray, "T K 3"]) -> Float32[np.ndarray, "T K 2"]:
+    """Pixels of world points in each frame; NaN where there is no point in front of the camera."""
+    cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).to(torch.float64)
+    point_cam = transform(cam_from_world[:, None], torch.from_numpy(point_world).to(torch.float64))
+    return project(point_cam, clip.camera).numpy().astype(np.float32)

@@ -1,0 +1,107 @@
+"""What every baseline does at its door: accept point queries, and lift pixels by the clip's depth."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, Int
+
+from quest.errors import ConfigError, InputError
+from quest.geometry import invert, lift, transform
+from quest.types import Clip, Query
+
+NO_DEPTH = "clip without depth: world points are missing"
+NO_FIRST_DEPTH = "query {name!r}: no depth around its pixel at frame {frame}; world points are missing until there is"
+
+
+def check_point_queries(
+    clip: Clip, queries: Sequence[Query] | None, *, tracker: str
+) -> tuple[Int[np.ndarray, " K"], Float32[np.ndarray, "K 2"]]:
+    """Frame and pixel of each query.
+
+    Raises:
+        ConfigError: no queries (discovery), or a query that is not a point.
+        InputError: a query's frame or pixel is outside the clip.
+    """
+    if queries is None or any(q.kind != "point" for q in queries):
+        asked = "discovery (no query)" if queries is None else next(q.kind for q in queries if q.kind != "point")
+        raise ConfigError(
+            f"tracker {tracker!r}: expected point queries, got {asked}; baselines only have the protocol 'point'"
+        )
+    w, h = clip.camera.width, clip.camera.height
+    for q in queries:
+        assert q.uv_px is not None  # a point query carries a pixel by construction
+        if q.frame >= len(clip):
+            raise InputError(f"query {q.name!r}: expected a frame below {len(clip)} of {clip.name!r}, got {q.frame}")
+        if not (0 <= q.uv_px[0] <= w and 0 <= q.uv_px[1] <= h):
+            raise InputError(f"query {q.name!r}: expected a pixel within {w} x {h}, got {q.uv_px}")
+    frame = np.array([q.frame for q in queries], dtype=np.int64)
+    uv_px = np.array([q.uv_px for q in queries], dtype=np.float32).reshape(-1, 2)
+    return frame, uv_px
+
+
+def query_names(queries: Sequence[Query]) -> tuple[str, ...]:
+    """Name of each answer; made up where the query has none."""
+    return tuple(q.name or f"point-{i}" for i, q in enumerate(queries))
+
+
+def lift_pixels(clip: Clip, uv_px: Float32[np.ndarray, "T K 2"], *, window_px: int = 3) -> Float32[np.ndarray, "T K 3"]:
+    """World points of pixels, by the median of the valid depths in a small window.
+
+    The median keeps one stray pixel at a depth edge from throwing the point onto the background.
+
+    Args:
+        clip: frames with depth.
+        uv_px: pixel per frame and query; NaN where there is none.
+        window_px: odd side of the window, pixels.
+
+    Returns:
+        Metres; NaN where the pixel is missing or outside the image, or has no depth around it.
+    """
+    if clip.depth_m is None:
+        return np.full((*uv_px.shape[:2], 3), np.nan, dtype=np.float32)
+    height, width = clip.depth_m.shape[1:]
+    column, row = np.floor(np.nan_to_num(uv_px, nan=-1e6)).astype(np.int64).transpose(2, 0, 1)
+    # A pixel on the right or lower border belongs to the last column or row.
+    column = np.where(uv_px[..., 0] == width, width - 1, column)
+    row = np.where(uv_px[..., 1] == height, height - 1, row)
+    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    reach = np.arange(window_px) - window_px // 2
+    rows = row[..., None, None] + reach[:, None]
+    columns = column[..., None, None] + reach[None, :]
+    valid = (rows >= 0) & (rows < height) & (columns >= 0) & (columns < width) & inside[..., None, None]
+    frames = np.arange(len(clip))[:, None, None, None]
+    depth_m = clip.depth_m[frames, np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1)]
+    depth_m = np.where(valid & np.isfinite(depth_m) & (depth_m > 0), depth_m, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", category=RuntimeWarning)  # a window without depth has a NaN median: wanted
+        middle_m = np.nanmedian(depth_m, axis=(-2, -1)).astype(np.float32)
+    point_cam = lift(torch.from_numpy(np.ascontiguousarray(uv_px)), torch.from_numpy(middle_m), clip.camera)
+    world_from_cam = invert(torch.from_numpy(np.ascontiguousarray(clip.cam_from_world))).to(torch.float64)
+    point_world = transform(world_from_cam[:, None], point_cam.to(torch.float64))
+    return point_world.numpy().astype(np.float32)
+
+
+def depth_flags(clip: Clip, queries: Sequence[Query], point_world: Float32[np.ndarray, "T K 3"]) -> tuple[str, ...]:
+    """In words, what missing depth does to the answers."""
+    if clip.depth_m is None:
+        return (NO_DEPTH,)
+    names = query_names(queries)
+    return tuple(
+        NO_FIRST_DEPTH.format(name=names[k], frame=q.frame)
+        for k, q in enumerate(queries)
+        if not np.isfinite(point_world[q.frame, k]).all()
+    )
+
+
+def hold_last(point: Float[np.ndarray, "T K C"], *, first: Int[np.ndarray, " K"]) -> Float[np.ndarray, "T K C"]:
+    """Replace missing points by the last one before them; frames before ``first`` stay missing."""
+    t, k = point.shape[:2]
+    frames = np.arange(t)[:, None]
+    known = np.isfinite(point).all(axis=-1) & (frames >= first)
+    last = np.maximum.accumulate(np.where(known, frames, -1), axis=0)
+    held = point[np.maximum(last, 0), np.arange(k)]
+    return np.where((last >= 0)[..., None], held, np.nan).astype(point.dtype)

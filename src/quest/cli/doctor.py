@@ -1,0 +1,208 @@
+"""``quest doctor``: what this machine can do, and what to install for the rest."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from quest.errors import QuestError
+from quest.extras import EXTRA_OF, explain_missing, install_command, is_installed
+
+Status = Literal["ok", "optional", "broken"]
+
+SIGNS: dict[Status, str] = {"ok": "[green]ok[/]", "optional": "[yellow]-[/]", "broken": "[bold red]NO[/]"}
+
+MIN_FREE_GB = 1.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the table.
+
+    Attributes:
+        part: what was looked at.
+        status: ``broken`` only if the base install cannot track without it.
+        found: what there is.
+        remedy: what to do about it, if anything.
+    """
+
+    part: str
+    status: Status
+    found: str
+    remedy: str = ""
+
+
+@dataclass(frozen=True)
+class Doctor:
+    """Print what this machine can do: renderer, torch and devices, weights, optional parts."""
+
+    render: bool = False
+    """Render a few frames as well (takes up to half a minute without a GPU)."""
+
+    def run(self) -> int:
+        """Print the table; 0 if a recorded clip can be tracked here, else 1."""
+        checks: list[Callable[[], Iterator[Finding]]] = [
+            _python,
+            _torch,
+            _video,
+            _weights,
+            _renderer,
+            *([_test_render] if self.render else []),
+            _objects,
+            _extras,
+            _disk,
+        ]
+        findings = [finding for check in checks for finding in check()]
+        table = Table(
+            "", "part", "found", title="What this machine can do", title_justify="left", box=None, pad_edge=False
+        )
+        for finding in findings:
+            table.add_row(SIGNS[finding.status], escape(finding.part), escape(finding.found))
+        console = Console(highlight=False)
+        console.print(table)
+        for finding in findings:
+            if finding.remedy:
+                console.print(
+                    f"\n{SIGNS[finding.status]} {escape(finding.part)}: {escape(finding.remedy)}", soft_wrap=True
+                )
+        console.print()
+        broken = [finding.part for finding in findings if finding.status == "broken"]
+        if broken:
+            console.print(f"[bold red]cannot track recordings here[/]: {', '.join(broken)}")
+            return 1
+        console.print("[green]ready to track recordings[/]")
+        return 0
+
+
+def _python() -> Iterator[Finding]:
+    from quest import __version__
+
+    yield Finding("quest", "ok", f"{__version__} at {Path(__file__).parents[1]}")
+    yield Finding("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.machine()}")
+
+
+def _torch() -> Iterator[Finding]:
+    try:
+        import torch
+    except (ImportError, OSError) as error:
+        yield Finding("torch", "broken", str(error), "pip install --constraint constraints.txt quest-tracker")
+        return
+    yield Finding("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} of {os.cpu_count()} threads")
+    capability = torch.backends.cpu.get_cpu_capability()
+    fast = "native" if torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported() else "emulated"
+    yield Finding("cpu", "ok", f"{platform.processor() or platform.machine()}, {capability}, bfloat16 {fast}")
+    for index in range(torch.cuda.device_count()):
+        properties = torch.cuda.get_device_properties(index)
+        bf16 = "yes" if torch.cuda.is_bf16_supported() else "no"
+        memory_gib = properties.total_memory / 2**30
+        yield Finding(f"cuda:{index}", "ok", f"{properties.name}, {memory_gib:.0f} GiB, bfloat16 {bf16}")
+    if torch.backends.mps.is_available():
+        yield Finding("mps", "ok", "Apple GPU")
+    elif not torch.cuda.is_available():
+        yield Finding("gpu", "optional", "none that torch can use; everything runs on the CPU")
+
+
+def _video() -> Iterator[Finding]:
+    remedy = "pip install --force-reinstall av"
+    try:
+        import av
+    except (ImportError, OSError) as error:
+        yield Finding("video", "broken", f"PyAV cannot be imported: {error}", remedy)
+        return
+    try:
+        av.Codec("h264", "r")
+        encoder = av.Codec("libx264", "w").name
+    except ValueError:  # PyAV's error for an unknown codec
+        yield Finding("video", "broken", f"PyAV {av.__version__} cannot read or write H.264", remedy)
+        return
+    yield Finding("video", "ok", f"PyAV {av.__version__} with FFmpeg inside, H.264 by {encoder}")
+
+
+def _weights() -> Iterator[Finding]:
+    try:
+        from quest.model.weights import shipped_weights
+    except (ImportError, OSError):
+        return  # torch is broken, which is reported already
+    shipped = shipped_weights()
+    for name, path in shipped.items():
+        with path.open("rb") as file:
+            digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
+        yield Finding("weights", "ok", f"{name}, {path.stat().st_size / 1e6:.1f} MB, sha256 {digest}")
+    if not shipped:
+        yield Finding("weights", "broken", "none in the package", "reinstall quest-tracker, or train your own")
+
+
+def _renderer() -> Iterator[Finding]:
+    from quest.render_device import REMEDY, find_vulkan_icd
+
+    try:
+        driver = find_vulkan_icd()
+    except QuestError as error:
+        yield Finding("renderer", "optional", str(error))
+        return
+    if driver is None:
+        yield Finding("renderer", "optional", "no Vulkan driver can render (needed to generate takes)", REMEDY)
+    else:
+        yield Finding("renderer", "ok", f"{driver}{'' if driver.on_gpu is not False else ', on the CPU'}")
+
+
+def _test_render() -> Iterator[Finding]:
+    start_s = time.monotonic()
+    try:
+        from quest.sim.generate import TakeSettings, generate_take
+        from quest.sim.objects import load_object
+        from quest.sim.procedural import CATEGORIES, make_object
+        from quest.sim.renderer import Renderer
+
+        with tempfile.TemporaryDirectory() as folder:
+            sim_object = load_object(make_object(CATEGORIES[0], 0, Path(folder) / "object"))
+            settings = TakeSettings(views=1, size=64, every=8)
+            take = generate_take(sim_object, 1, 0, renderer=Renderer(), settings=settings)
+    except QuestError as error:
+        yield Finding("render test", "optional", str(error))
+        return
+    except ModuleNotFoundError as error:
+        yield Finding("render test", "optional", str(explain_missing(error) or error))
+        return
+    seconds = time.monotonic() - start_s
+    contrast = int(take.views[0].clip.rgb.std())
+    yield Finding("render test", "ok", f"{len(take)} frames in {seconds:.0f} s with shaders, contrast {contrast}")
+
+
+def _objects() -> Iterator[Finding]:
+    named = os.environ.get("QUEST_OBJECTS", "")
+    if not named:
+        yield Finding("objects", "optional", "QUEST_OBJECTS is not set", "name a folder of PartNet-Mobility objects")
+        return
+    count = sum(1 for _ in Path(named).glob("*/mobility.urdf"))
+    if count:
+        yield Finding("objects", "ok", f"{count} object folders in {named}")
+    else:
+        yield Finding("objects", "optional", f"no object folder in {named}", "correct QUEST_OBJECTS, or unset it")
+
+
+def _extras() -> Iterator[Finding]:
+    for extra in dict.fromkeys(EXTRA_OF.values()):
+        missing = [module for module, owner in EXTRA_OF.items() if owner == extra and not is_installed(module)]
+        if missing:
+            yield Finding(f"[{extra}]", "optional", f"missing: {', '.join(missing)}", install_command(extra))
+        else:
+            yield Finding(f"[{extra}]", "ok", "installed")
+
+
+def _disk() -> Iterator[Finding]:
+    free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
+    few = free_gb < MIN_FREE_GB
+    yield Finding("disk", "optional" if few else "ok", f"{free_gb:.0f} GB free here", "make room" if few else "")

@@ -1,0 +1,195 @@
+"""``quest eval``: track takes of a store under the protocols and print what came of it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from rich.console import Console
+
+    from quest.data.store import TakeStore
+    from quest.evaluation.protocols import ClipTracker
+    from quest.evaluation.results import Results, Run
+    from quest.evaluation.runner import Evaluated
+    from quest.evaluation.selection import SplitPart
+
+TrackerName = Literal["quest", "lk", "hold-still"]
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Evaluate trackers on takes: a table in the terminal and, with --out, a result file.
+
+    The protocol point always has the tracker hold-still for comparison. Baselines do not have the protocol semantic.
+
+    Attributes:
+        takes: folder of the take store.
+        protocol: point (the true pixel is given) and semantic (nothing is given).
+        trackers: what to compare.
+        weights: name or file of the weights of the tracker quest.
+        split: parts of the object split; training objects are reported only if train is named here.
+        level: levels to evaluate; all by default.
+        objects: object ids to evaluate; all by default.
+        same_objects: keep only objects that have takes of every level, so that levels compare.
+        resamples: of the bootstrap over objects.
+        seed: of the bootstrap.
+        out: result file (.json); the per-frame records go beside it (.records.parquet).
+    """
+
+    takes: Path
+    protocol: tuple[Literal["point", "semantic"], ...] = ("point",)
+    trackers: tuple[TrackerName, ...] = ("quest", "lk", "hold-still")
+    weights: str = "quest-s16"
+    split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation", "test", "unlisted")
+    level: tuple[int, ...] = ()
+    objects: tuple[str, ...] = ()
+    same_objects: bool = False
+    resamples: int = 1000
+    seed: int = 0
+    out: Path | None = None
+
+    def run(self) -> int:
+        """Evaluate, print the table, write the file.
+
+        Raises:
+            ConfigError: nothing to evaluate, or settings out of range.
+            TakeError: the store is missing or a take is torn.
+            WeightsError: the weights cannot be loaded.
+        """
+        from rich.console import Console
+
+        from quest.errors import ConfigError
+        from quest.evaluation.results import write_results
+        from quest.evaluation.selection import select_takes
+        from quest.evaluation.tables import FULL_WIDTH, results_table
+
+        if not self.protocol or not self.trackers or self.resamples < 1:
+            raise ConfigError(
+                f"eval: expected a protocol, a tracker and resamples >= 1, got {self.protocol}, {self.trackers}, "
+                f"{self.resamples}"
+            )
+        if self.out is not None and self.out.suffix != ".json":
+            raise ConfigError(f"eval: expected --out to end in .json, got {self.out}")
+        start_s = time.monotonic()
+        store, broken = self._open_store()
+        chosen = select_takes(
+            store.infos(), split=self.split, levels=self.level, objects=self.objects, same_objects=self.same_objects
+        )
+        trackers = self._load_trackers()
+        console = Console(stderr=True)
+        found = self._evaluate(store, chosen, trackers, console)
+        results = self._results(found, broken, self._run(store, chosen, trackers, start_s))
+        output = Console()
+        if not output.is_terminal:  # a file or pipe has no width of its own: show every column
+            output = Console(width=FULL_WIDTH)
+        output.print(results_table(results, width=output.width))
+        if self.out is not None:
+            write_results(results, self.out, records=found.records)
+            console.print(f"wrote {self.out}", highlight=False)
+        return 0
+
+    def _open_store(self) -> tuple[TakeStore, list[str]]:
+        """The store, and the names of its torn takes."""
+        from quest.data.store import TakeStore
+        from quest.errors import TakeError
+
+        if not self.takes.is_dir():
+            raise TakeError(
+                f"take store {self.takes}: expected a folder of takes, found none; make one with quest generate"
+            )
+        store = TakeStore(self.takes)
+        return store, sorted(store.problems())
+
+    def _load_trackers(self) -> list[ClipTracker]:
+        from quest.baselines import HoldStill, LucasKanade
+
+        names = list(dict.fromkeys(self.trackers))
+        if "point" in self.protocol and "hold-still" not in names:
+            names.append("hold-still")
+        trackers: list[ClipTracker] = []
+        for name in names:
+            if name == "quest":
+                import quest
+
+                trackers.append(quest.load(self.weights))
+            else:
+                trackers.append(LucasKanade() if name == "lk" else HoldStill())
+        return trackers
+
+    def _evaluate(
+        self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], console: Console
+    ) -> Evaluated:
+        from rich.progress import (
+            BarColumn,
+            MofNCompleteColumn,
+            Progress,
+            TextColumn,
+            TimeElapsedColumn,
+            TimeRemainingColumn,
+        )
+
+        from quest.evaluation.runner import evaluate, has_protocol
+
+        runs = sum(has_protocol(t, p) for t in trackers for p in self.protocol)
+        headers = store.headers()
+        frames = sum(headers[name].frames * len(headers[name].cameras) for name in chosen) * runs
+        bar = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+        )
+        with Progress(*bar, console=console, transient=True) as progress:
+            task = progress.add_task("frames", total=frames)
+
+            def advance(doing: str, done: int) -> None:
+                progress.update(task, description=doing, advance=done)
+
+            return evaluate(store, chosen, trackers, protocols=self.protocol, progress=advance)
+
+    def _run(
+        self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], start_s: float
+    ) -> Run:
+        from quest.evaluation.provenance import code_commit, combined_hash, file_hash, machine, package_versions
+        from quest.evaluation.results import Run
+
+        with_quest = "quest" in self.trackers
+        known = next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None)
+        return Run(
+            command=shlex.join(["quest", *sys.argv[1:]]),
+            commit=code_commit(),
+            data_hash=combined_hash((name, store.data_hash(name)) for name in chosen),
+            weights=self.weights if with_quest else None,
+            weights_hash=(known or file_hash(self.weights)) if with_quest else None,
+            resamples=self.resamples,
+            seed=self.seed,
+            machine=machine(),
+            versions=package_versions(),
+            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
+            seconds=round(time.monotonic() - start_s, 1),
+        )
+
+    def _results(self, found: Evaluated, broken: list[str], run: Run) -> Results:
+        from quest.evaluation.results import Results
+        from quest.evaluation.summary import summarise
+
+        rows = summarise(found.records, found.discoveries, resamples=self.resamples, seed=self.seed)
+        notes = list(found.notes)
+        if broken:
+            notes.append(f"torn takes of the store were left out: {', '.join(broken)}")
+        levels: dict[tuple[str, str], dict[int, set[str]]] = {}
+        for record in found.records:
+            s = record.subject
+            levels.setdefault((s.part, s.source), {}).setdefault(s.level, set()).add(s.object_id)
+        if any(len({frozenset(o) for o in by_level.values()}) > 1 for by_level in levels.values()):
+            notes.append("levels rest on different objects; compare levels with --same-objects")
+        return Results(run, rows, found.discoveries, found.unscored, tuple(notes))

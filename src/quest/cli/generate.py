@@ -1,0 +1,164 @@
+"""``quest generate``: simulated takes with ground truth, into a take store."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from quest.errors import ConfigError, ObjectError
+
+if TYPE_CHECKING:
+    from quest.data.store import TakeStore
+    from quest.sim.generate import TakeSettings
+    from quest.sim.plan import ObjectShelf, TakeSpec
+
+
+@dataclass(frozen=True)
+class Generate:
+    """Render takes of articulated objects, with ground truth, into a take store; run again to resume."""
+
+    out: Path
+    """Folder of the take store; takes that it already has are skipped."""
+    objects: tuple[str, ...] = ()
+    """Objects by name: partnet:44817,23724 or procedural:chest-12."""
+    split: Literal["train", "validation", "test"] | None = None
+    """All PartNet-Mobility objects of a part of the split; also where --procedural takes its seeds from."""
+    procedural: int = 0
+    """How many procedural objects."""
+    seeds: str | None = None
+    """Object seeds A..B (both included) of the procedural objects, instead of the first ones of the split's part."""
+    partnet: bool = True
+    """Whether --split brings PartNet-Mobility objects; --no-partnet for procedural ones only."""
+    objects_root: Path | None = None
+    """Folder of PartNet-Mobility folders; default: the environment variable QUEST_OBJECTS."""
+    level: tuple[int, ...] = (1,)
+    """How many joints move one after the other: one level or several."""
+    takes_per_object: int = 1
+    """Takes of every object and level."""
+    seed: int = 0
+    """Seed of the first take of each object; the others count up."""
+    every: int = 1
+    """Keep every n-th frame of the motion script (1 to 8)."""
+    views: int = 3
+    """Cameras per take."""
+    size: int = 224
+    """Width and height of the images, pixels."""
+    frames_per_joint: int = 60
+    """Frames of the motion script that each joint gets."""
+    randomize_materials: bool = True
+    """Give objects random materials: procedural ones always, others now and then."""
+
+    def run(self) -> int:
+        """Render and write; 0 if every planned take is there or was skipped for a stated reason."""
+        from quest.data.store import TakeStore
+        from quest.sim.generate import TakeSettings
+        from quest.sim.plan import ObjectShelf, plan_takes
+        from quest.sim.provenance import take_provenance
+        from quest.sim.renderer import Renderer
+
+        settings = TakeSettings(self.views, self.size, self.every, self.frames_per_joint, self.randomize_materials)
+        if self.takes_per_object < 1 or not self.level or min(self.level) < 1:
+            raise ConfigError("generate: expected --takes-per-object and --level of at least 1")
+        store = TakeStore(self.out)
+        takes = plan_takes(
+            self._chosen(), levels=self.level, takes_per_object=self.takes_per_object, first_seed=self.seed
+        )
+        console = Console(stderr=True, highlight=False)
+        missing = [spec for spec in takes if spec.name not in store]
+        console.print(f"{len(takes)} takes planned, {len(takes) - len(missing)} there already; store {escape(str(self.out))}")
+        if not missing:
+            return 0
+        renderer = Renderer()
+        provenance = take_provenance(renderer=str(renderer.device), command=" ".join(["quest", *sys.argv[1:]]))
+        with ObjectShelf(self.objects_root) as shelf:
+            return _Run(store, shelf, renderer, settings, provenance, console).make(missing)
+
+    def _chosen(self) -> list[tuple[str, str]]:
+        """Source and id of every object that the arguments name."""
+        from quest.data.split import object_split
+        from quest.sim.plan import parse_object, procedural_objects
+
+        chosen = [pair for text in self.objects for pair in parse_object(text)]
+        split = object_split()
+        if self.split is not None and self.partnet:
+            chosen += [("partnet", object_id) for object_id in split.partnet_mobility[self.split]]
+        if self.procedural or self.seeds:
+            first, last = _seed_range(self.seeds) if self.seeds else split.procedural_seeds[self.split or "train"]
+            count = self.procedural or last - first + 1
+            if count > last - first + 1:
+                raise ConfigError(f"generate: {count} procedural objects do not fit into seeds {first}..{last}")
+            chosen += procedural_objects(count, first)
+        if not chosen:
+            raise ConfigError("generate: no objects; pass --objects, --split or --procedural")
+        return chosen
+
+
+def _seed_range(text: str) -> tuple[int, int]:
+    first, dots, last = text.partition("..")
+    if not (dots and first.isdigit() and last.isdigit() and int(first) <= int(last)):
+        raise ConfigError(f"generate: expected --seeds A..B with 0 <= A <= B, got {text!r}")
+    return int(first), int(last)
+
+
+@dataclass
+class _Run:
+    """Makes takes one after the other and shows how far it is."""
+
+    store: TakeStore
+    shelf: ObjectShelf
+    renderer: object
+    settings: TakeSettings
+    provenance: dict
+    console: Console
+
+    def make(self, takes: list[TakeSpec]) -> int:
+        columns = (
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"),
+            TimeElapsedColumn(), TimeRemainingColumn(),
+        )  # fmt: skip
+        frames, skipped, seconds = 0, 0, 0.0
+        warned: set[str] = set()
+        with Progress(*columns, console=self.console) as progress:
+            bar = progress.add_task("warming up (shaders)", total=len(takes), speed="")
+            for index, spec in enumerate(takes):
+                start = time.perf_counter()
+                made = self._make_one(spec, warned)
+                if made == 0:
+                    skipped += 1
+                elif index:  # the first take pays for the shaders
+                    frames, seconds = frames + made, seconds + time.perf_counter() - start
+                speed = f"{frames / seconds:.1f} frames/s" if seconds else ""
+                progress.update(bar, advance=1, description=spec.name, speed=speed)
+        speed = f" at {frames / seconds:.1f} frames/s" if seconds else ""
+        self.console.print(f"{len(takes) - skipped} takes written{speed}, {skipped} skipped; store {self.store.root}")
+        return 0
+
+    def _make_one(self, spec: TakeSpec, warned: set[str]) -> int:
+        """Number of frames rendered, all views counted; 0 if the take is impossible, which is said once per reason."""
+        from quest.sim.generate import generate_take
+
+        try:
+            sim_object = self.shelf.load(spec.source, spec.object_id)
+            self._warn(spec.object_id, sim_object.warnings, warned)
+            take = generate_take(
+                sim_object, spec.level, spec.seed, renderer=self.renderer, settings=self.settings, provenance=self.provenance
+            )  # fmt: skip
+        except ObjectError as error:
+            self._warn(f"skipped {spec.object_id}", (str(error),), warned)
+            return 0
+        self.store.write(take)
+        return len(take) * len(take.views)
+
+    def _warn(self, subject: str, messages: tuple[str, ...], warned: set[str]) -> None:
+        for message in messages:
+            line = f"{subject}: {message}"
+            if line not in warned:
+                warned.add(line)
+                self.console.print(f"[yellow]{escape(line)}[/]")

@@ -1,0 +1,105 @@
+"""The program ``quest``: picks a command, turns errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from typing import Protocol, runtime_checkable
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+
+from quest.cli.data import Data
+from quest.cli.doctor import Doctor
+from quest.cli.evaluate import Eval
+from quest.cli.generate import Generate
+from quest.cli.track import Track
+from quest.cli.train import Train
+from quest.cli.weights import Weights
+from quest.errors import QuestError
+from quest.extras import explain_missing
+
+EXIT_ERROR = 2
+EXIT_INTERRUPTED = 130
+
+COMMANDS: dict[str, type[Command]] = {
+    "generate": Generate,
+    "data": Data,
+    "train": Train,
+    "track": Track,
+    "eval": Eval,
+    "weights": Weights,
+    "doctor": Doctor,
+}
+"""Command line name of every command."""
+
+DESCRIPTION = "Follow handles, knobs, rims and fronts of articulated objects in RGB-D video."
+
+
+@runtime_checkable
+class Command(Protocol):
+    """A command's dataclass: its fields are the arguments."""
+
+    def run(self) -> int:
+        """Do the work and return the exit code."""
+        ...
+
+
+def parse(arguments: Sequence[str]) -> Command:
+    """Parse arguments into a command.
+
+    Args:
+        arguments: what follows ``quest`` on the command line.
+
+    Raises:
+        SystemExit: on ``--help`` (code 0) and on bad arguments (code 2, after a message on stderr).
+    """
+    commands: dict[str, Callable[..., Command]] = dict(COMMANDS)
+    return tyro.extras.subcommand_cli_from_dict(
+        commands,
+        prog="quest",
+        description=DESCRIPTION,
+        args=list(arguments),
+        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.HelptextFromCommentsOff),
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``quest``.
+
+    Args:
+        arguments: what follows ``quest``; those of the process by default.
+
+    Returns:
+        The exit code: the command's own, 2 for an error that the user can mend, 130 when interrupted.
+    """
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if list(arguments) == ["--version"]:
+        from quest import __version__
+
+        print(f"quest {__version__}")
+        return 0
+    command = parse(arguments or ["--help"])
+    try:
+        return command.run()
+    except QuestError as error:
+        return _fail(error)
+    except ModuleNotFoundError as error:
+        explained = explain_missing(error)
+        if explained is None:
+            raise
+        return _fail(explained)
+    except KeyboardInterrupt:
+        Console(stderr=True).print("interrupted", style="yellow")
+        return EXIT_INTERRUPTED
+
+
+def _fail(error: QuestError) -> int:
+    message = " ".join(str(error).split())
+    Console(stderr=True, highlight=False).print(f"[bold red]error:[/] [red]{escape(message)}[/]", soft_wrap=True)
+    return EXIT_ERROR
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The take store, recordings on disk, and files of tracks."""

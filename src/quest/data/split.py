@@ -1,0 +1,69 @@
+"""Which objects are for training, validation and test: the committed file ``split.json``."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Literal
+
+from quest.errors import ObjectError
+from quest.types import TakeInfo
+
+Part = Literal["train", "validation", "test"]
+PARTS: tuple[Part, ...] = ("train", "validation", "test")
+"""The parts of the split, in the order of the file."""
+
+
+@dataclass(frozen=True)
+class ObjectSplit:
+    """The object split.
+
+    Attributes:
+        partnet_mobility: folder names per part.
+        procedural_seeds: first and last object seed per part, both included.
+    """
+
+    partnet_mobility: dict[str, tuple[str, ...]]
+    procedural_seeds: dict[str, tuple[int, int]]
+
+
+@cache
+def object_split() -> ObjectSplit:
+    """The split that the package ships."""
+    text = resources.files("quest.data").joinpath("split.json").read_text(encoding="utf-8")
+    raw = json.loads(text)
+    return ObjectSplit(
+        partnet_mobility={part: tuple(raw["partnet-mobility"][part]) for part in PARTS},
+        procedural_seeds={part: (raw["procedural_seeds"][part][0], raw["procedural_seeds"][part][1]) for part in PARTS},
+    )
+
+
+def split_of(info: TakeInfo) -> Part:
+    """Which part of the split the object of a take belongs to.
+
+    Raises:
+        ObjectError: the object is in no part, so that neither training nor a reported number may use it.
+    """
+    split = object_split()
+    if info.source == "partnet-mobility":
+        for part in PARTS:
+            if info.object_id in split.partnet_mobility[part]:
+                return part
+    else:
+        match = re.fullmatch(r".+-(\d+)", info.object_id)
+        if match is None:
+            raise ObjectError(
+                f"object {info.object_id!r}: expected a procedural object to be called category-seed, such as "
+                f"'fridge-100003'; rename it so that its part of the split is known"
+            )
+        for part in PARTS:
+            first, last = split.procedural_seeds[part]
+            if first <= int(match.group(1)) <= last:
+                return part
+    raise ObjectError(
+        f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's objects "
+        f"or a procedural seed in its ranges"
+    )

@@ -1,0 +1,233 @@
+"""What a take looks like on disk: its description as JSON, its arrays, and how to tell that it is whole.
+
+A take is one Zarr v3 group. The group's attributes (:class:`TakeHeader`) are written last and list every file of the
+group with its size, so that a missing or truncated file is noticed without reading any pixel.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from quest.errors import InputError, TakeError
+from quest.types import Camera, Entity, Joint, Take, TakeInfo
+
+FORMAT = "quest-take"
+VERSION = 1
+DEPTH_SCALE_M = 1e-4
+"""Metres per stored unit of depth; 16 bits reach 6.5535 m."""
+
+TAKE_ARRAYS: dict[str, type] = {
+    "stamp_s": np.float64,
+    "point_world": np.float32,
+    "flow_world": np.float32,
+    "link_pose": np.float32,
+    "joint_position": np.float32,
+    "joint_velocity": np.float32,
+    "joint_axis": np.float32,
+}
+VIEW_ARRAYS: dict[str, type] = {"uv_px": np.float32, "visible": np.bool_, "link_id": np.uint8, "entity_id": np.uint8}
+
+HEADER_FILE = "zarr.json"
+REMEDY = "delete its folder and generate it again"
+
+
+@dataclass(frozen=True)
+class TakeHeader:
+    """Everything about a stored take but its arrays.
+
+    Attributes:
+        info: description of the take.
+        frames: number of frames.
+        cameras: one per view.
+        clip_names: one per view.
+        has_depth: whether each view carries depth.
+        data_hash: digest of arrays and description, see :func:`hash_take`.
+        files: size in bytes of every file of the group but the header itself, by relative path.
+    """
+
+    info: TakeInfo
+    frames: int
+    cameras: tuple[Camera, ...]
+    clip_names: tuple[str, ...]
+    has_depth: tuple[bool, ...]
+    data_hash: str
+    files: Mapping[str, int]
+
+    def to_attributes(self) -> dict[str, Any]:
+        """JSON-serialisable attributes of the group."""
+        return {
+            "format": FORMAT,
+            "version": VERSION,
+            "depth_scale_m": DEPTH_SCALE_M,
+            "info": asdict(self.info),
+            "frames": self.frames,
+            "views": [
+                {"name": name, "camera": asdict(camera), "has_depth": depth}
+                for name, camera, depth in zip(self.clip_names, self.cameras, self.has_depth, strict=True)
+            ],
+            "data_hash": self.data_hash,
+            "files": dict(self.files),
+        }
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any]) -> TakeHeader:
+        """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
+        views = attributes["views"]
+        return cls(
+            info=info_from_json(attributes["info"]),
+            frames=int(attributes["frames"]),
+            cameras=tuple(Camera(**view["camera"]) for view in views),
+            clip_names=tuple(view["name"] for view in views),
+            has_depth=tuple(bool(view["has_depth"]) for view in views),
+            data_hash=attributes["data_hash"],
+            files=attributes["files"],
+        )
+
+
+def info_from_json(fields: Mapping[str, Any]) -> TakeInfo:
+    """The inverse of ``dataclasses.asdict`` on a :class:`TakeInfo` that went through JSON."""
+    return TakeInfo(
+        **{
+            **fields,
+            "entities": tuple(Entity(**entity) for entity in fields["entities"]),
+            "joints": tuple(Joint(**joint) for joint in fields["joints"]),
+            "moved_joints": tuple(fields["moved_joints"]),
+        }
+    )
+
+
+def read_header(folder: Path) -> TakeHeader:
+    """Header of the take in ``folder``, after checking that every file it lists is there in full.
+
+    Raises:
+        TakeError: there is no take, it is of another format version, or it is torn.
+    """
+    name = folder.name.removesuffix(".zarr")
+    if not folder.is_dir():
+        raise TakeError(f"take {name!r}: no folder {folder}; check the name, or generate the take")
+    try:
+        attributes = json.loads((folder / HEADER_FILE).read_text(encoding="utf-8"))["attributes"]
+    except FileNotFoundError:
+        raise TakeError(
+            f"take {name!r}: {folder} holds no {HEADER_FILE}, so it is torn or not a take; {REMEDY}"
+        ) from None
+    except (ValueError, KeyError, TypeError) as error:
+        raise TakeError(f"take {name!r}: {folder / HEADER_FILE} cannot be read ({error}); {REMEDY}") from error
+    if not isinstance(attributes, dict) or attributes.get("format") != FORMAT:
+        raise TakeError(
+            f"take {name!r}: {folder} is a Zarr group but not a take (no format {FORMAT!r}); give a take's folder"
+        )
+    if attributes.get("version") != VERSION:
+        raise TakeError(
+            f"take {name!r}: {folder} has format version {attributes.get('version')!r}, expected {VERSION}; "
+            "generate it again, or use the version of quest that wrote it"
+        )
+    try:
+        header = TakeHeader.from_attributes(attributes)
+    except (KeyError, TypeError, ValueError) as error:
+        raise TakeError(f"take {name!r}: {folder / HEADER_FILE} is damaged ({error!r}); {REMEDY}") from error
+    check_files(folder, header.files)
+    return header
+
+
+def list_files(folder: Path) -> dict[str, int]:
+    """Size in bytes of every file under ``folder`` but the group's own header, by relative path."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / HEADER_FILE)
+    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
+
+
+def check_files(folder: Path, files: Mapping[str, int]) -> None:
+    """Raise TakeError unless every listed file is in ``folder`` with its listed size."""
+    for path, size in files.items():
+        try:
+            found = (folder / path).stat().st_size
+        except (FileNotFoundError, NotADirectoryError):
+            raise TakeError(f"take {folder.stem!r} is torn: {folder / path} is missing; {REMEDY}") from None
+        if found != size:
+            raise TakeError(
+                f"take {folder.stem!r} is torn: {folder / path} has {found} bytes, expected {size}; {REMEDY}"
+            )
+
+
+def encode_depth(depth_m: np.ndarray) -> np.ndarray:
+    """Depth in metres as 16-bit units of :data:`DEPTH_SCALE_M`.
+
+    What is not finite, not positive, or beyond the range of 16 bits (6.55 m) becomes 0, missing: a clipped depth would
+    claim a surface where there is none.
+    """
+    with np.errstate(invalid="ignore"):  # NaN compares false, which is what is wanted
+        units = np.rint(depth_m * np.float32(1 / DEPTH_SCALE_M))
+        inside = (units > 0) & (units <= np.iinfo(np.uint16).max)
+    return np.where(inside, units, 0).astype(np.uint16)
+
+
+def decode_depth(units: np.ndarray) -> np.ndarray:
+    """Depth in metres from 16-bit units, float32."""
+    return units.astype(np.float32) * np.float32(DEPTH_SCALE_M)
+
+
+def take_arrays(take: Take) -> Iterator[tuple[str, np.ndarray]]:
+    """Path in the group and stored form of every array of a take, in a fixed order."""
+    for name, dtype in TAKE_ARRAYS.items():
+        yield name, np.ascontiguousarray(getattr(take, name), dtype=dtype)
+    for v, view in enumerate(take.views):
+        yield f"view_{v}/cam_from_world", np.ascontiguousarray(view.clip.cam_from_world, dtype=np.float64)
+        yield f"view_{v}/rgb", np.ascontiguousarray(view.clip.rgb, dtype=np.uint8)
+        if view.clip.depth_m is not None:
+            yield f"view_{v}/depth", encode_depth(view.clip.depth_m)
+        for name, dtype in VIEW_ARRAYS.items():
+            yield f"view_{v}/{name}", np.ascontiguousarray(getattr(view, name), dtype=dtype)
+
+
+class TakeHash:
+    """Digest of a take's stored arrays and its description without provenance, fed one array after the other."""
+
+    def __init__(self, info: TakeInfo, cameras: tuple[Camera, ...]) -> None:
+        described = asdict(info)
+        described.pop("provenance")
+        described["cameras"] = [asdict(camera) for camera in cameras]
+        self._digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+
+    def add(self, path: str, array: np.ndarray) -> None:
+        """Take one array in."""
+        self._digest.update(f"{path} {array.dtype.str} {array.shape}".encode())
+        self._digest.update(np.ascontiguousarray(array).data)
+
+    def hexdigest(self) -> str:
+        """The digest of what was added so far."""
+        return self._digest.hexdigest()
+
+
+def check_take(take: Take) -> None:
+    """Raise InputError if the arrays of a take contradict each other or its description."""
+    frames, entities, joints = len(take), len(take.info.entities), len(take.info.joints)
+    expected = {
+        "point_world": (frames, entities, 3),
+        "flow_world": (frames, entities, 3),
+        "link_pose": (frames, take.link_pose.shape[1] if take.link_pose.ndim == 4 else -1, 4, 4),
+        "joint_position": (frames, joints),
+        "joint_velocity": (frames, joints),
+        "joint_axis": (frames, joints, 6),
+    }
+    found = {name: getattr(take, name).shape for name in expected}
+    for v, view in enumerate(take.views):
+        expected[f"view {v} rgb"] = (frames, *view.clip.rgb.shape[1:3], 3)
+        expected[f"view {v} uv_px"] = (frames, entities, 2)
+        expected[f"view {v} visible"] = (frames, entities)
+        expected[f"view {v} link_id"] = expected[f"view {v} entity_id"] = expected[f"view {v} rgb"][:3]
+        found[f"view {v} rgb"] = view.clip.rgb.shape
+        found |= {f"view {v} {name}": getattr(view, name).shape for name in VIEW_ARRAYS}
+        if not np.array_equal(view.clip.stamp_s, take.stamp_s):
+            raise InputError(f"take {take.info.name!r}: view {v} has other time stamps than the take; views share them")
+    for name, shape in expected.items():
+        if found[name] != shape:
+            raise InputError(f"take {take.info.name!r}: {name} has shape {found[name]}, expected {shape}")
+    if frames == 0 or not take.views:
+        raise InputError(f"take {take.info.name!r}: expected at least one frame and one view")

@@ -1,0 +1,82 @@
+"""Intervals: 95 % bootstrap over objects, the unit that a new user's object is drawn from.
+
+Reference: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13 (percentile intervals).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from quest.evaluation.metrics import Sums
+
+LEVEL = 0.95
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number with its interval.
+
+    Attributes:
+        mean: the metric (a median where its name says so).
+        low: lower end of the 95 % interval; None with fewer than two objects.
+        high: upper end of the interval.
+        count: how many terms (frames, records or slots) it is over.
+    """
+
+    mean: float
+    low: float | None
+    high: float | None
+    count: int
+
+
+def draw_objects(objects: int, *, resamples: int, generator: np.random.Generator) -> Int[np.ndarray, "B O"]:
+    """How often each object is drawn in each resample of as many objects."""
+    return generator.multinomial(objects, np.full(objects, 1.0 / objects), size=resamples)
+
+
+def mean_value(sums: Sums, object_of: Int[np.ndarray, " N"], draws: Int[np.ndarray, "B O"]) -> Value | None:
+    """The pooled mean and its interval; None where nothing was counted.
+
+    Args:
+        sums: per record.
+        object_of: object index per record, below O.
+        draws: from :func:`draw_objects`.
+    """
+    if sums.count.sum() == 0:
+        return None
+    size = draws.shape[1]
+    total = draws @ np.bincount(object_of, weights=sums.total, minlength=size)
+    count = draws @ np.bincount(object_of, weights=sums.count, minlength=size)
+    with_terms = count > 0  # a resample may hold only objects to which the metric does not apply
+    low, high = _percentiles(total[with_terms] / count[with_terms], objects=size)
+    return Value(sums.mean(), low, high, int(sums.count.sum()))
+
+
+def median_value(
+    value: Float[np.ndarray, " M"], object_of: Int[np.ndarray, " M"], draws: Int[np.ndarray, "B O"]
+) -> Value | None:
+    """The median of pooled terms and its interval; None without terms. NaN terms are left out."""
+    known = ~np.isnan(value)
+    value, object_of = value[known], object_of[known]
+    if not len(value):
+        return None
+    order = np.argsort(value, kind="stable")
+    ordered, owner = value[order], object_of[order]
+    medians = []
+    for drawn in draws:
+        below = np.cumsum(drawn[owner])
+        if below[-1] > 0:
+            medians.append(ordered[np.searchsorted(below, 0.5 * below[-1])])
+    low, high = _percentiles(np.array(medians), objects=draws.shape[1])
+    return Value(float(np.median(value)), low, high, len(value))
+
+
+def _percentiles(samples: np.ndarray, *, objects: int) -> tuple[float | None, float | None]:
+    if objects < 2 or not len(samples):
+        return None, None
+    tail = (1.0 - LEVEL) / 2.0
+    low, high = np.quantile(samples, (tail, 1.0 - tail))
+    return float(low), float(high)

@@ -1,0 +1,66 @@
+"""What a number must carry to be made again: commit, data, machine, versions."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+
+import quest
+
+PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python")
+
+
+def code_commit() -> str:
+    """Commit of the checkout that the package runs from, ``+dirty`` where tracked files differ; else the version."""
+    folder = Path(__file__).resolve().parent
+    try:
+        commit = _git(folder, "rev-parse", "HEAD")
+        tracked = _git(folder, "ls-files", Path(__file__).name)
+        if tracked:  # an installed package may lie inside a checkout of something else
+            return commit + ("+dirty" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.CalledProcessError, subprocess.TimeoutExpired):
+        pass  # no git or no checkout: a released version says as much
+    return f"version {quest.__version__}"
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
+    return done.stdout.strip()
+
+
+def combined_hash(hashes: Iterable[tuple[str, str]]) -> str:
+    """One hash over the names and data hashes of takes, whatever their order."""
+    digest = hashlib.sha256()
+    for name, data_hash in sorted(hashes):
+        digest.update(f"{name}\0{data_hash}\n".encode())
+    return digest.hexdigest()
+
+
+def file_hash(path: str | Path) -> str | None:
+    """SHA-256 of a file; None if it is no file (a name of shipped weights)."""
+    path = Path(path)
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def machine() -> str:
+    """Operating system, processor and cores, without the host's name."""
+    return f"{platform.system()} {platform.release()}, {platform.machine()}, {os.cpu_count()} cores"
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of Python and the packages that compute; ``not installed`` where one is missing."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found

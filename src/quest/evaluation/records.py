@@ -1,0 +1,167 @@
+"""What an evaluation keeps: one record per tracker, take, view and entity, with its distance in every frame.
+
+Every number in a table can be computed again from these; they are stored as Parquet beside the table.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Bool, Float32, Int16
+
+from quest.errors import InputError
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What a table row is about: records with equal subjects but for the object belong to one row.
+
+    Attributes:
+        tracker: its name.
+        protocol: ``point`` or ``semantic``.
+        part: ``train``, ``validation``, ``test``, or ``unlisted`` where the split does not know the object.
+        source: ``partnet-mobility`` or ``procedural``.
+        level: how many joints move one after the other.
+        object_id: the object.
+    """
+
+    tracker: str
+    protocol: str
+    part: str
+    source: str
+    level: int
+    object_id: str
+
+
+@dataclass(frozen=True)
+class EntityRecord:
+    """How one tracker answered for one entity in one view of one take.
+
+    Attributes:
+        subject: tracker, protocol and object.
+        take: name of the take.
+        view: index of the view.
+        entity: index of the entity in the take.
+        name: the entity's name.
+        label: the entity's label.
+        moved: whether it is at some time more than 0.1 from rest.
+        found: whether an answer was given to it at all (always so in the point protocol).
+        first_frame: frames before it are not scored.
+        distance: normalised units; 1 where the prediction is missing.
+        distance_px: pixels of the letterboxed input; NaN where the entity has no true pixel.
+        follows: index of the entity that the prediction follows, -1 for none.
+        visible: whether the entity is seen.
+    """
+
+    subject: Subject
+    take: str
+    view: int
+    entity: int
+    name: str
+    label: str
+    moved: bool
+    found: bool
+    first_frame: int
+    distance: Float32[np.ndarray, " T"]
+    distance_px: Float32[np.ndarray, " T"]
+    follows: Int16[np.ndarray, " T"]
+    visible: Bool[np.ndarray, " T"]
+
+
+@dataclass(frozen=True)
+class Discovery:
+    """How many answers a tracker gave unasked in one view, and how many of them were entities.
+
+    Attributes:
+        subject: tracker, protocol and object.
+        take: name of the take.
+        view: index of the view.
+        slots: answers.
+        matched: answers that were assigned to an entity.
+    """
+
+    subject: Subject
+    take: str
+    view: int
+    slots: int
+    matched: int
+
+
+@dataclass(frozen=True)
+class Unscored:
+    """An entity that is not scored in a view, because it is not visible in frames 0 to 7.
+
+    Attributes:
+        take: name of the take.
+        view: index of the view.
+        name: the entity's name.
+        label: the entity's label.
+    """
+
+    take: str
+    view: int
+    name: str
+    label: str
+
+
+_PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}
+
+
+def write_records(records: Sequence[EntityRecord], path: Path) -> None:
+    """Write records as Parquet, one row each with lists over frames; atomic.
+
+    Args:
+        records: at least one.
+        path: the file.
+    """
+    flat = [f.name for f in fields(EntityRecord) if f.name != "subject" and f.name not in _PER_FRAME]
+    columns: dict[str, list] = {f.name: [getattr(r.subject, f.name) for r in records] for f in fields(Subject)}
+    columns |= {name: [getattr(r, name) for r in records] for name in flat}
+    arrays = {name: pa.array(values) for name, values in columns.items()}
+    for name, dtype in _PER_FRAME.items():
+        item = pa.from_numpy_dtype(dtype)
+        arrays[name] = pa.array([getattr(r, name) for r in records], type=pa.list_(item))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        pq.write_table(pa.table(arrays), temporary, compression="zstd")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
+    """Read what :func:`write_records` wrote.
+
+    Raises:
+        InputError: the file is missing or is no such file.
+    """
+    try:
+        table = pq.read_table(path)
+        rows = table.to_pylist()
+        records = []
+        for row in rows:
+            subject = Subject(**{f.name: row.pop(f.name) for f in fields(Subject)})
+            per_frame: dict[str, Any] = {
+                name: np.array(row.pop(name), dtype=dtype) for name, dtype in _PER_FRAME.items()
+            }
+            records.append(EntityRecord(subject=subject, **row, **per_frame))
+    except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
+        raise InputError(f"records {path}: expected a Parquet file written by `quest eval --out` ({error})") from error
+    return tuple(records)
+
+
+def discovery_to_json(found: Discovery) -> dict:
+    """Plain values of a discovery record."""
+    return asdict(found)
+
+
+def discovery_from_json(raw: dict) -> Discovery:
+    """The discovery record of plain values."""
+    return Discovery(**{**raw, "subject": Subject(**raw["subject"])})

@@ -1,0 +1,149 @@
+"""A finished evaluation: its rows, what made them, and the file that keeps both."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from quest.errors import InputError
+from quest.evaluation.bootstrap import Value
+from quest.evaluation.records import (
+    Discovery,
+    EntityRecord,
+    Unscored,
+    discovery_from_json,
+    discovery_to_json,
+    write_records,
+)
+from quest.evaluation.summary import Metrics, Row
+
+FORMAT = 1
+"""Version of the result file."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What made the numbers.
+
+    Attributes:
+        command: the command line.
+        commit: commit of the checkout, with ``+dirty`` where files differ from it; the version where there is none.
+        data_hash: over the hashes of all takes that were evaluated.
+        weights: what was loaded for the tracker ``quest``; None if it did not take part.
+        weights_hash: SHA-256 of the weights file, where it is known.
+        resamples: of the bootstrap over objects.
+        seed: of the bootstrap.
+        machine: operating system, processor and cores.
+        versions: of Python and the packages that compute.
+        stamp: date and time of the end, UTC.
+        seconds: duration.
+    """
+
+    command: str
+    commit: str
+    data_hash: str
+    weights: str | None
+    weights_hash: str | None
+    resamples: int
+    seed: int
+    machine: str
+    versions: dict[str, str]
+    stamp: str
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Results:
+    """Rows and what they rest on.
+
+    Attributes:
+        run: what made them.
+        rows: the table.
+        discoveries: answers and matches per view, in the semantic protocol.
+        unscored: entities that were not scored.
+        notes: what a reader must know, in words.
+    """
+
+    run: Run
+    rows: tuple[Row, ...]
+    discoveries: tuple[Discovery, ...] = ()
+    unscored: tuple[Unscored, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def records_path(path: str | Path) -> Path:
+    """Where the records of a result file are: ``results.json`` has ``results.records.parquet`` beside it."""
+    path = Path(path)
+    return path.with_name(f"{path.stem}.records.parquet")
+
+
+def write_results(results: Results, path: str | Path, *, records: tuple[EntityRecord, ...] = ()) -> None:
+    """Write the result file, and the records beside it; each is written whole or not at all.
+
+    Args:
+        results: what to write.
+        path: a file ending in ``.json``.
+        records: what the rows were computed from; nothing is written beside where empty.
+
+    Raises:
+        InputError: the name does not end in ``.json``.
+    """
+    path = Path(path)
+    if path.suffix != ".json":
+        raise InputError(f"results {path}: expected a file name that ends in .json; the records go beside it")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if records:
+        write_records(records, records_path(path))
+    raw = {
+        "format": FORMAT,
+        "records": records_path(path).name if records else None,
+        "run": asdict(results.run),
+        "rows": [asdict(row) for row in results.rows],
+        "notes": list(results.notes),
+        "discoveries": [discovery_to_json(d) for d in results.discoveries],
+        "unscored": [asdict(u) for u in results.unscored],
+    }
+    text = json.dumps(raw, indent=1, allow_nan=False)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("w", encoding="utf-8") as file:
+            file.write(text + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_results(path: str | Path) -> Results:
+    """Read a result file back, equal to what was written.
+
+    Raises:
+        InputError: the file is missing, damaged, or of another format version.
+    """
+    try:
+        raw = json.loads(Path(path).read_text(encoding="utf-8"))
+        if raw["format"] != FORMAT:
+            raise InputError(f"results {path}: expected format {FORMAT}, got {raw['format']}; run `quest eval` again")
+        return Results(
+            run=Run(**raw["run"]),
+            rows=tuple(_row(row) for row in raw["rows"]),
+            discoveries=tuple(discovery_from_json(d) for d in raw["discoveries"]),
+            unscored=tuple(Unscored(**u) for u in raw["unscored"]),
+            notes=tuple(raw["notes"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(
+            f"results {path}: expected a file written by `quest eval --out` ({type(error).__name__}: {error})"
+        ) from error
+
+
+def _row(raw: dict[str, Any]) -> Row:
+    values = raw["metrics"]
+    metrics = {f.name: None if values[f.name] is None else Value(**values[f.name]) for f in fields(Metrics)}
+    return Row(**{**raw, "metrics": Metrics(**metrics)})

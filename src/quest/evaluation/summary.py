@@ -1,0 +1,208 @@
+"""From records to table rows: pooled metrics with intervals, in two readings."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Int
+
+from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
+from quest.evaluation.metrics import INPUT_PX, Sums, accuracy, distance_at, frame_mean, slope, switches
+from quest.evaluation.records import Discovery, EntityRecord
+
+Reading = Literal["all", "moved"]
+READINGS: tuple[Reading, ...] = ("all", "moved")
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """The metrics of one row; None where nothing was counted. ``docs/metrics.md`` defines them.
+
+    Attributes:
+        ape: mean 3D distance, normalised units.
+        ape_vis: the same on visible frames.
+        ape_px: mean pixel distance, pixels of the letterboxed input.
+        ape_2d: mean distance in [0, 1]^2 coordinates of the letterboxed input.
+        median_px: median pixel distance.
+        median_px_vis: median pixel distance on visible frames.
+        d50: 3D distance at half of the take.
+        d100: 3D distance at its end.
+        acc: share of frames with the right identity.
+        switches: changes of identity per 1,000 frames.
+        slope: growth of the 3D distance per 100 frames.
+        precision: share of the tracker's own discoveries that are entities (semantic, reading ``all``).
+        recall: share of the entities that were discovered (semantic).
+    """
+
+    ape: Value | None
+    ape_vis: Value | None
+    ape_px: Value | None
+    ape_2d: Value | None
+    median_px: Value | None
+    median_px_vis: Value | None
+    d50: Value | None
+    d100: Value | None
+    acc: Value | None
+    switches: Value | None
+    slope: Value | None
+    precision: Value | None = None
+    recall: Value | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a table.
+
+    Attributes:
+        tracker: its name.
+        protocol: ``point`` or ``semantic``.
+        part: part of the object split.
+        source: ``partnet-mobility`` or ``procedural``.
+        level: how many joints move one after the other.
+        reading: ``all`` entities or those that ``moved``.
+        objects: how many different objects.
+        takes: how many takes.
+        entities: how many entities of these takes; each counts once, however many views see it.
+        tracks: how many (take, view, entity).
+        frames: how many scored frames of these.
+        metrics: the numbers.
+    """
+
+    tracker: str
+    protocol: str
+    part: str
+    source: str
+    level: int
+    reading: Reading
+    objects: int
+    takes: int
+    entities: int
+    tracks: int
+    frames: int
+    metrics: Metrics
+
+
+def summarise(
+    records: Sequence[EntityRecord],
+    discoveries: Sequence[Discovery] = (),
+    *,
+    resamples: int,
+    seed: int,
+) -> tuple[Row, ...]:
+    """Rows per protocol, part, source, level, reading and tracker; a reading without records has no row.
+
+    Every row draws its resamples from a generator of its own with the same seed, so that rows over the same objects
+    are resampled alike and a row does not depend on which others are there.
+
+    Args:
+        records: of any number of trackers.
+        discoveries: of the semantic protocol.
+        resamples: of the bootstrap over objects.
+        seed: of the bootstrap.
+    """
+    groups: dict[tuple, list[EntityRecord]] = defaultdict(list)
+    for record in records:
+        for reading in READINGS:
+            if reading == "all" or record.moved:
+                s = record.subject
+                groups[(s.protocol, s.part, s.source, s.level, reading, s.tracker)].append(record)
+    slots: dict[tuple, list[Discovery]] = defaultdict(list)
+    for found in discoveries:
+        s = found.subject
+        slots[(s.protocol, s.part, s.source, s.level, "all", s.tracker)].append(found)
+    order = {tracker: i for i, tracker in enumerate(dict.fromkeys(r.subject.tracker for r in records))}
+    keys = sorted(groups, key=lambda key: (*key[:5], order[key[5]]))
+    return tuple(_row(key, groups[key], slots[key], resamples=resamples, seed=seed) for key in keys)
+
+
+def _row(key: tuple, records: list[EntityRecord], found: list[Discovery], *, resamples: int, seed: int) -> Row:
+    protocol, part, source, level, reading, tracker = key
+    # Views in which nothing could be scored still belong to the objects that the discovery was judged on.
+    objects = sorted({r.subject.object_id for r in records} | {d.subject.object_id for d in found})
+    draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
+    index = {name: i for i, name in enumerate(objects)}
+    return Row(
+        tracker=tracker,
+        protocol=protocol,
+        part=part,
+        source=source,
+        level=level,
+        reading=reading,
+        objects=len({r.subject.object_id for r in records}),
+        takes=len({r.take for r in records}),
+        entities=len({(r.take, r.entity) for r in records}),
+        tracks=len(records),
+        frames=sum(len(r.distance) - r.first_frame for r in records),
+        metrics=_metrics(records, found, index, draws, semantic=protocol == "semantic"),
+    )
+
+
+def _metrics(
+    records: list[EntityRecord],
+    found: list[Discovery],
+    index: dict[str, int],
+    draws: Int[np.ndarray, "B O"],
+    *,
+    semantic: bool,
+) -> Metrics:
+    object_of = np.array([index[r.subject.object_id] for r in records])
+    sums = _sums(records)
+    values = {name: mean_value(s, object_of, draws) for name, s in sums.items()}
+    for name, visible_only in (("median_px", False), ("median_px_vis", True)):
+        kept = [r.distance_px[_counted(r, visible_only=visible_only)].astype(np.float64) for r in records]
+        owner = np.repeat(object_of, [len(k) for k in kept])
+        values[name] = median_value(np.concatenate(kept), owner, draws)
+    if semantic:
+        recall = Sums(np.array([float(r.found) for r in records]), np.ones(len(records)))
+        values["recall"] = mean_value(recall, object_of, draws)
+    if found:
+        matched = np.array([d.matched for d in found], dtype=float)
+        slots = np.array([d.slots for d in found], dtype=float)
+        owner = np.array([index[d.subject.object_id] for d in found])
+        values["precision"] = mean_value(Sums(matched, slots), owner, draws)
+    return Metrics(**values)
+
+
+def _counted(record: EntityRecord, *, visible_only: bool = False) -> np.ndarray:
+    counted = np.arange(len(record.distance)) >= record.first_frame
+    return counted & record.visible if visible_only else counted
+
+
+def _sums(records: list[EntityRecord]) -> dict[str, Sums]:
+    """Sums of every averaged metric, in the order of the records; records of equal length are computed together."""
+    by_length: dict[int, list[int]] = defaultdict(list)
+    for i, record in enumerate(records):
+        by_length[len(record.distance)].append(i)
+    parts: dict[str, list[Sums]] = defaultdict(list)
+    for rows in by_length.values():
+        for name, sums in _block_sums([records[i] for i in rows]).items():
+            parts[name].append(sums)
+    back = np.argsort(np.concatenate(list(by_length.values())))
+    return {
+        name: Sums(np.concatenate([s.total for s in blocks])[back], np.concatenate([s.count for s in blocks])[back])
+        for name, blocks in parts.items()
+    }
+
+
+def _block_sums(records: list[EntityRecord]) -> dict[str, Sums]:
+    gap = np.stack([r.distance for r in records]).astype(np.float64)
+    gap_px = np.stack([r.distance_px for r in records]).astype(np.float64)
+    follows = np.stack([r.follows for r in records]).astype(np.int64)
+    visible = np.stack([r.visible for r in records])
+    counted = np.stack([_counted(r) for r in records])
+    own = np.array([r.entity for r in records])
+    return {
+        "ape": frame_mean(gap, counted),
+        "ape_vis": frame_mean(gap, counted & visible),
+        "ape_px": frame_mean(gap_px, counted),
+        "ape_2d": frame_mean(gap_px / INPUT_PX, counted),
+        "d50": distance_at(gap, 0.5),
+        "d100": distance_at(gap, 1.0),
+        "acc": accuracy(follows, own, counted),
+        "switches": switches(follows, own, counted),
+        "slope": slope(gap, counted),
+    }

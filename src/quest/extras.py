@@ -1,0 +1,62 @@
+"""Optional parts: which extra of the distribution brings which module, and one clear message where it is missing.
+
+The base install tracks a recorded clip. What only simulation or training need comes with an
+extra, such as ``pip install "quest-tracker[sim]"``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from types import ModuleType
+
+from quest.errors import MissingExtraError
+
+DISTRIBUTION = "quest-tracker"
+
+EXTRA_OF = {
+    "sapien": "sim",
+    "scene_synthesizer": "sim",
+    "trimesh": "sim",
+    "lightning_fabric": "train",
+    "tensorboard": "train",
+    "onnx": "train",
+}
+"""Extra that brings each optional module."""
+
+
+def install_command(extra: str) -> str:
+    """Command that installs an extra."""
+    return f'pip install "{DISTRIBUTION}[{extra}]"'
+
+
+def is_installed(module: str) -> bool:
+    """Whether an optional module can be found (it is not imported)."""
+    return importlib.util.find_spec(module) is not None
+
+
+def require(module: str) -> ModuleType:
+    """Import an optional module.
+
+    Args:
+        module: one of :data:`EXTRA_OF`, or a submodule of one.
+
+    Raises:
+        MissingExtraError: it is not installed; the message names the extra.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        explained = explain_missing(error)
+        if explained is None:
+            raise  # something inside an installed module is missing: that is not ours to explain
+        raise explained from error
+
+
+def explain_missing(error: ModuleNotFoundError) -> MissingExtraError | None:
+    """Turn "no module named ..." into advice, or return None if no extra would help."""
+    root = (error.name or "").partition(".")[0]
+    extra = EXTRA_OF.get(root)
+    if extra is None:
+        return None
+    return MissingExtraError(f"{root} is not installed; it comes with an extra: {install_command(extra)}")

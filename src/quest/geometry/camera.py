@@ -1,0 +1,64 @@
+"""Pinhole projection and lifting.
+
+Pixel centres lie at half-integers, camera axes are OpenCV's (x right, y down, z forward).
+
+Reference: Hartley and Zisserman, Multiple View Geometry, section 6.1.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from quest.types import Camera
+
+
+def project(point_cam: Float[Tensor, "*B 3"], camera: Camera) -> Float[Tensor, "*B 2"]:
+    """Pixels of camera-frame points in metres; NaN for points that are not in front of the camera."""
+    z = point_cam[..., 2]
+    z = torch.where(z > 1e-6, z, torch.full_like(z, torch.nan))
+    x = camera.fx * point_cam[..., 0] / z + camera.cx
+    y = camera.fy * point_cam[..., 1] / z + camera.cy
+    return torch.stack((x, y), dim=-1)
+
+
+def lift(uv_px: Float[Tensor, "*B 2"], depth_m: Float[Tensor, "*B"], camera: Camera) -> Float[Tensor, "*B 3"]:
+    """Camera-frame points in metres of pixels with depth along +z; NaN where depth is 0 or not finite."""
+    z = torch.where((depth_m > 0) & torch.isfinite(depth_m), depth_m, torch.full_like(depth_m, torch.nan))
+    x = (uv_px[..., 0] - camera.cx) / camera.fx * z
+    y = (uv_px[..., 1] - camera.cy) / camera.fy * z
+    return torch.stack((x, y, z), dim=-1)
+
+
+def lift_depth(depth_m: Float[Tensor, "*B H W"], camera: Camera) -> Float[Tensor, "*B H W 3"]:
+    """Camera-frame point of every pixel of a depth image, metres; NaN where depth is missing."""
+    h, w = depth_m.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(h, dtype=depth_m.dtype, device=depth_m.device) + 0.5,
+        torch.arange(w, dtype=depth_m.dtype, device=depth_m.device) + 0.5,
+        indexing="ij",
+    )
+    uv_px = torch.stack((x, y), dim=-1).expand(*depth_m.shape, 2)
+    return lift(uv_px, depth_m, camera)
+
+
+def scale_camera(camera: Camera, *, scale: float, pad_left_px: float, pad_top_px: float, width: int, height: int) -> Camera:
+    """Intrinsics after resizing an image by ``scale`` and placing it on a canvas.
+
+    Args:
+        camera: intrinsics of the source image.
+        scale: target pixels per source pixel.
+        pad_left_px: columns left of the resized image on the canvas.
+        pad_top_px: rows above the resized image on the canvas.
+        width: canvas width, pixels.
+        height: canvas height, pixels.
+    """
+    return Camera(
+        camera.fx * scale,
+        camera.fy * scale,
+        camera.cx * scale + pad_left_px,
+        camera.cy * scale + pad_top_px,
+        width,
+        height,
+    )

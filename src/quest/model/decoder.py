@@ -1,0 +1,240 @@
+"""Queries, the decoder that lets them look at every frame of the window, and the heads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from quest.model.config import NetworkConfig
+from quest.model.layers import Attention, FeedForward, PointCode
+from quest.model.observation import Observation, Observer, cell_centres
+from quest.types import LABELS
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """What queries are bound to; it never changes after binding.
+
+    Attributes:
+        content: embedding of the entity at the frame where it was bound.
+        valid: False for padding queries, which nothing attends to.
+    """
+
+    content: Float[Tensor, "B K D"]
+    valid: Bool[Tensor, "B K"]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Answers for every frame of a window.
+
+    Attributes:
+        embedding: the queries after the decoder.
+        logits: score of every cell (empty for direct regression).
+        peak: best cell (0 for direct regression).
+        uv: coordinates in [0, 1]^2 of the input; raw for direct regression, so they may leave it.
+        point: position in the reference frame; NaN where it cannot be lifted.
+        visible_logit: is the entity seen?
+        right_logit: is the identity right?
+    """
+
+    embedding: Float[Tensor, "B T K D"]
+    logits: Float[Tensor, "B T K C"]
+    peak: Int[Tensor, "B T K"]
+    uv: Float[Tensor, "B T K 2"]
+    point: Float[Tensor, "B T K 3"]
+    visible_logit: Float[Tensor, "B T K"]
+    right_logit: Float[Tensor, "B T K"]
+
+
+class Binder(nn.Module):
+    """Makes an :class:`Anchor` from a pixel: its features, its 3D point, a label, and what surrounds it."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        d = config.width
+        self.content = nn.Linear(d + Observer.fine_width, d)
+        self.place = nn.Linear(2, d)
+        self.points = PointCode(d) if config.points3d else None
+        self.label = nn.Embedding(len(LABELS) + 1, d)
+        self.context = nn.ModuleList(Attention(d, config.heads) for _ in range(2))
+        self.mlp = nn.ModuleList(FeedForward(d) for _ in range(2))
+
+    def forward(
+        self,
+        observed: Observation,
+        uv: Float[Tensor, "B K 2"],
+        point: Float[Tensor, "B K 3"],
+        label: Int[Tensor, "B K"],
+        valid: Bool[Tensor, "B K"],
+    ) -> Anchor:
+        """Bind queries at one frame.
+
+        Args:
+            observed: that frame (T = 1).
+            uv: where, in [0, 1]^2 of the input.
+            point: lifted position in the reference frame, NaN if unknown.
+            label: index into LABELS, or ``len(LABELS)`` if unknown.
+            valid: False for padding.
+        """
+        tokens = observed.tokens[:, 0]
+        coarse = sample_grid(tokens, uv, self.config.encoder.grid)
+        fine = sample_grid(observed.fine[:, 0], uv, self.config.cells)
+        x = self.content(torch.cat((coarse, fine), dim=-1)) + self.place(2 * uv - 1) + self.label(label)
+        if self.points is not None:
+            x = x + self.points(point)
+        for attention, mlp in zip(self.context, self.mlp, strict=True):
+            x = x + attention(x, tokens)
+            x = x + mlp(x)
+        return Anchor(x, valid)
+
+
+class DecoderLayer(nn.Module):
+    """Queries look at one frame, at themselves in earlier frames, and at each other."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        d, heads = config.width, config.heads
+        self.look = Attention(d, heads)
+        self.remember = Attention(d, heads) if config.queries == "anchored" else None
+        self.compare = Attention(d, heads)
+        self.mlp = FeedForward(d)
+
+    def forward(
+        self, x: Float[Tensor, "B T K D"], tokens: Float[Tensor, "B T N D"], valid: Bool[Tensor, "B K"]
+    ) -> Float[Tensor, "B T K D"]:
+        """One round; a frame sees only itself and earlier frames."""
+        b, t, k, d = x.shape
+        flat = x.flatten(0, 1)
+        flat = flat + self.look(flat, tokens.flatten(0, 1))
+        # A padding query may see itself, so that no row of the mask is empty.
+        mask = valid[:, None, :] | torch.eye(k, dtype=torch.bool, device=x.device)
+        flat = flat + self.compare(flat, mask=mask.repeat_interleave(t, dim=0))
+        x = flat.unflatten(0, (b, t))
+        if self.remember is not None:
+            causal = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
+            per_query = x.transpose(1, 2).flatten(0, 1)
+            per_query = per_query + self.remember(per_query, mask=causal)
+            x = per_query.unflatten(0, (b, k)).transpose(1, 2)
+        return x + self.mlp(x)
+
+
+class HeatmapHead(nn.Module):
+    """A score per cell, then a sub-cell offset and a 3D offset from the cells around the best one."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        f = Observer.fine_width
+        self.key = nn.Linear(config.width, f)
+        self.offset_query = nn.Linear(config.width, f)
+        self.offset = nn.Sequential(nn.Linear(2 * f, f), nn.GELU(), nn.Linear(f, 5))
+        self.judge = nn.Sequential(nn.Linear(config.width + f + 2, f), nn.GELU(), nn.Linear(f, 2))
+
+    def logits(self, x: Float[Tensor, "B T K D"], observed: Observation) -> Float[Tensor, "B T K C"]:
+        """Match of every query with every cell."""
+        return (self.key(x) @ observed.fine.transpose(-1, -2)).float() * Observer.fine_width**-0.5
+
+    def refine(
+        self,
+        x: Float[Tensor, "B T K D"],
+        logits: Float[Tensor, "B T K C"],
+        observed: Observation,
+        peak: Int[Tensor, "B T K"],
+    ) -> tuple[Float[Tensor, "B T K 2"], Float[Tensor, "B T K 3"]]:
+        """Coordinates in [0, 1]^2 and reference point from the 3 x 3 cells around a peak."""
+        side, cell = self.config.cells, self.config.cell_px
+        step = torch.tensor([-1, 0, 1], device=peak.device)
+        row = (peak.div(side, rounding_mode="floor")[..., None, None] + step[:, None]).clamp(0, side - 1)
+        column = ((peak % side)[..., None, None] + step[None, :]).clamp(0, side - 1)
+        index = (row * side + column).flatten(-2)
+        fine = _gather_cells(observed.fine, index)
+        query = self.offset_query(x).unsqueeze(-2).expand_as(fine)
+        offset = self.offset(torch.cat((query, fine), dim=-1)).float()
+        weight = logits.gather(-1, index).softmax(dim=-1).unsqueeze(-1)
+        centre = cell_centres(self.config, device=peak.device)[index]
+        uv = (weight * (centre + cell * offset[..., :2])).sum(-2) / self.config.encoder.image_size
+        point = _gather_cells(observed.cell_point, index)
+        lifted = torch.isfinite(point).all(dim=-1, keepdim=True)
+        weight = weight * lifted
+        total = weight.sum(-2)
+        mean = (weight * (point.nan_to_num() + offset[..., 2:])).sum(-2) / total.clamp(min=1e-6)
+        return uv, torch.where(total > 1e-6, mean, torch.full_like(mean, torch.nan))
+
+    def forward(
+        self, x: Float[Tensor, "B T K D"], observed: Observation, scores: Float[Tensor, "B T K C"] | None = None
+    ) -> Prediction:
+        """Everything at the best cell.
+
+        Args:
+            x: the queries after the decoder.
+            observed: the frames.
+            scores: what decides on the best cell and weighs its neighbours; the logits if None.
+        """
+        logits = self.logits(x, observed)
+        scores = logits if scores is None else scores
+        peak = scores.argmax(dim=-1)
+        uv, point = self.refine(x, scores, observed, peak)
+        log_p = logits.log_softmax(dim=-1)
+        entropy = -(log_p.exp() * log_p).sum(-1, keepdim=True)
+        at_peak = log_p.gather(-1, peak.unsqueeze(-1))
+        fine = _gather_cells(observed.fine, peak.unsqueeze(-1)).squeeze(-2)
+        # The confidences learn from the answer, the answer never from them.
+        judged = self.judge(torch.cat((x, fine, at_peak, entropy), dim=-1).detach()).float()
+        return Prediction(x, logits, peak, uv, point, judged[..., 0], judged[..., 1])
+
+
+class RegressionHead(nn.Module):
+    """One shared MLP to coordinates and one confidence, as published."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        d = config.width
+        self.mlp = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
+
+    def forward(self, x: Float[Tensor, "B T K D"], observed: Observation) -> Prediction:
+        """Raw coordinates; the point is lifted by the network, which knows the depth."""
+        out = self.mlp(x).float()
+        empty = out.new_zeros(*out.shape[:-1], 0)
+        nowhere = torch.full((*out.shape[:-1], 3), torch.nan, device=out.device)
+        peak = torch.zeros(out.shape[:-1], dtype=torch.long, device=out.device)
+        return Prediction(x, empty, peak, out[..., :2] + 0.5, nowhere, out[..., 2], out[..., 2])
+
+
+class AffordanceHead(nn.Module):
+    """Per cell a score for every label and a sub-cell offset; its peaks seed the slots.
+
+    Reference: Zhou et al., Objects as Points, 2019, section 3.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        f = Observer.fine_width
+        self.mlp = nn.Sequential(nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, len(LABELS) + 2))
+        final = self.mlp[-1]
+        assert isinstance(final, nn.Linear)
+        nn.init.constant_(final.bias[: len(LABELS)], -4.0)
+
+    def forward(self, observed: Observation) -> tuple[Float[Tensor, "B T C L"], Float[Tensor, "B T C 2"]]:
+        """Label logits, and the offset from the cell's centre in cells."""
+        out = self.mlp(observed.fine).float()
+        return out[..., : len(LABELS)], out[..., len(LABELS) :]
+
+
+def sample_grid(cells: Float[Tensor, "B N D"], uv: Float[Tensor, "B K 2"], side: int) -> Float[Tensor, "B K D"]:
+    """Bilinear samples of a square grid of vectors at coordinates in [0, 1]^2."""
+    grid = cells.transpose(1, 2).unflatten(2, (side, side))
+    place = (2 * uv - 1).unsqueeze(1).to(grid.dtype)
+    sampled = F.grid_sample(grid, place, mode="bilinear", padding_mode="border", align_corners=False)
+    return sampled.squeeze(2).transpose(1, 2)
+
+
+def _gather_cells(cells: Float[Tensor, "B T C D"], index: Int[Tensor, "B T K M"]) -> Float[Tensor, "B T K M D"]:
+    b, t, k, m = index.shape
+    flat = index.reshape(b, t, k * m, 1).expand(-1, -1, -1, cells.shape[-1])
+    return cells.gather(2, flat).reshape(b, t, k, m, -1)

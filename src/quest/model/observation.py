@@ -1,0 +1,223 @@
+"""What the network knows of a window of frames before any query looks at it.
+
+Reference frame: the camera axes of the frame at which a stream began, centred on the scene and divided by
+the half width that the image spans at the median depth, so that coordinates are of order one for a pair of glasses
+and for a wardrobe. A NaN coordinate means that depth is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, UInt8
+from torch import Tensor, nn
+
+from quest.geometry import transform
+from quest.model.config import NetworkConfig
+from quest.model.layers import DetailStem, PointCode, TokenLayer
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Frames as the network takes them, letterboxed to its input size.
+
+    Attributes:
+        features: tokens of the encoder.
+        rgb: colours.
+        depth_m: depth along +z, 0 where missing.
+        cell_depth_m: near depth of each cell (see :func:`cell_depth`), 0 where missing.
+        intrinsics: fx, fy, cx, cy of the letterboxed input, pixels.
+        ref_from_cam: rigid motion from each frame's camera to the reference camera, metres.
+        center: origin of the reference frame in the reference camera, metres.
+        scale: metres per unit of the reference frame.
+    """
+
+    features: Float[Tensor, "B T N E"]
+    rgb: UInt8[Tensor, "B T H W 3"]
+    depth_m: Float[Tensor, "B T H W"]
+    cell_depth_m: Float[Tensor, "B T Hc Wc"]
+    intrinsics: Float[Tensor, "B 4"]
+    ref_from_cam: Float[Tensor, "B T 4 4"]
+    center: Float[Tensor, "B 3"]
+    scale: Float[Tensor, " B"]
+
+    def during(self, frames: slice) -> FrameBatch:
+        """Some of the frames."""
+        return replace(
+            self,
+            features=self.features[:, frames],
+            rgb=self.rgb[:, frames],
+            depth_m=self.depth_m[:, frames],
+            cell_depth_m=self.cell_depth_m[:, frames],
+            ref_from_cam=self.ref_from_cam[:, frames],
+        )
+
+    def to(self, device: torch.device) -> FrameBatch:
+        """The same on a device."""
+        return FrameBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+    def to_reference(self, uv_px: Float[Tensor, "B T Q 2"], depth_m: Float[Tensor, "B T Q"]) -> Float[Tensor, "B T Q 3"]:
+        """Points of the reference frame under pixels of the input; NaN where depth is 0."""
+        fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
+        z = torch.where(depth_m > 0, depth_m, torch.full_like(depth_m, torch.nan))
+        point = torch.stack(((uv_px[..., 0] - cx) / fx * z, (uv_px[..., 1] - cy) / fy * z, z), dim=-1)
+        point = transform(self.ref_from_cam[:, :, None], point)
+        return (point - self.center[:, None, None]) / self.scale[:, None, None, None]
+
+    def depth_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q"]:
+        """Depth of the pixel that each position falls in; 0 where missing or outside."""
+        h, w = self.depth_m.shape[-2:]
+        inside = (uv_px >= 0).all(-1) & (uv_px[..., 0] < w) & (uv_px[..., 1] < h)
+        x = uv_px[..., 0].nan_to_num().long().clamp(0, w - 1)
+        y = uv_px[..., 1].nan_to_num().long().clamp(0, h - 1)
+        depth = self.depth_m.flatten(-2).gather(-1, y * w + x)
+        return torch.where(inside, depth, torch.zeros_like(depth))
+
+    def near_depth_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q"]:
+        """Smallest depth in the 3 x 3 pixels around each position; 0 where all are missing.
+
+        An entity lies on an outer surface, so of a thin part and what is behind it the near one is meant.
+        """
+        step = torch.tensor([-1.0, 0.0, 1.0], device=uv_px.device)
+        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(9, 2)
+        b, t, q, _ = uv_px.shape
+        depth = self.depth_at((uv_px.unsqueeze(-2) + around).reshape(b, t, q * 9, 2)).reshape(b, t, q, 9)
+        near = torch.where(depth > 0, depth, torch.inf).amin(dim=-1)
+        return torch.where(torch.isfinite(near), near, torch.zeros_like(near))
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Tokens and cells of a window.
+
+    Attributes:
+        tokens: one per patch, with position codes.
+        fine: one per cell of the heatmap (empty without a heatmap).
+        cell_point: lifted point of each cell in the reference frame, NaN where depth is missing.
+    """
+
+    tokens: Float[Tensor, "B T N D"]
+    fine: Float[Tensor, "B T C F"]
+    cell_point: Float[Tensor, "B T C 3"]
+
+    def during(self, frames: slice) -> Observation:
+        """Some of the frames."""
+        return Observation(self.tokens[:, frames], self.fine[:, frames], self.cell_point[:, frames])
+
+    @staticmethod
+    def stack(frames: list[Observation]) -> Observation:
+        """Join observations along time."""
+        return Observation(
+            torch.cat([f.tokens for f in frames], dim=1),
+            torch.cat([f.fine for f in frames], dim=1),
+            torch.cat([f.cell_point for f in frames], dim=1),
+        )
+
+
+def cell_depth(depth_m: Float[Tensor, "B H W"], cell_px: int) -> Float[Tensor, "B Hc Wc"]:
+    """Near depth of each cell: the first quartile of its valid pixels, 0 if less than an eighth are valid.
+
+    The quartile, not the median, so that a thin handle before a large front keeps its own depth.
+    """
+    b, h, w = depth_m.shape
+    patches = depth_m.reshape(b, h // cell_px, cell_px, w // cell_px, cell_px).transpose(2, 3).flatten(3)
+    valid = patches > 0
+    ordered = torch.where(valid, patches, torch.inf).sort(dim=-1).values
+    count = valid.sum(dim=-1)
+    index = ((count - 1).clamp(min=0) * 0.25).long()
+    near = ordered.gather(-1, index.unsqueeze(-1)).squeeze(-1)
+    return torch.where(count * 8 >= cell_px * cell_px, near, torch.zeros_like(near))
+
+
+def reference_of(
+    cell_depth_m: Float[Tensor, "B Hc Wc"], intrinsics: Float[Tensor, "B 4"], image_size: int
+) -> tuple[Float[Tensor, "B 3"], Float[Tensor, " B"]]:
+    """Centre and scale of the reference frame from the first frame's depth; without depth (0, 0, 1) m and 1 m."""
+    flat = cell_depth_m.flatten(1)
+    valid = flat > 0
+    median = torch.where(valid, flat, torch.nan).nanmedian(dim=1).values
+    z = torch.where(valid.any(dim=1), median, torch.ones_like(median))
+    center = torch.stack((torch.zeros_like(z), torch.zeros_like(z), z), dim=-1)
+    scale = 0.5 * image_size * z / intrinsics[:, 0]
+    return center, torch.where(valid.any(dim=1), scale, torch.ones_like(scale))
+
+
+class Observer(nn.Module):
+    """Turns a :class:`FrameBatch` into an :class:`Observation`."""
+
+    fine_width = 128
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        grid, d = config.encoder.grid, config.width
+        self.project = nn.Linear(config.encoder.width, d)
+        self.position = nn.Parameter(0.02 * torch.randn(grid * grid, d))
+        self.layers = nn.ModuleList(TokenLayer(d, config.heads) for _ in range(config.token_layers))
+        self.norm = nn.LayerNorm(d)
+        self.points = PointCode(d) if config.points3d else None
+        if config.head == "heatmap":
+            f = self.fine_width
+            self.stem = DetailStem(f, d)
+            self.up = nn.Linear(d, 4 * f)
+            self.fine_points = PointCode(f) if config.points3d else None
+            self.fine_position = nn.Parameter(0.02 * torch.randn(config.cells**2, f))
+            self.fine_mlp = nn.Sequential(nn.LayerNorm(f), nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, f))
+            self.fine_norm = nn.LayerNorm(f)
+
+    def forward(self, frames: FrameBatch) -> Observation:
+        """Observe every frame by itself; nothing crosses time here."""
+        b, t = frames.features.shape[:2]
+        config, grid, side = self.config, self.config.encoder.grid, self.config.cells
+        tokens = self.project(frames.features) + self.position
+        cell_point = self._cell_points(frames)
+        detail = None
+        if config.head == "heatmap":
+            fine_map, token_map = self.stem(self._detail_image(frames).flatten(0, 1))
+            tokens = tokens + token_map.flatten(2).transpose(1, 2).unflatten(0, (b, t))
+            detail = fine_map.flatten(2).transpose(1, 2).unflatten(0, (b, t))
+        if self.points is not None:
+            # The nearest of a patch's four cells: the one that a thin part would fill.
+            quads = cell_point.reshape(b, t, grid, 2, grid, 2, 3).transpose(3, 4).flatten(4, 5)
+            z = torch.where(torch.isfinite(quads[..., 2]), quads[..., 2], torch.inf)
+            nearest = z.argmin(dim=-1)[..., None, None].expand(*z.shape[:-1], 1, 3)
+            tokens = tokens + self.points(quads.gather(-2, nearest).squeeze(-2).flatten(2, 3))
+        flat = tokens.flatten(0, 1)
+        for layer in self.layers:
+            flat = layer(flat)
+        flat = self.norm(flat)
+        if detail is None:
+            return Observation(flat.unflatten(0, (b, t)), flat.new_zeros(b, t, 0, 0), cell_point)
+        up = self.up(flat).reshape(b * t, grid, grid, 2, 2, -1).transpose(2, 3).reshape(b, t, side * side, -1)
+        fine = detail + up + self.fine_position
+        if self.fine_points is not None:
+            fine = fine + self.fine_points(cell_point)
+        fine = self.fine_norm(fine + self.fine_mlp(fine))
+        return Observation(flat.unflatten(0, (b, t)), fine, cell_point)
+
+    def _cell_points(self, frames: FrameBatch) -> Float[Tensor, "B T C 3"]:
+        b, t = frames.features.shape[:2]
+        centre = cell_centres(self.config, device=frames.depth_m.device).expand(b, t, -1, -1)
+        return frames.to_reference(centre, frames.cell_depth_m.flatten(2))
+
+    def _detail_image(self, frames: FrameBatch) -> Float[Tensor, "B T 7 H W"]:
+        rgb = frames.rgb.permute(0, 1, 4, 2, 3).to(frames.depth_m.dtype) / 127.5 - 1
+        if not self.config.points3d:
+            return F.pad(rgb, (0, 0, 0, 0, 0, 4))
+        b, t, h, w = frames.depth_m.shape
+        y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
+        uv = torch.stack((x, y), dim=-1).to(frames.depth_m).reshape(1, 1, h * w, 2).expand(b, t, -1, -1)
+        point = frames.to_reference(uv, frames.depth_m.flatten(2))
+        valid = torch.isfinite(point[..., :1])
+        point = torch.where(valid, point, torch.zeros_like(point)).clamp(-4, 4)
+        geometry = torch.cat((point, valid.to(point.dtype)), dim=-1).transpose(2, 3).reshape(b, t, 4, h, w)
+        return torch.cat((rgb, geometry), dim=2)
+
+
+def cell_centres(config: NetworkConfig, *, device: torch.device | None = None) -> Float[Tensor, "C 2"]:
+    """Centre pixel of every cell of the heatmap, row by row."""
+    side = (torch.arange(config.cells, device=device) + 0.5) * config.cell_px
+    y, x = torch.meshgrid(side, side, indexing="ij")
+    return torch.stack((x, y), dim=-1).reshape(-1, 2)

@@ -1,0 +1,170 @@
+"""Finding a Vulkan driver that can render, without importing SAPIEN.
+
+Vulkan drivers announce themselves by small JSON files (an *installable client driver*, ICD). This
+module picks the one that SAPIEN can use and puts it into the environment before SAPIEN is imported:
+the user's own choice, else an NVIDIA driver where a GPU is present, else SwiftShader, the software
+renderer that ships with Chromium and Chrome, else a recent enough lavapipe.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from quest.errors import RendererError
+
+ICD_VARIABLES = ("VK_DRIVER_FILES", "VK_ICD_FILENAMES")
+"""Variables by which the Vulkan loader is told what to load; the first one wins."""
+
+ICD_FOLDERS = (
+    "etc/vulkan/icd.d",
+    "usr/share/vulkan/icd.d",
+    "usr/local/share/vulkan/icd.d",
+    "usr/local/etc/vulkan/icd.d",
+)
+
+SWIFTSHADER_PLACES = (
+    "usr/lib/chromium/vk_swiftshader_icd.json",
+    "usr/lib64/chromium-browser/vk_swiftshader_icd.json",
+    "usr/lib/chromium-browser/vk_swiftshader_icd.json",
+    "opt/google/chrome/vk_swiftshader_icd.json",
+    "opt/microsoft/msedge/vk_swiftshader_icd.json",
+    "opt/brave.com/brave/vk_swiftshader_icd.json",
+    "snap/chromium/current/usr/lib/chromium-browser/vk_swiftshader_icd.json",
+)
+
+LIBRARY_FOLDERS = (
+    "usr/lib/x86_64-linux-gnu",
+    "usr/lib/aarch64-linux-gnu",
+    "usr/lib64",
+    "usr/lib",
+    "usr/local/nvidia/lib64",
+    "usr/lib/wsl/lib",
+)
+
+LAVAPIPE_MIN_HEADER = 302
+"""Vulkan header revision of Mesa 24.3, the first whose lavapipe has the external handles that SAPIEN asks for."""
+
+REMEDY = (
+    "install a software renderer with `make render-deps` (Debian and Ubuntu: `apt-get install chromium libvulkan1`; "
+    "elsewhere: Chromium or Google Chrome from your package manager), or install the NVIDIA driver with its graphics "
+    "libraries, or name a driver yourself with VK_ICD_FILENAMES=/path/to/icd.json"
+)
+
+DriverKind = Literal["chosen", "nvidia", "swiftshader", "lavapipe", "system"]
+
+
+@dataclass(frozen=True)
+class VulkanDriver:
+    """A Vulkan driver that can render.
+
+    Attributes:
+        kind: ``chosen`` by the user's environment, ``nvidia``, ``swiftshader``, ``lavapipe``, or ``system`` where the
+            platform brings its own (macOS, Windows).
+        icd: the driver's JSON file, or the list of files that the user chose; None where the loader finds it by itself.
+    """
+
+    kind: DriverKind
+    icd: str | None
+
+    @property
+    def on_gpu(self) -> bool | None:
+        """Whether it renders on a GPU; None if that cannot be told from the files."""
+        return {"nvidia": True, "swiftshader": False, "lavapipe": False}.get(self.kind)
+
+    def __str__(self) -> str:
+        return self.kind if self.icd is None else f"{self.kind} ({self.icd})"
+
+
+def find_vulkan_icd(*, environ: Mapping[str, str] | None = None, root: Path = Path("/")) -> VulkanDriver | None:
+    """Find the Vulkan driver that rendering should use.
+
+    Args:
+        environ: environment variables; those of the process by default.
+        root: where the file system starts (tests give a folder of their own).
+
+    Returns:
+        The driver, or None if there is none that is known to work.
+
+    Raises:
+        RendererError: the user's environment names drivers that do not exist.
+    """
+    environ = os.environ if environ is None else environ
+    chosen = _chosen_by_user(environ)
+    if chosen is not None:
+        return chosen
+    if not sys.platform.startswith("linux"):
+        return VulkanDriver("system", None)
+    return _find_nvidia(root) or _find_swiftshader(root) or _find_lavapipe(root)
+
+
+def prepare_renderer() -> VulkanDriver:
+    """Choose the Vulkan driver of this process; call it before SAPIEN is imported.
+
+    Returns:
+        The driver that SAPIEN will load.
+
+    Raises:
+        RendererError: no driver is known to work; the message says what to install.
+    """
+    driver = find_vulkan_icd()
+    if driver is None:
+        raise RendererError(f"no Vulkan driver here can render (looked for NVIDIA's, SwiftShader, lavapipe): {REMEDY}")
+    if driver.kind != "chosen" and driver.icd is not None:
+        # The older name of the variable is understood by every loader, SAPIEN's own included.
+        os.environ["VK_ICD_FILENAMES"] = driver.icd
+    return driver
+
+
+def _chosen_by_user(environ: Mapping[str, str]) -> VulkanDriver | None:
+    for variable in ICD_VARIABLES:
+        value = environ.get(variable, "")
+        if not value:
+            continue
+        missing = [name for name in value.split(os.pathsep) if not Path(name).exists()]
+        if missing:
+            raise RendererError(
+                f"{variable} names {', '.join(missing)}, which does not exist; "
+                f"unset {variable} to let quest search, or correct it"
+            )
+        return VulkanDriver("chosen", value)
+    return None
+
+
+def _find_nvidia(root: Path) -> VulkanDriver | None:
+    # A container may show the device without the driver's graphics libraries; Vulkan then finds nothing.
+    device = (root / "dev/nvidia0").exists() or (root / "dev/nvidiactl").exists()
+    library = any((root / folder / "libGLX_nvidia.so.0").exists() for folder in LIBRARY_FOLDERS)
+    if not (device and library):
+        return None
+    icd = _first_icd(root, "nvidia_icd*.json")
+    # Without a file of the driver's own, SAPIEN brings one.
+    return VulkanDriver("nvidia", None if icd is None else str(icd))
+
+
+def _find_swiftshader(root: Path) -> VulkanDriver | None:
+    for place in SWIFTSHADER_PLACES:
+        icd = root / place
+        if icd.is_file():
+            return VulkanDriver("swiftshader", str(icd))
+    return None
+
+
+def _find_lavapipe(root: Path) -> VulkanDriver | None:
+    icd = _first_icd(root, "lvp_icd*.json")
+    if icd is None:
+        return None
+    try:
+        header = int(str(json.loads(icd.read_text())["ICD"]["api_version"]).split(".")[2])
+    except (OSError, ValueError, KeyError, IndexError, TypeError):
+        return None  # an unreadable announcement is as good as none
+    return VulkanDriver("lavapipe", str(icd)) if header >= LAVAPIPE_MIN_HEADER else None
+
+
+def _first_icd(root: Path, pattern: str) -> Path | None:
+    return next((icd for folder in ICD_FOLDERS for icd in sorted((root / folder).glob(pattern))), None)

@@ -1,0 +1,167 @@
+"""Rigid bodies and the joints between them: geometry and forward kinematics, in metres.
+
+Links joined by fixed joints are one body, so that a handle bolted to a door moves as part of that
+door. Body 0 is everything that never moves; body ``1 + j`` is what joint ``j`` carries.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from quest.types import Joint
+
+MAX_TURN_RAD = np.deg2rad(110)
+"""How far a revolute joint is turned from rest at most."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One visual mesh or primitive of a body.
+
+    Attributes:
+        name: name that tells what it is (``handle-14``, ``drawer_front-31``); empty if unknown.
+        body: index of the body that it belongs to.
+        body_from_part: pose in the body, metres.
+        mesh: mesh file, or None for a primitive.
+        scale: factors from the mesh file's units to metres, per axis.
+        shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
+        size_m: edge lengths; or radius and length; or radius.
+        rgba: colour given by the URDF, or None.
+        surface: the geometry in the body's frame, metres.
+    """
+
+    name: str
+    body: int
+    body_from_part: Float[np.ndarray, "4 4"]
+    mesh: Path | None
+    scale: tuple[float, float, float]
+    shape: str
+    size_m: tuple[float, ...]
+    rgba: tuple[float, float, float, float] | None
+    surface: trimesh.Trimesh
+
+
+@dataclass(frozen=True)
+class ArticulatedJoint:
+    """A moving joint; it carries body ``1 + its index``.
+
+    Attributes:
+        joint: name, kind and limits (radians or metres).
+        parent: index of the parent body.
+        parent_from_joint: pose of the joint frame in the parent body, metres.
+        axis: unit direction in the joint frame; the axis passes through its origin.
+        rest: closed position: zero, clamped into the limits.
+    """
+
+    joint: Joint
+    parent: int
+    parent_from_joint: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, "3"]
+    rest: float
+
+    def travel(self) -> tuple[float, float]:
+        """How far the joint can go below and above its rest position, both >= 0, radians or metres."""
+        cap = MAX_TURN_RAD if self.joint.kind == "revolute" else np.inf
+        return min(self.rest - self.joint.lower, cap), min(self.joint.upper - self.rest, cap)
+
+    def opening(self) -> float:
+        """Signed travel from rest to the limit that is farther away."""
+        below, above = self.travel()
+        return above if above >= below else -below
+
+    def motion(self, position: float) -> Float[np.ndarray, "4 4"]:
+        """Displacement of the joint's child at a position, in the joint frame."""
+        matrix = np.eye(4)
+        if self.joint.kind == "prismatic":
+            matrix[:3, 3] = position * self.axis
+            return matrix
+        # Rodrigues' formula.
+        x, y, z = self.axis
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        matrix[:3, :3] += np.sin(position) * cross + (1 - np.cos(position)) * cross @ cross
+        return matrix
+
+
+@dataclass(frozen=True)
+class Articulation:
+    """The bodies and joints of one object.
+
+    Attributes:
+        body_names: name per body.
+        parts: all visuals, of all bodies.
+        joints: moving joints, parents before children; joint ``j`` carries body ``1 + j``.
+        world_from_root: where the root body stands in the world (z up, floor at 0, front towards +x).
+    """
+
+    body_names: tuple[str, ...]
+    parts: tuple[Part, ...]
+    joints: tuple[ArticulatedJoint, ...]
+    world_from_root: Float[np.ndarray, "4 4"]
+
+    @property
+    def rest(self) -> Float[np.ndarray, " J"]:
+        """Position of every joint when closed."""
+        return np.array([j.rest for j in self.joints])
+
+    def poses(self, position: Float[np.ndarray, " J"]) -> Float[np.ndarray, "B 4 4"]:
+        """``world_from_body`` of every body at given joint positions."""
+        poses = np.empty((1 + len(self.joints), 4, 4))
+        poses[0] = self.world_from_root
+        for j, joint in enumerate(self.joints):
+            poses[1 + j] = poses[joint.parent] @ joint.parent_from_joint @ joint.motion(position[j])
+        return poses
+
+    def axes(self, poses: Float[np.ndarray, "B 4 4"]) -> Float[np.ndarray, "J 6"]:
+        """Origin and unit direction of every joint's axis in the world, given the bodies' poses."""
+        frames = [poses[j.parent] @ j.parent_from_joint for j in self.joints]
+        lines = [(*f[:3, 3], *(f[:3, :3] @ j.axis)) for f, j in zip(frames, self.joints, strict=True)]
+        return np.array(lines).reshape(-1, 6)
+
+    def body_parts(self, body: int) -> list[int]:
+        """Indices of the parts of a body."""
+        return [i for i, part in enumerate(self.parts) if part.body == body]
+
+    @cached_property
+    def body_points(self) -> list[Float[np.ndarray, "N 3"]]:
+        """Vertices of every body in its own frame."""
+        empty = np.zeros((0, 3))
+        return [
+            np.concatenate([empty, *(np.asarray(self.parts[i].surface.vertices) for i in self.body_parts(b))])
+            for b in range(len(self.body_names))
+        ]
+
+    @cached_property
+    def body_hulls(self) -> list[Float[np.ndarray, "N 3"]]:
+        """A few points of every body, in its own frame, that bound it: corners of its hull, thinned to 200."""
+        hulls = []
+        for points in self.body_points:
+            if len(points) > 8:
+                # Extreme points along fixed directions: no hull library fails on flat bodies this way.
+                directions = np.random.default_rng(0).normal(size=(200, 3))
+                points = points[np.unique((points @ directions.T).argmax(axis=0))]
+            hulls.append(points)
+        return hulls
+
+    def world_points(self, position: Float[np.ndarray, " J"]) -> Float[np.ndarray, "N 3"]:
+        """All vertices in the world at given joint positions."""
+        poses = self.poses(position)
+        return np.concatenate([apply(pose, points) for pose, points in zip(poses, self.body_points, strict=True)])
+
+    def velocity(self, joint: int, point: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:
+        """World velocity, per unit of opening, of world points on a joint's body when everything is at rest."""
+        line = self.axes(self.poses(self.rest))[joint]
+        sign = 1.0 if self.joints[joint].opening() >= 0 else -1.0
+        if self.joints[joint].joint.kind == "prismatic":
+            return np.broadcast_to(sign * line[3:], point.shape)
+        return sign * np.cross(line[3:], point - line[:3])
+
+
+def apply(matrix: Float[np.ndarray, "4 4"], point: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:
+    """Points after a rigid or affine transform."""
+    return point @ matrix[:3, :3].T + matrix[:3, 3]

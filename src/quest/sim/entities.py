@@ -1,0 +1,245 @@
+"""Where the entities of an object are: points fixed in a body that a tracker can follow.
+
+A moving body carries one entity per handle or knob; without any, the rim of what turns or the front
+of what slides. Every revolute joint also has a hinge, which is reported apart and listed last.
+
+The point of an entity lies on the *outer* surface: among surface samples that can be seen from in
+front of the closed object, the one nearest to a target. The target is the part's area-weighted
+centroid (handle, knob), the middle of the edge farthest from the axis (rim), or the middle of the face
+that the body moves towards (front).
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+
+import numpy as np
+import trimesh
+from jaxtyping import Bool, Float
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from quest.sim.articulation import Articulation, apply
+
+MOVES_AT_LEAST = 0.1
+"""A joint counts as movable if an entity on it moves this far over its range, normalised units."""
+
+HANDLE_GAP = 0.03
+"""Parts named as handles that come closer than this, normalised units, are one handle."""
+
+_NAMED = re.compile(r"(?:^|[^a-z])(handle|knob)", re.IGNORECASE)
+_SAMPLES = 600
+# Directions towards the cameras: azimuth from the front, elevation.
+_SEEN_FROM_DEG = tuple((a, e) for a in (-45, -15, 15, 45) for e in (10, 30, 50))
+
+
+@dataclass(frozen=True)
+class SimEntity:
+    """An entity of a simulated object.
+
+    Attributes:
+        name: unique within the object, such as ``link_0/handle``.
+        label: ``handle``, ``knob``, ``rim``, ``front`` or ``hinge``.
+        joint: index of the joint that moves it; its body is ``1 + joint``.
+        point: where it is in its body, metres.
+        parts: indices of the parts that it is made of; empty for rims, fronts and hinges.
+        travel_m: how far it gets from its place at rest when only its joint moves.
+        inside: whether nothing of it can be seen from the front while the object is closed.
+    """
+
+    name: str
+    label: str
+    joint: int
+    point: Float[np.ndarray, "3"]
+    parts: tuple[int, ...]
+    travel_m: float
+    inside: bool
+
+    @property
+    def body(self) -> int:
+        """Index of the body that carries it."""
+        return 1 + self.joint
+
+
+def part_label(name: str) -> str | None:
+    """``handle`` or ``knob`` if a part's name says so, else None."""
+    match = _NAMED.search(name)
+    return match.group(1).lower() if match else None
+
+
+def find_entities(articulation: Articulation, half_diagonal_m: float) -> tuple[SimEntity, ...]:
+    """All entities of an object, hinges last; positions as described at the top of this module.
+
+    Args:
+        articulation: the object, standing in the world with its front towards +x.
+        half_diagonal_m: half the diagonal of its bounding box at rest.
+    """
+    surfaces = _Surfaces(articulation, half_diagonal_m)
+    named: list[SimEntity] = []
+    unnamed: list[SimEntity] = []
+    hinges: list[SimEntity] = []
+    for j, joint in enumerate(articulation.joints):
+        parts = articulation.body_parts(1 + j)
+        if not parts:
+            continue
+        handles = _handles(articulation, j, surfaces, half_diagonal_m)
+        named += handles
+        if not handles:
+            label = "rim" if joint.joint.kind == "revolute" else "front"
+            target = surfaces.rim_target(j) if label == "rim" else surfaces.front_target(j)
+            unnamed.append(_entity(articulation, j, label, *surfaces.outer_point(parts, target), ()))
+        if joint.joint.kind == "revolute":
+            hinges.append(_entity(articulation, j, "hinge", surfaces.hinge_point(j), False, ()))
+    # A button's or turntable's face is a nuisance unless it is all that there is.
+    followed = [e for e in unnamed if e.travel_m >= MOVES_AT_LEAST * half_diagonal_m]
+    if not named and not followed:
+        followed = unnamed
+    kept = sorted(named + followed, key=lambda e: e.joint)
+    return _with_unique_names(kept + hinges)
+
+
+def _handles(
+    articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float
+) -> list[SimEntity]:
+    found = []
+    for label in ("handle", "knob"):
+        parts = [i for i in articulation.body_parts(1 + joint) if part_label(articulation.parts[i].name) == label]
+        for group in _near_groups([articulation.parts[i].surface for i in parts], HANDLE_GAP * half_diagonal_m):
+            members = tuple(parts[i] for i in group)
+            meshes = [articulation.parts[i].surface for i in members]
+            area = np.concatenate([m.area_faces for m in meshes])
+            centres = np.concatenate([m.triangles_center for m in meshes])
+            target = np.average(centres, axis=0, weights=area) if area.sum() > 0 else centres.mean(axis=0)
+            point, inside = surfaces.outer_point(list(members), target)
+            found.append(_entity(articulation, joint, label, point, inside, members))
+    return found
+
+
+def _entity(
+    articulation: Articulation, joint: int, label: str, point: Float[np.ndarray, "3"], inside: bool, parts: tuple[int, ...]
+) -> SimEntity:
+    rest = articulation.rest
+    start = apply(articulation.poses(rest)[1 + joint], point)
+    travel = 0.0
+    for share in (0.25, 0.5, 0.75, 1.0):
+        moved = rest.copy()
+        moved[joint] += share * articulation.joints[joint].opening()
+        travel = max(travel, float(np.linalg.norm(apply(articulation.poses(moved)[1 + joint], point) - start)))
+    return SimEntity(f"{articulation.body_names[1 + joint]}/{label}", label, joint, point, parts, travel, inside)
+
+
+def _with_unique_names(entities: list[SimEntity]) -> tuple[SimEntity, ...]:
+    named, count = [], {}
+    for e in entities:
+        count[e.name] = count.get(e.name, 0) + 1
+        name = e.name if count[e.name] == 1 else f"{e.name}_{count[e.name]}"
+        named.append(replace(e, name=name))
+    return tuple(named)
+
+
+def _near_groups(meshes: list[trimesh.Trimesh], gap: float) -> list[list[int]]:
+    """Groups of meshes that are connected by gaps below ``gap``."""
+    if not meshes:
+        return []
+    points = [_sample(m, 300)[0] for m in meshes]
+    trees = [cKDTree(p) for p in points]
+    near = np.eye(len(meshes), dtype=bool)
+    for a in range(len(meshes)):
+        for b in range(a):
+            near[a, b] = near[b, a] = trees[a].query(points[b])[0].min() < gap
+    count, group = connected_components(near, directed=False)
+    return [np.flatnonzero(group == g).tolist() for g in range(count)]
+
+
+def _sample(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
+    """Area-weighted surface samples (with the vertices of very small meshes) and their normals; always the same."""
+    rng = np.random.default_rng(0)
+    area = np.asarray(mesh.area_faces)
+    weights = area / area.sum() if area.sum() > 0 else np.full(len(area), 1 / len(area))
+    face = rng.choice(len(area), size=count, p=weights)
+    u, v = rng.random((2, count, 1))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    corner = np.asarray(mesh.triangles)[face]
+    points = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
+    return points, np.asarray(mesh.face_normals)[face]
+
+
+class _Surfaces:
+    """Surfaces of an object at rest, with what can be seen of them from the front."""
+
+    def __init__(self, articulation: Articulation, half_diagonal_m: float) -> None:
+        self._articulation = articulation
+        self._half_diagonal_m = half_diagonal_m
+        self._poses = articulation.poses(articulation.rest)
+        self._world = [p.surface.copy().apply_transform(self._poses[p.body]) for p in articulation.parts]
+        self._scene = trimesh.util.concatenate(self._world)
+        angles = np.deg2rad(_SEEN_FROM_DEG)
+        azimuth, elevation = angles[:, 0], angles[:, 1]
+        self._towards = np.stack(
+            (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)), axis=-1
+        )
+
+    def outer_point(self, parts: list[int], target: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], bool]:
+        """The outer surface sample of some parts that is nearest to a target, both in their body's frame.
+
+        Also tells whether it is inside: whether nothing near the target can be seen from the front.
+        """
+        body = self._articulation.parts[parts[0]].body
+        area = np.array([max(self._world[i].area, 1e-12) for i in parts])
+        counts = np.maximum(20, np.ceil(2 * _SAMPLES * area / area.sum())).astype(int)
+        points = np.concatenate([_sample(self._world[i], n)[0] for i, n in zip(parts, counts, strict=True)])
+        goal = apply(self._poses[body], target)
+        # Rays are cast for the samples nearest to the target only: they decide.
+        points = points[np.argsort(np.linalg.norm(points - goal, axis=1), kind="stable")[:_SAMPLES]]
+        outer, inside = self._outer(points, body)
+        points = points[outer]
+        nearest = points[np.argmin(np.linalg.norm(points - goal, axis=1))]
+        return apply(np.linalg.inv(self._poses[body]), nearest), inside
+
+    def _outer(self, points: Float[np.ndarray, "N 3"], body: int) -> tuple[Bool[np.ndarray, " N"], bool]:
+        seen = self._seen_share(points, self._scene)
+        inside = bool(seen.max() == 0)
+        if inside:
+            # Inside the closed object: judge the body alone, as it will look when pulled out.
+            own = [self._world[i] for i in self._articulation.body_parts(body)]
+            seen = self._seen_share(points, trimesh.util.concatenate(own))
+        return seen >= 0.5 * seen.max(), inside
+
+    def _seen_share(self, points: Float[np.ndarray, "N 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " N"]:
+        origin = points[:, None] + 2e-3 * self._half_diagonal_m * self._towards
+        direction = np.broadcast_to(self._towards, origin.shape)
+        hit = mesh.ray.intersects_any(origin.reshape(-1, 3), direction.reshape(-1, 3))
+        return 1.0 - np.asarray(hit).reshape(len(points), -1).mean(axis=1)
+
+    def _body_samples(self, joint: int) -> Float[np.ndarray, "N 3"]:
+        parts = self._articulation.body_parts(1 + joint)
+        vertices = self._articulation.body_points[1 + joint]
+        return np.concatenate([vertices, *(_sample(self._articulation.parts[i].surface, 200)[0] for i in parts)])
+
+    def rim_target(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Middle of the edge farthest from the axis, in the body's frame (whose origin lies on the axis)."""
+        points, axis = self._body_samples(joint), self._articulation.joints[joint].axis
+        along = points @ axis
+        radial = points - along[:, None] * axis
+        radius = np.linalg.norm(radial, axis=1)
+        edge = radius >= radius.max() - 0.03 * self._half_diagonal_m
+        middle = (along[edge].min() + along[edge].max()) / 2
+        return np.median(radial[edge], axis=0) + middle * axis
+
+    def front_target(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Middle of the face that the body moves towards, in the body's frame."""
+        points = self._body_samples(joint)
+        sign = 1.0 if self._articulation.joints[joint].opening() >= 0 else -1.0
+        towards = sign * self._articulation.joints[joint].axis
+        along = points @ towards
+        face = points[along >= along.max() - 0.05 * self._half_diagonal_m]
+        middle = (face.min(axis=0) + face.max(axis=0)) / 2
+        return middle + (along.max() - middle @ towards) * towards
+
+    def hinge_point(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Middle of the body's extent along the axis, on the axis, in the body's frame."""
+        axis = self._articulation.joints[joint].axis
+        along = self._articulation.body_points[1 + joint] @ axis
+        return (along.min() + along.max()) / 2 * axis

@@ -1,0 +1,131 @@
+"""Which takes a run makes, and where their objects come from."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from quest.errors import ObjectError
+from quest.sim.generate import take_name
+from quest.sim.objects import SimObject, find_objects, load_object
+from quest.sim.procedural import CATEGORIES, category_for_seed, make_object
+
+
+@dataclass(frozen=True)
+class TakeSpec:
+    """One take to make.
+
+    Attributes:
+        source: ``partnet`` or ``procedural``.
+        object_id: folder name, or ``category-seed``.
+        level: how many joints move.
+        seed: of the take.
+    """
+
+    source: str
+    object_id: str
+    level: int
+    seed: int
+
+    @property
+    def name(self) -> str:
+        """Name of the take in its store."""
+        return take_name(self.object_id, self.level, self.seed)
+
+
+def plan_takes(
+    objects: Iterable[tuple[str, str]], *, levels: Sequence[int], takes_per_object: int, first_seed: int = 0
+) -> list[TakeSpec]:
+    """Takes of every object at every level, all objects once before any comes again.
+
+    Args:
+        objects: source and id of each.
+        levels: levels to make.
+        takes_per_object: takes per object and level.
+        first_seed: seed of the first take of each object; the others count up.
+    """
+    chosen = list(objects)
+    return [
+        TakeSpec(source, object_id, level, first_seed + n)
+        for n in range(takes_per_object)
+        for level in levels
+        for source, object_id in chosen
+    ]
+
+
+def parse_object(text: str) -> list[tuple[str, str]]:
+    """Sources and ids of ``partnet:44817,23724``, ``procedural:chest-12`` or ids alone (PartNet-Mobility).
+
+    Raises:
+        ObjectError: the source is unknown or no id is given.
+    """
+    source, colon, ids = text.partition(":")
+    if not colon:
+        source, ids = "partnet", text
+    names = [name.strip() for name in ids.split(",") if name.strip()]
+    if source not in ("partnet", "procedural") or not names:
+        raise ObjectError(
+            f"objects {text!r}: expected partnet:ID,ID or procedural:CATEGORY-SEED, such as partnet:44817,23724"
+        )
+    return [(source, name) for name in names]
+
+
+def procedural_objects(count: int, first_seed: int) -> list[tuple[str, str]]:
+    """``count`` procedural objects, one per object seed, in the usual mix of categories."""
+    return [("procedural", f"{category_for_seed(seed)}-{seed}") for seed in range(first_seed, first_seed + count)]
+
+
+class ObjectShelf:
+    """Loads objects by source and id, and keeps them; procedural ones are made in a temporary folder.
+
+    Args:
+        root: folder of PartNet-Mobility folders; default is the environment's ``QUEST_OBJECTS``.
+    """
+
+    def __init__(self, root: Path | None = None) -> None:
+        self._root = root
+        self._folders: dict[str, Path] | None = None
+        self._made = tempfile.TemporaryDirectory(prefix="quest-objects-")
+        self._loaded: dict[tuple[str, str], SimObject | ObjectError] = {}
+
+    def __enter__(self) -> ObjectShelf:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._made.cleanup()
+
+    def load(self, source: str, object_id: str) -> SimObject:
+        """An object; one that failed before fails again without being read again.
+
+        Raises:
+            ObjectError: there is no such object, or it cannot be used.
+        """
+        key = (source, object_id)
+        if key not in self._loaded:
+            try:
+                self._loaded[key] = load_object(self._folder(source, object_id))
+            except ObjectError as error:
+                self._loaded[key] = error
+        found = self._loaded[key]
+        if isinstance(found, ObjectError):
+            raise found
+        return found
+
+    def _folder(self, source: str, object_id: str) -> Path:
+        if source == "procedural":
+            category, _, seed = object_id.rpartition("-")
+            if category not in CATEGORIES or not seed.isdigit():
+                raise ObjectError(
+                    f"procedural object {object_id!r}: expected CATEGORY-SEED with one of {', '.join(CATEGORIES)}"
+                )
+            return make_object(category, int(seed), Path(self._made.name) / object_id)
+        if self._folders is None:
+            self._folders = {folder.name: folder for folder in find_objects(self._root)}
+        if object_id not in self._folders:
+            raise ObjectError(
+                f"object {object_id!r}: expected one of the {len(self._folders)} folders of PartNet-Mobility objects, "
+                f"found none of that name; check the id and the folder"
+            )
+        return self._folders[object_id]

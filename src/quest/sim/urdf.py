@@ -1,0 +1,211 @@
+"""Reading a URDF file: links with their visuals, and joints, as plain records in URDF units.
+
+Only what a kinematic playback needs is read: visuals, origins, joint types, axes and limits.
+Collisions, inertias and transmissions are ignored.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.errors import ObjectError
+
+CONTINUOUS_RANGE_RAD = np.pi / 2
+"""How far a joint without limits is taken to turn."""
+
+_JOINT_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+
+
+@dataclass(frozen=True)
+class UrdfVisual:
+    """One visual of a URDF link: a mesh file or a primitive.
+
+    Attributes:
+        name: the visual's name; empty where the file gives none.
+        link_from_visual: pose in its URDF link.
+        mesh: mesh file, or None for a primitive.
+        scale: factors per axis of the mesh.
+        shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
+        size: box edge lengths; or radius and length (cylinder); or radius (sphere).
+        rgba: colour of the visual's material, or None.
+    """
+
+    name: str
+    link_from_visual: Float[np.ndarray, "4 4"]
+    mesh: Path | None
+    scale: tuple[float, float, float]
+    shape: str
+    size: tuple[float, ...]
+    rgba: tuple[float, float, float, float] | None
+
+
+@dataclass(frozen=True)
+class UrdfJoint:
+    """One joint of a URDF.
+
+    Attributes:
+        name: the joint's name.
+        kind: ``revolute``, ``prismatic`` or ``fixed``.
+        parent: name of the parent link.
+        child: name of the child link.
+        parent_from_joint: pose of the joint's frame in the parent link.
+        axis: unit direction in the joint's frame.
+        lower: lower limit, radians or URDF units.
+        upper: upper limit, radians or URDF units.
+    """
+
+    name: str
+    kind: str
+    parent: str
+    child: str
+    parent_from_joint: Float[np.ndarray, "4 4"]
+    axis: Float[np.ndarray, "3"]
+    lower: float
+    upper: float
+
+
+@dataclass(frozen=True)
+class Urdf:
+    """A parsed URDF: visuals per link name, and joints ordered from the root to the leaves."""
+
+    links: dict[str, tuple[UrdfVisual, ...]]
+    joints: tuple[UrdfJoint, ...]
+
+
+def read_urdf(path: Path) -> Urdf:
+    """Reads a URDF file.
+
+    Raises:
+        ObjectError: the file is missing, is not XML, or its links do not form a tree.
+    """
+    try:
+        root = ElementTree.parse(path).getroot()
+    except FileNotFoundError:
+        raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf") from None
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        raise ObjectError(f"{path}: not a readable URDF ({error}); restore the file from its source") from None
+    colours = {m.get("name"): rgba for m in root.findall("material") if (rgba := _rgba(m)) is not None}
+    try:
+        links = {
+            link.attrib["name"]: tuple(_visual(v, path.parent, colours) for v in link.findall("visual"))
+            for link in root.findall("link")
+        }
+        joints = [_joint(joint) for joint in root.findall("joint")]
+    except (KeyError, ValueError, AttributeError) as error:
+        raise ObjectError(
+            f"{path}: a link, visual or joint lacks a field or has an unreadable one ({error!r}); "
+            "restore the file from its source"
+        ) from None
+    return Urdf(links, _ordered(joints, links, path))
+
+
+def pose_matrix(xyz: Float[np.ndarray, "3"], rpy: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
+    """Pose of a URDF origin: fixed-axis roll, pitch, yaw, then a translation."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    matrix = np.eye(4)
+    matrix[:3, :3] = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    matrix[:3, 3] = xyz
+    return matrix
+
+
+def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
+    if text is None:
+        return np.array(default)
+    values = np.array([float(v) for v in text.split()])
+    if values.shape != (len(default),) or not np.isfinite(values).all():
+        raise ValueError(f"expected {len(default)} finite numbers, got {text!r}")
+    return values
+
+
+def _origin(element: ElementTree.Element) -> Float[np.ndarray, "4 4"]:
+    origin = element.find("origin")
+    attributes = {} if origin is None else origin.attrib
+    return pose_matrix(_numbers(attributes.get("xyz"), (0, 0, 0)), _numbers(attributes.get("rpy"), (0, 0, 0)))
+
+
+def _rgba(material: ElementTree.Element) -> tuple[float, float, float, float] | None:
+    colour = material.find("color")
+    if colour is None or colour.get("rgba") is None:
+        return None
+    r, g, b, a = _numbers(colour.get("rgba"), (0, 0, 0, 1)).tolist()
+    return (r, g, b, a)
+
+
+def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVisual:
+    geometry = element.find("geometry")
+    shape = None if geometry is None else next(iter(geometry), None)
+    if shape is None:
+        raise ValueError(f"visual {element.get('name')!r} has no geometry")
+    mesh, scale, size = None, np.ones(3), np.zeros(0)
+    if shape.tag == "mesh":
+        mesh = folder / shape.attrib["filename"].removeprefix("file://").removeprefix("package://")
+        scale_text = shape.get("scale")
+        scale = _numbers(scale_text, (1, 1, 1)) if len((scale_text or "1 1 1").split()) == 3 else np.full(3, float(scale_text or 1))
+    elif shape.tag == "box":
+        size = _numbers(shape.attrib["size"], (0, 0, 0))
+    elif shape.tag == "cylinder":
+        size = np.array([float(shape.attrib["radius"]), float(shape.attrib["length"])])
+    elif shape.tag == "sphere":
+        size = np.array([float(shape.attrib["radius"])])
+    else:
+        raise ValueError(f"unknown geometry {shape.tag!r}")
+    material = element.find("material")
+    rgba = None if material is None else _rgba(material) or colours.get(material.get("name"))
+    sx, sy, sz = scale.tolist()
+    return UrdfVisual(element.get("name") or "", _origin(element), mesh, (sx, sy, sz), shape.tag, tuple(size.tolist()), rgba)
+
+
+def _joint(element: ElementTree.Element) -> UrdfJoint:
+    parent, child = element.find("parent"), element.find("child")
+    if parent is None or child is None:
+        raise ValueError(f"joint {element.get('name')!r} lacks a parent or child")
+    urdf_type = element.attrib["type"]
+    # Joint types with more than one degree of freedom are rare in articulated objects and stay fixed.
+    kind = _JOINT_TYPES.get(urdf_type, "fixed")
+    axis_element = element.find("axis")
+    axis = _numbers(None if axis_element is None else axis_element.get("xyz"), (1, 0, 0))
+    norm = float(np.linalg.norm(axis))
+    if kind != "fixed" and norm < 1e-9:
+        raise ValueError(f"joint {element.get('name')!r} has an axis of length zero")
+    limit = element.find("limit")
+    lower, upper = 0.0, 0.0
+    if kind != "fixed":
+        if urdf_type == "continuous" or limit is None:
+            lower, upper = 0.0, CONTINUOUS_RANGE_RAD if kind == "revolute" else 0.0
+        else:
+            lower, upper = sorted((float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))))
+        if not (np.isfinite(lower) and np.isfinite(upper)):
+            raise ValueError(f"joint {element.get('name')!r} has limits {lower}, {upper}")
+    return UrdfJoint(
+        element.attrib["name"], kind, parent.attrib["link"], child.attrib["link"], _origin(element),
+        axis / max(norm, 1e-9), lower, upper,
+    )  # fmt: skip
+
+
+def _ordered(joints: list[UrdfJoint], links: dict, path: Path) -> tuple[UrdfJoint, ...]:
+    """Joints from the root to the leaves; file order among those that are equally deep."""
+    children = [j.child for j in joints]
+    unknown = sorted({n for j in joints for n in (j.parent, j.child)} - set(links))
+    if unknown or len(set(children)) < len(children) or not links:
+        raise ObjectError(
+            f"{path}: expected links that form a tree; unknown links {unknown}, "
+            f"{len(children) - len(set(children))} links with two parents; restore the file from its source"
+        )
+    reached, remaining, order = set(links) - set(children), list(joints), []
+    while remaining:
+        ready = [j for j in remaining if j.parent in reached]
+        if not ready:
+            raise ObjectError(f"{path}: expected links that form a tree, found a cycle; restore the file from its source")
+        order += ready
+        reached |= {j.child for j in ready}
+        remaining = [j for j in remaining if j.child not in reached]
+    return tuple(order)

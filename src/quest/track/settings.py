@@ -1,0 +1,56 @@
+"""What a tracker may be told besides its weights; chosen on validation objects and stored with the weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+from quest.errors import ConfigError, WeightsError
+
+
+@dataclass(frozen=True)
+class TrackerConfig:
+    """Settings of tracking.
+
+    Attributes:
+        move_sigma: how far an entity may move between frames, reference units (half the width of the view).
+        jump: probability that it is anywhere else, which lets a wrong belief recover.
+        temperature: divides the scores of the heatmap; above 1 trusts a single frame less.
+        lift_tolerance: largest distance between the lifted pixel and the predicted point for the pixel's depth to
+            be taken, reference units; beyond it the pixel lies on something before or behind the entity.
+        slot_bias: added to the affordance logit, so that slots worth keeping have a confidence above one half.
+        slot_gain: multiplies the affordance logit.
+        slot_threshold: probability above which discovery takes a slot.
+        prompt_threshold: probability above which a prompt takes a slot; lower, because the user says it is there.
+        slot_radius_cells: peaks of one label closer than this are one slot.
+    """
+
+    move_sigma: float = 0.08
+    jump: float = 0.02
+    temperature: float = 1.0
+    lift_tolerance: float = 0.05
+    slot_bias: float = 0.0
+    slot_gain: float = 1.0
+    slot_threshold: float = 0.5
+    prompt_threshold: float = 0.2
+    slot_radius_cells: float = 1.5
+
+    def __post_init__(self) -> None:
+        if self.move_sigma <= 0 or self.temperature <= 0 or not 0 < self.jump < 1 or self.lift_tolerance < 0:
+            raise ConfigError(f"tracker: expected positive move_sigma and temperature and 0 < jump < 1, got {self}")
+
+    def to_json(self) -> str:
+        """One line, stored with the weights."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> TrackerConfig:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            WeightsError: the text holds other settings.
+        """
+        try:
+            return cls(**json.loads(text))
+        except (json.JSONDecodeError, TypeError, ConfigError) as error:
+            raise WeightsError(f"settings stored with the weights cannot be read: {error}") from error

@@ -1,0 +1,341 @@
+"""The step function of tracking: one frame in, one answer per query out, in bounded time and memory."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float32, UInt8
+from torch import Tensor
+
+from quest.data.letterbox import Letterbox
+from quest.errors import InputError
+from quest.geometry import invert, transform
+from quest.model.discovery import find_peaks
+from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.network import UNKNOWN_LABEL, QuestNetwork
+from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
+from quest.track.belief import Belief, update
+from quest.track.settings import TrackerConfig
+from quest.types import LABELS, Camera, Query, State
+
+_LOST_BELOW = 0.3
+
+
+@dataclass(frozen=True)
+class StreamState:
+    """Answers for one frame; K grows when queries bind.
+
+    Attributes:
+        names: name per query.
+        labels: label per query, or None.
+        uv_px: pixel in the source frame.
+        point_world: world point in metres, NaN where it cannot be lifted.
+        confidence: probability that the identity is right.
+        visible: whether the entity is seen.
+        state: :class:`~quest.types.State` per query.
+        stamp_s: the frame's time.
+        has_depth: whether the frame brought any depth.
+    """
+
+    names: tuple[str, ...]
+    labels: tuple[str | None, ...]
+    uv_px: Float32[np.ndarray, "K 2"]
+    point_world: Float32[np.ndarray, "K 3"]
+    confidence: Float32[np.ndarray, " K"]
+    visible: Bool[np.ndarray, " K"]
+    state: tuple[State, ...]
+    stamp_s: float
+    has_depth: bool
+
+
+@dataclass
+class _Bound:
+    """A query that has found its entity."""
+
+    name: str
+    label: str | None
+    slot: int | None
+    belief: Belief | None = None
+
+
+class Stream:
+    """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
+
+    The memory is a ring of T observed frames, one anchor and one belief per query.
+
+    Args:
+        network: trained network in evaluation mode.
+        config: settings of tracking.
+        camera: intrinsics of the frames.
+        queries: what to follow; None discovers entities in the first frame.
+        device: where the network runs.
+        autocast: whether the network computes in bfloat16.
+    """
+
+    def __init__(
+        self,
+        network: QuestNetwork,
+        config: TrackerConfig,
+        camera: Camera,
+        queries: Sequence[Query] | None,
+        *,
+        device: torch.device,
+        autocast: bool,
+    ) -> None:
+        self._network = network
+        self._config = config
+        self._letterbox = Letterbox(camera, network.config.encoder.image_size)
+        self._discover_all = queries is None
+        self._waiting = list(queries or ())
+        self._device = device
+        self._autocast = autocast
+        self._ring: deque[Observation] = deque(maxlen=network.config.window)
+        self._reference: tuple[Tensor, Tensor, Tensor] | None = None
+        self._reference_has_depth = False
+        self._bound: list[_Bound] = []
+        self._anchor: Anchor | None = None
+        self._t = 0
+
+    @property
+    def unbound(self) -> tuple[Query, ...]:
+        """Queries that have not found their entity, and point queries whose frame has not come."""
+        return tuple(self._waiting)
+
+    def step(
+        self,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+        stamp_s: float,
+        cam_from_world: Float[np.ndarray, "4 4"] | None = None,
+    ) -> StreamState:
+        """Track the next frame.
+
+        Args:
+            rgb: colours.
+            depth_m: metres along +z; 0 or NaN where missing, None without depth.
+            stamp_s: time in seconds.
+            cam_from_world: pose of the camera; the world is the camera if None.
+
+        Raises:
+            InputError: the frame does not have the camera's size or type.
+        """
+        self._check(rgb, depth_m)
+        with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
+            frames = self._frame_batch(rgb, depth_m, np.eye(4) if cam_from_world is None else cam_from_world)
+            observed = self._network.observe(frames)
+            while len(self._ring) < self._network.config.window - 1:
+                self._ring.append(observed)
+            self._ring.append(observed)
+            self._bind(observed, frames)
+            state = self._answer(frames, stamp_s, bool((frames.depth_m > 0).any()))
+        self._t += 1
+        return state
+
+    def _check(self, rgb: np.ndarray, depth_m: np.ndarray | None) -> None:
+        camera = self._letterbox.source
+        expected = (camera.height, camera.width, 3)
+        if rgb.shape != expected or rgb.dtype != np.uint8:
+            raise InputError(f"frame {self._t}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
+        if depth_m is not None and (depth_m.shape != expected[:2] or not np.issubdtype(depth_m.dtype, np.floating)):
+            raise InputError(
+                f"frame {self._t}: expected depth {expected[:2]} in metres as float, got {depth_m.shape} of "
+                f"{depth_m.dtype}; multiply raw units by their size in metres"
+            )
+
+    def _frame_batch(self, rgb: np.ndarray, depth_m: np.ndarray | None, cam_from_world: np.ndarray) -> FrameBatch:
+        network, box = self._network, self._letterbox
+        size = network.config.encoder.image_size
+        image = torch.from_numpy(np.ascontiguousarray(box.rgb(rgb))).to(self._device)
+        raw = np.zeros((size, size), np.float32) if depth_m is None else box.depth(depth_m)
+        depth = torch.from_numpy(raw).to(self._device)[None]
+        cells = cell_depth(depth, network.config.cell_px)
+        camera = box.camera
+        intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=self._device)
+        pose = torch.from_numpy(np.asarray(cam_from_world, np.float64)).to(self._device)
+        has_depth = bool((depth > 0).any())
+        if self._reference is None or (has_depth and not self._reference_has_depth):
+            # Coordinates change with the reference, so nothing observed before may be mixed with it.
+            center, scale = reference_of(cells, intrinsics, size)
+            self._reference, self._reference_has_depth = (pose, center, scale), has_depth
+            self._ring.clear()
+            for bound in self._bound:
+                bound.belief = None
+        ref_pose, center, scale = self._reference
+        return FrameBatch(
+            features=network.encode(image[None])[:, None].float(),
+            rgb=image[None, None],
+            depth_m=depth[None],
+            cell_depth_m=cells[None],
+            intrinsics=intrinsics,
+            ref_from_cam=(ref_pose @ invert(pose)).float()[None, None],
+            center=center,
+            scale=scale,
+        )
+
+    def _bind(self, observed: Observation, frames: FrameBatch) -> None:
+        if self._network.config.queries == "learned":
+            self._bind_learned(frames)
+            return
+        if self._t == 0 and (self._discover_all or any(q.kind != "point" for q in self._waiting)):
+            self._bind_slots(observed, frames)
+        due = [q for q in self._waiting if q.kind == "point" and q.frame == self._t]
+        if due:
+            size = self._network.config.encoder.image_size
+            uv_px = np.array([q.uv_px for q in due], np.float32)
+            uv = torch.from_numpy(self._letterbox.to_canvas(uv_px) / size)
+            label = torch.tensor([LABELS.index(q.label) if q.label else UNKNOWN_LABEL for q in due])
+            self._join(observed, frames, uv, label)
+            for query in due:
+                name = query.name or f"point {len(self._bound)}"
+                self._bound.append(_Bound(name, query.label, None))
+                self._waiting.remove(query)
+
+    def _bind_slots(self, observed: Observation, frames: FrameBatch) -> None:
+        config = self._config
+        slots = find_peaks(self._network, observed, radius_cells=config.slot_radius_cells)
+        existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
+        found = [LABELS[int(n)] for n in slots.label]
+        chosen: list[tuple[int, str]] = []
+        if self._discover_all:
+            chosen = [(i, "") for i, e in enumerate(existence) if e > config.slot_threshold]
+        for query in [q for q in self._waiting if q.kind != "point"]:
+            used = {i for i, _ in chosen}
+            fits = [i for i, n in enumerate(found) if i not in used and query.label in (None, n)]
+            if fits and existence[fits[0]] > config.prompt_threshold:
+                chosen.append((fits[0], query.name or f"{found[fits[0]]} {len(chosen)}"))
+                self._waiting.remove(query)
+        if chosen:
+            index = torch.tensor([i for i, _ in chosen])
+            self._join(observed, frames, slots.uv[index], slots.label[index])
+            self._bound += [_Bound(name or f"{found[i]} {n}", found[i], None) for n, (i, name) in enumerate(chosen)]
+
+    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor) -> None:
+        """Bind more queries; the anchors of the others stay as they are."""
+        uv, label = uv[None].to(self._device), label[None].to(self._device)
+        uv_px = uv[:, None] * self._network.config.encoder.image_size
+        point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
+        valid = torch.ones(label.shape, dtype=torch.bool, device=self._device)
+        anchor = self._network.bind(observed, uv, point, label, valid)
+        if self._anchor is not None:
+            content = torch.cat((self._anchor.content, anchor.content), dim=1)
+            anchor = Anchor(content, torch.cat((self._anchor.valid, anchor.valid), dim=1))
+        self._anchor = anchor
+
+    def _bind_learned(self, frames: FrameBatch) -> None:
+        """Learned queries are there from the start; a point is answered by the slot nearest to it when it is asked."""
+        if self._anchor is None:
+            self._anchor = self._network.slots(1)
+        if self._t == 0:
+            label = self._network.learned_label(self._anchor.content)[0].argmax(dim=-1)
+            if self._discover_all:
+                self._bound = [_Bound(f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
+            for query in [q for q in self._waiting if q.kind != "point"]:
+                used = {b.slot for b in self._bound}
+                fits = [i for i, n in enumerate(label) if i not in used and query.label in (None, LABELS[int(n)])]
+                if fits:
+                    self._bound.append(_Bound(query.name or f"slot {fits[0]}", LABELS[int(label[fits[0]])], fits[0]))
+                    self._waiting.remove(query)
+        due = [q for q in self._waiting if q.kind == "point" and q.frame == self._t]
+        if due:
+            prediction = self._network.decode(self._anchor, self._ring[-1], frames)
+            size = self._network.config.encoder.image_size
+            for query in due:
+                uv = torch.from_numpy(self._letterbox.to_canvas(np.array(query.uv_px)) / size).to(prediction.uv)
+                slot = int((prediction.uv[0, -1] - uv).norm(dim=-1).argmin())
+                self._bound.append(_Bound(query.name or f"point {len(self._bound)}", query.label, slot))
+                self._waiting.remove(query)
+
+    def _answer(self, frames: FrameBatch, stamp_s: float, has_depth: bool) -> StreamState:
+        if not self._bound or self._anchor is None:
+            empty = np.zeros((0, 3), np.float32)
+            return StreamState((), (), empty[:, :2], empty, empty[:, 0], empty[:, 0] > 0, (), stamp_s, has_depth)
+        window = Observation.stack(list(self._ring))
+        head = self._network.head
+        if isinstance(head, HeatmapHead):
+            x = self._network.embed(self._anchor, window)[:, -1:]
+            newest = window.during(slice(-1, None))
+            prediction = self._track_cells(head, x, newest)
+            uv, point = prediction.uv[0, 0], self._lift(prediction, frames)
+        else:
+            prediction = self._network.decode(self._anchor, window.during(slice(-1, None)), frames)
+            index = torch.tensor([b.slot for b in self._bound])
+            uv, point = prediction.uv[0, 0, index], prediction.point[0, 0, index]
+            prediction = Prediction(*(getattr(prediction, n)[:, :, index] for n in Prediction.__dataclass_fields__))
+        world = self._to_world(point, has_depth)
+        visible_p = prediction.visible_logit[0, 0].sigmoid().cpu().numpy()
+        confidence = prediction.right_logit[0, 0].sigmoid().cpu().numpy()
+        visible = (visible_p > 0.5) & ((uv >= 0) & (uv <= 1)).all(-1).cpu().numpy()
+        size = self._network.config.encoder.image_size
+        return StreamState(
+            names=tuple(b.name for b in self._bound),
+            labels=tuple(b.label for b in self._bound),
+            uv_px=self._letterbox.to_source(uv.cpu().numpy() * size).astype(np.float32),
+            point_world=world,
+            confidence=confidence.astype(np.float32),
+            visible=visible,
+            state=tuple(
+                State.LOST if c < _LOST_BELOW else State.TRACKING if v else State.HELD
+                for c, v in zip(confidence, visible, strict=True)
+            ),
+            stamp_s=stamp_s,
+            has_depth=has_depth,
+        )
+
+    def _track_cells(self, head: HeatmapHead, x: Tensor, newest: Observation) -> Prediction:
+        """Fuse the newest heatmap with the belief and answer at the best cell."""
+        free = head(x, newest)
+        logits, seen = free.logits, free.visible_logit[0, 0].sigmoid()
+        cell_point = newest.cell_point[0, 0].float()
+        size = self._network.config.encoder.image_size
+        cell_uv = 2 * cell_centres(self._network.config, device=logits.device) / size - 1
+        posterior = torch.empty_like(logits[0, 0])
+        # Queries that bound at the same frame share the cells that their beliefs live on.
+        for fresh in (True, False):
+            rows = [i for i, b in enumerate(self._bound) if (b.belief is None) == fresh]
+            if not rows:
+                continue
+            before = None if fresh else self._joint_belief(rows)
+            after = update(before, logits[0, 0, rows], seen[rows], cell_point, cell_uv, self._config)
+            posterior[rows] = after.probability
+            for row, probability in zip(rows, after.probability, strict=True):
+                self._bound[row].belief = Belief(probability[None], cell_point)
+        fused = posterior.clamp(min=1e-12).log()[None, None]
+        return head(x, newest, fused)
+
+    def _joint_belief(self, rows: list[int]) -> Belief:
+        beliefs = [b for b in (self._bound[i].belief for i in rows) if b is not None]
+        return Belief(torch.cat([b.probability for b in beliefs]), beliefs[0].cell_point)
+
+    def _lift(self, prediction: Prediction, frames: FrameBatch) -> Tensor:
+        """The lifted pixel where it agrees with the predicted point, else the predicted point.
+
+        At a depth edge the pixel may lie on what is before or behind the entity; of the pixels around it the one
+        nearest to the predicted depth is taken.
+        """
+        size, predicted = self._network.config.encoder.image_size, prediction.point[0, 0].float()
+        uv_px = prediction.uv * size
+        step = torch.arange(-2.0, 3.0, device=uv_px.device)
+        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(1, 1, 1, 25, 2)
+        k = uv_px.shape[2]
+        pixels = (uv_px.unsqueeze(-2) + around).reshape(1, 1, k * 25, 2)
+        depth = frames.depth_at(pixels)
+        # Depth is taken from a neighbour, the ray from the pixel itself.
+        rays = uv_px.unsqueeze(-2).expand(1, 1, k, 25, 2).reshape(1, 1, k * 25, 2)
+        lifted = frames.to_reference(rays, depth).reshape(k, 25, 3)
+        gap = (lifted - predicted[:, None]).norm(dim=-1).nan_to_num(torch.inf)
+        best = gap.argmin(dim=-1)
+        chosen = lifted[torch.arange(k), best]
+        agrees = gap[torch.arange(k), best] < self._config.lift_tolerance
+        return torch.where(agrees.unsqueeze(-1), chosen, predicted)
+
+    def _to_world(self, point: Tensor, has_depth: bool) -> Float32[np.ndarray, "K 3"]:
+        assert self._reference is not None
+        pose, center, scale = self._reference
+        metric = point.double() * scale.double() + center.double()
+        if not has_depth:
+            metric = torch.full_like(metric, torch.nan)
+        return transform(invert(pose)[None], metric).cpu().numpy().astype(np.float32)

@@ -1,0 +1,105 @@
+"""Checkpoints of a training run: weights and optimiser state as safetensors, the rest as JSON.
+
+A checkpoint is a folder that is written beside its place and renamed, so that it is whole or absent.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import nn
+
+from quest.errors import WeightsError
+from quest.model.config import NetworkConfig
+from quest.model.encoder import load_exactly
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training run stands.
+
+    Attributes:
+        step: optimiser steps done.
+        best: best validation score so far (mean 3D distance, normalised units).
+        best_step: step of the best score.
+        stale: validations since the best.
+        rng: state of the generator that draws windows, as JSON.
+        network: the network's configuration, as JSON.
+    """
+
+    step: int
+    best: float
+    best_step: int
+    stale: int
+    rng: str
+    network: str
+
+
+def save_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
+    """Write or replace a checkpoint."""
+    partial = folder.with_name(f".partial-{folder.name}")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    save_file(_trained(network), partial / "weights.safetensors")
+    state = optimizer.state_dict()
+    tensors = {f"{i}.{key}": value.contiguous() for i, entry in state["state"].items() for key, value in entry.items()}
+    save_file(tensors, partial / "optimizer.safetensors")
+    groups = [{k: v for k, v in group.items() if k != "params"} for group in state["param_groups"]]
+    (partial / "progress.json").write_text(json.dumps({"progress": asdict(progress), "groups": groups}))
+    old = folder.with_name(f".old-{folder.name}")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    partial.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer | None) -> Progress:
+    """Read a checkpoint into a network and, to go on training, its optimiser.
+
+    Raises:
+        WeightsError: the checkpoint is missing, torn, or of another network.
+    """
+    if not folder.exists():
+        # The process was killed between the two renames of a replacement.
+        folder = folder.with_name(f".old-{folder.name}")
+    try:
+        text = json.loads((folder / "progress.json").read_text())
+        progress = Progress(**text["progress"])
+        weights = load_file(folder / "weights.safetensors")
+        tensors = load_file(folder / "optimizer.safetensors")
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise WeightsError(f"{folder}: checkpoint is missing or torn ({error}); remove it to start anew") from error
+    own = {name: tensor for name, tensor in network.state_dict().items() if name.startswith("encoder.")}
+    load_exactly(network, {**own, **weights}, what=f"checkpoint {folder}")
+    if optimizer is not None:
+        state: dict[int, dict[str, torch.Tensor]] = {}
+        for name, tensor in tensors.items():
+            index, key = name.split(".", 1)
+            state.setdefault(int(index), {})[key] = tensor
+        groups = optimizer.state_dict()["param_groups"]
+        merged = [{**new, **saved} for new, saved in zip(groups, text["groups"], strict=True)]
+        optimizer.load_state_dict({"state": state, "param_groups": merged})
+    return progress
+
+
+def check_same_network(progress: Progress, config: NetworkConfig, folder: Path) -> None:
+    """Refuse to resume with another network.
+
+    Raises:
+        WeightsError: the checkpoint's configuration differs.
+    """
+    if progress.network != config.to_json():
+        raise WeightsError(f"{folder}: this run was started with another network; use another --out or its settings")
+
+
+def _trained(network: nn.Module) -> dict[str, torch.Tensor]:
+    """Everything but the frozen encoder, which has its own file."""
+    state = network.state_dict()
+    return {name: tensor.contiguous() for name, tensor in state.items() if not name.startswith("encoder.")}

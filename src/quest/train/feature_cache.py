@@ -1,0 +1,193 @@
+"""Frozen encoder features of every frame of a store, computed once and read by memory map.
+
+One folder per view of a take, written beside its place and renamed, so that a killed run leaves whole
+entries or nothing. An entry is stale when the take or the encoder changed, and is then made again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float16, Float32, Int8, UInt8, UInt16
+
+from quest.data.letterbox import Letterbox
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.model.config import NetworkConfig
+from quest.model.encoder import Encoder
+from quest.model.observation import cell_depth
+from quest.types import LABELS, Camera, Take
+
+_VERSION = 1
+_DEPTH_UNIT_M = 1e-4
+
+
+@dataclass(frozen=True)
+class CachedView:
+    """One view of a take as the network takes it; arrays are memory maps.
+
+    Attributes:
+        name: take and view.
+        object_id: the object in it.
+        camera: intrinsics of the letterboxed input.
+        half_diagonal_m: metres per normalised unit.
+        features: tokens of the encoder.
+        rgb: letterboxed colours.
+        depth: letterboxed depth in units of 0.1 mm, 0 where missing.
+        cell_depth_m: near depth of each cell.
+        cam_from_world: pose of each frame.
+        uv_px: true pixel of the letterboxed input, per tracked entity.
+        visible: whether the entity is seen.
+        point_world: true world point, metres.
+        label: index into LABELS.
+        revolute: whether the entity's joint turns.
+        axis_world: origin and direction of the joint's axis at rest.
+    """
+
+    name: str
+    object_id: str
+    camera: Camera
+    half_diagonal_m: float
+    features: Float16[np.ndarray, "T N E"]
+    rgb: UInt8[np.ndarray, "T S S 3"]
+    depth: UInt16[np.ndarray, "T S S"]
+    cell_depth_m: Float32[np.ndarray, "T C C"]
+    cam_from_world: Float32[np.ndarray, "T 4 4"]
+    uv_px: Float32[np.ndarray, "T K 2"]
+    visible: Bool[np.ndarray, "T K"]
+    point_world: Float32[np.ndarray, "T K 3"]
+    label: Int8[np.ndarray, " K"]
+    revolute: Bool[np.ndarray, " K"]
+    axis_world: Float32[np.ndarray, "K 6"]
+
+    def __len__(self) -> int:
+        return len(self.rgb)
+
+
+_ARRAYS = tuple(f for f in CachedView.__dataclass_fields__ if f not in {"name", "object_id", "camera", "half_diagonal_m"})
+
+
+class FeatureCache:
+    """Views of the takes of a store with their features.
+
+    Args:
+        root: folder of the cache.
+        config: network that will read it.
+        encoder: encoder with its initial weights.
+    """
+
+    def __init__(self, root: Path, config: NetworkConfig, encoder: Encoder) -> None:
+        self.root = root
+        self.config = config
+        self.encoder = encoder.eval()
+        digest = hashlib.sha256(json.dumps([_VERSION, asdict(config.encoder), config.cell_px]).encode())
+        for name, tensor in sorted(encoder.state_dict().items()):
+            digest.update(name.encode())
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        self.encoder_hash = digest.hexdigest()
+
+    def build(self, store: TakeStore, names: list[str], *, device: torch.device) -> Iterator[int]:
+        """Make what is missing or stale; yields the number of frames of every view that is ready.
+
+        Args:
+            store: where the takes are.
+            names: takes to prepare.
+            device: where the encoder runs.
+        """
+        self.root.mkdir(parents=True, exist_ok=True)
+        self.encoder.to(device)
+        for name in names:
+            stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
+            entries = self._entries(name)
+            if entries and all(self._stamp(entry) == stamp for entry in entries):
+                yield from (len(np.load(e / "visible.npy", mmap_mode="r")) for e in entries)
+                continue
+            take = store.read(name)
+            for view in range(len(take.views)):
+                yield self._write(take, view, stamp, device)
+
+    def views(self, names: list[str]) -> list[CachedView]:
+        """Open the prepared views of these takes.
+
+        Raises:
+            ConfigError: there is none.
+        """
+        views = [self._open(entry) for name in names for entry in self._entries(name)]
+        views = [v for v in views if v.visible.shape[1] > 0]
+        if not views:
+            raise ConfigError(f"{self.root}: no prepared views with entities; generate takes first")
+        return views
+
+    def _entries(self, name: str) -> list[Path]:
+        return sorted(self.root.glob(f"{name}-v[0-9]*"))
+
+    def _stamp(self, entry: Path) -> dict[str, str]:
+        return json.loads((entry / "meta.json").read_text())["stamp"]
+
+    def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> int:
+        clip, truth, tracked = take.views[view].clip, take.views[view], take.tracked
+        box = Letterbox(clip.camera, self.config.encoder.image_size)
+        rgb = np.stack([box.rgb(image) for image in clip.rgb])
+        depth_m = np.zeros(rgb.shape[:3], np.float32)
+        if clip.depth_m is not None:
+            depth_m = np.stack([box.depth(image) for image in clip.depth_m])
+        joints = [take.info.entities[e].joint for e in tracked]
+        arrays = {
+            "features": encode_images(self.encoder, rgb, device=device),
+            "rgb": rgb,
+            "depth": np.clip(np.rint(depth_m / _DEPTH_UNIT_M), 0, 65535).astype(np.uint16),
+            "cell_depth_m": cell_depth(torch.from_numpy(depth_m), self.config.cell_px).numpy(),
+            "cam_from_world": clip.cam_from_world.astype(np.float32),
+            "uv_px": box.to_canvas(truth.uv_px[:, tracked]).astype(np.float32),
+            "visible": truth.visible[:, tracked],
+            "point_world": take.point_world[:, tracked],
+            "label": np.array([LABELS.index(take.info.entities[e].label) for e in tracked], np.int8),
+            "revolute": np.array([take.info.joints[j].kind == "revolute" for j in joints], bool),
+            "axis_world": take.joint_axis[0, joints].astype(np.float32).reshape(-1, 6),
+        }
+        meta = {
+            "stamp": stamp,
+            "object_id": take.info.object_id,
+            "camera": asdict(box.camera),
+            "half_diagonal_m": take.info.half_diagonal_m,
+        }
+        entry = self.root / f"{take.info.name}-v{view}"
+        partial = self.root / f".partial-{entry.name}"
+        for stale in (partial, entry):
+            shutil.rmtree(stale, ignore_errors=True)
+        partial.mkdir()
+        for name in _ARRAYS:
+            np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
+        (partial / "meta.json").write_text(json.dumps(meta))
+        partial.rename(entry)
+        return len(rgb)
+
+    def _open(self, entry: Path) -> CachedView:
+        meta = json.loads((entry / "meta.json").read_text())
+        arrays = {name: np.load(entry / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
+        return CachedView(
+            name=entry.name,
+            object_id=meta["object_id"],
+            camera=Camera(**meta["camera"]),
+            half_diagonal_m=meta["half_diagonal_m"],
+            **arrays,
+        )
+
+
+def encode_images(
+    encoder: Encoder, rgb: UInt8[np.ndarray, "T S S 3"], *, device: torch.device, batch: int = 16
+) -> Float16[np.ndarray, "T N E"]:
+    """Features of many images, in bfloat16 arithmetic where that is fast."""
+    out = []
+    with torch.inference_mode(), torch.autocast(device.type, dtype=torch.bfloat16):
+        for start in range(0, len(rgb), batch):
+            images = torch.from_numpy(np.ascontiguousarray(rgb[start : start + batch])).to(device)
+            out.append(encoder(images).to(torch.float16).cpu().numpy())
+    return np.concatenate(out)

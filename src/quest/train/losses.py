@@ -1,0 +1,168 @@
+"""Losses of stage 1.
+
+The names follow the design: L_aff, L_vel, L_acc, L_conf, L_bound, L_feat, L_manifold; a heatmap adds its cross-entropy
+and 3D offset, discovery its focal loss. Each is a function of predictions and truth that can be tested by itself.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from quest.types import LABELS
+
+
+def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
+    """Mean of the values where the mask is, weighted by it; 0 where it is nowhere. NaN outside it does no harm."""
+    weight = mask.to(value.dtype)
+    return (torch.where(weight > 0, value, torch.zeros_like(value)) * weight).sum() / weight.sum().clamp(min=1e-6)
+
+
+def coordinate_loss(
+    uv: Float[Tensor, "*B 2"], target: Float[Tensor, "*B 2"], mask: Bool[Tensor, "*B"]
+) -> Float[Tensor, ""]:
+    """L_aff: Huber loss of coordinates in [0, 1]^2, quadratic below 0.01."""
+    target = torch.where(mask.unsqueeze(-1), target, uv.detach())
+    return masked_mean(F.huber_loss(uv, target, reduction="none", delta=0.01).sum(-1) / 0.01, mask)
+
+
+def heatmap_loss(
+    logits: Float[Tensor, "*B C"], uv: Float[Tensor, "*B 2"], weight: Float[Tensor, "*B"], *, cells: int
+) -> Float[Tensor, ""]:
+    """Cross-entropy against a Gaussian of 0.6 cells around the true position.
+
+    Args:
+        logits: score per cell.
+        uv: true coordinates in [0, 1]^2.
+        weight: how much each position counts; 0 outside the image.
+        cells: cells along one side.
+    """
+    inside = weight > 0
+    place = torch.where(inside.unsqueeze(-1), uv, torch.full_like(uv, 0.5)) * cells
+    centre = torch.arange(cells, device=uv.device) + 0.5
+    x = torch.exp(-0.5 * ((centre - place[..., :1]) / 0.6) ** 2)
+    y = torch.exp(-0.5 * ((centre - place[..., 1:]) / 0.6) ** 2)
+    target = (y.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2)
+    target = target / target.sum(-1, keepdim=True).clamp(min=1e-9)
+    return masked_mean(-(target * logits.log_softmax(-1)).sum(-1), weight)
+
+
+def point_loss(
+    point: Float[Tensor, "B T K 3"], target: Float[Tensor, "B T K 3"], unit: Float[Tensor, " B"], mask: Bool[Tensor, "B T K"]
+) -> Float[Tensor, ""]:
+    """Huber loss of the 3D distance in normalised units, linear above 0.05."""
+    mask = mask & torch.isfinite(point).all(-1) & torch.isfinite(target).all(-1)
+    error = torch.where(mask.unsqueeze(-1), point - target, torch.zeros_like(point)) / unit[:, None, None, None]
+    return masked_mean(F.huber_loss(error, torch.zeros_like(error), reduction="none", delta=0.05).sum(-1) / 0.05, mask)
+
+
+def difference_loss(
+    point: Float[Tensor, "B T K 3"],
+    target: Float[Tensor, "B T K 3"],
+    unit: Float[Tensor, " B"],
+    mask: Bool[Tensor, "B T K"],
+    *,
+    order: int,
+) -> Float[Tensor, ""]:
+    """L_vel (order 1) and L_acc (order 2): L1 of differences of the 3D track, normalised units."""
+    mask = mask & torch.isfinite(point).all(-1) & torch.isfinite(target).all(-1)
+    error = torch.where(mask.unsqueeze(-1), point - target, torch.zeros_like(point)) / unit[:, None, None, None]
+    for _ in range(order):
+        error = error[:, 1:] - error[:, :-1]
+        mask = mask[:, 1:] & mask[:, :-1]
+    # Clamped, so that one frame on the wrong part does not outweigh all smooth ones.
+    return masked_mean(error.abs().clamp(max=0.5).sum(-1), mask)
+
+
+def confidence_loss(logit: Float[Tensor, "*B"], target: Bool[Tensor, "*B"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
+    """L_conf: binary cross-entropy."""
+    return masked_mean(F.binary_cross_entropy_with_logits(logit, target.to(logit.dtype), reduction="none"), mask)
+
+
+def label_loss(
+    logits: Float[Tensor, "B K L"], label: Int[Tensor, "B K"], mask: Bool[Tensor, "B K"]
+) -> Float[Tensor, ""]:
+    """Cross-entropy of the label of learned queries, which take the place of a dense map."""
+    return masked_mean(F.cross_entropy(logits.transpose(1, 2), label, reduction="none"), mask)
+
+
+def bound_loss(uv: Float[Tensor, "*B 2"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
+    """L_bound: how far raw coordinates leave [0, 1]^2."""
+    return masked_mean((F.relu(-uv) + F.relu(uv - 1)).sum(-1), mask)
+
+
+def feature_loss(embedding: Float[Tensor, "B T K D"], mask: Bool[Tensor, "B K"]) -> Float[Tensor, ""]:
+    """L_feat: one minus the cosine of a query's embeddings in neighbouring frames."""
+    cosine = F.cosine_similarity(embedding[:, 1:].float(), embedding[:, :-1].float(), dim=-1)
+    return masked_mean(1 - cosine, mask[:, None].expand_as(cosine))
+
+
+def manifold_loss(
+    point: Float[Tensor, "B T K 3"],
+    rest: Float[Tensor, "B K 3"],
+    axis: Float[Tensor, "B K 6"],
+    revolute: Bool[Tensor, "B K"],
+    unit: Float[Tensor, " B"],
+    mask: Bool[Tensor, "B T K"],
+) -> Float[Tensor, ""]:
+    """L_manifold: distance of a point to the line or circle that its entity moves on, normalised units.
+
+    Args:
+        point: predicted positions in the reference frame.
+        rest: a true position on the line or circle.
+        axis: origin and unit direction of the joint.
+        revolute: circle about the axis, else line along it.
+        unit: reference units per normalised unit.
+        mask: which predictions count.
+    """
+    mask = mask & torch.isfinite(point).all(-1)
+    point = torch.where(mask.unsqueeze(-1), point, rest[:, None])
+    origin, direction = axis[:, None, :, :3], axis[:, None, :, 3:]
+
+    def cylinder(p: Tensor) -> tuple[Tensor, Tensor]:
+        height = ((p - origin) * direction).sum(-1)
+        radial = (p - origin) - height.unsqueeze(-1) * direction
+        return height, radial.square().sum(-1).clamp(min=1e-8).sqrt()
+
+    height, radius = cylinder(point)
+    rest_height, rest_radius = cylinder(rest[:, None])
+    circle = ((height - rest_height) ** 2 + (radius - rest_radius) ** 2).clamp(min=1e-8).sqrt()
+    offset = point - rest[:, None]
+    along = (offset * direction).sum(-1, keepdim=True)
+    line = (offset - along * direction).square().sum(-1).clamp(min=1e-8).sqrt()
+    distance = torch.where(revolute[:, None], circle, line) / unit[:, None, None]
+    return masked_mean(distance.clamp(max=0.5), mask)
+
+
+def affordance_loss(
+    logits: Float[Tensor, "B C L"],
+    offset: Float[Tensor, "B C 2"],
+    uv: Float[Tensor, "B K 2"],
+    label: Int[Tensor, "B K"],
+    visible: Bool[Tensor, "B K"],
+    *,
+    cells: int,
+) -> Float[Tensor, ""]:
+    """Focal loss of the dense map and L1 of its offsets at the true cells.
+
+    Reference: Law and Deng, CornerNet, ECCV 2018, equations 1 and 2.
+    """
+    place = torch.where(visible.unsqueeze(-1), uv, torch.full_like(uv, 0.5)).clamp(0, 1 - 1e-6) * cells
+    centre = torch.arange(cells, device=uv.device) + 0.5
+    x = torch.exp(-0.5 * ((centre - place[..., :1]) / 0.8) ** 2)
+    y = torch.exp(-0.5 * ((centre - place[..., 1:]) / 0.8) ** 2)
+    blob = (y.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2) * visible.unsqueeze(-1)
+    cell = place[..., 1].long() * cells + place[..., 0].long()
+    blob = blob.scatter(-1, cell.unsqueeze(-1), visible.to(blob.dtype).unsqueeze(-1))
+    one_hot = F.one_hot(label, len(LABELS)).to(blob.dtype)
+    target = (blob.unsqueeze(-1) * one_hot.unsqueeze(-2)).amax(dim=1)
+    log_p, log_not = F.logsigmoid(logits), F.logsigmoid(-logits)
+    p = logits.sigmoid()
+    positive = target >= 1
+    loss = torch.where(positive, -((1 - p) ** 2) * log_p, -((1 - target) ** 4) * p**2 * log_not)
+    focal = loss.sum() / positive.sum().clamp(min=1)
+    at_cell = offset.gather(1, cell.unsqueeze(-1).expand(-1, -1, 2))
+    residual = (at_cell - (place - place.floor() - 0.5)).abs().sum(-1)
+    return focal + 0.5 * masked_mean(residual, visible)

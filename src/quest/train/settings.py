@@ -1,0 +1,96 @@
+"""Settings of training, free of heavy imports so that the command line is quick."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from quest.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How a network is trained.
+
+    Attributes:
+        steps: optimiser steps at most.
+        learning_rate: peak of the schedule (linear warm-up, then cosine to a twentieth).
+        weight_decay: of AdamW.
+        warmup_steps: steps of the warm-up.
+        clip_norm: largest norm of the gradient.
+        validate_every: steps between validations and checkpoints.
+        validation_batches: fixed batches per validation.
+        patience: validations without a better score before training stops.
+        seed: seed of windows and of initial weights.
+        precision: ``bf16-mixed`` or ``32-true``.
+    """
+
+    steps: int = 3000
+    learning_rate: float = 4e-4
+    weight_decay: float = 0.01
+    warmup_steps: int = 100
+    clip_norm: float = 1.0
+    validate_every: int = 250
+    validation_batches: int = 12
+    patience: int = 15
+    seed: int = 0
+    precision: str = "bf16-mixed"
+
+    def __post_init__(self) -> None:
+        if min(self.steps, self.validate_every, self.validation_batches, self.patience) < 1:
+            raise ConfigError("training: steps, validate_every, validation_batches and patience must be at least 1")
+        if self.precision not in ("bf16-mixed", "32-true"):
+            raise ConfigError(f"training: expected precision bf16-mixed or 32-true, got {self.precision!r}")
+
+
+@dataclass(frozen=True)
+class WindowConfig:
+    """How windows are drawn and disturbed.
+
+    Attributes:
+        batch: windows per step.
+        max_stride: largest step between the frames of a window, in stored frames (0 repeats one frame).
+        first_frame_share: how often the anchor is the first frame in which most entities are seen.
+        point_jitter_px: standard deviation of the anchor's pixel, pixels of the input.
+        label_share: how often a query is told its label.
+        depth_drop_share: how often a window loses all depth.
+        query_drop_share: how often a query is left out of a window.
+        colour_jitter: largest relative change of brightness per channel, seen by the detail stem only.
+    """
+
+    batch: int = 16
+    max_stride: int = 3
+    first_frame_share: float = 0.6
+    point_jitter_px: float = 1.0
+    label_share: float = 0.4
+    depth_drop_share: float = 0.08
+    query_drop_share: float = 0.2
+    colour_jitter: float = 0.2
+
+
+@dataclass(frozen=True)
+class LossWeights:
+    """Weight of every loss; 0 turns it off.
+
+    Attributes:
+        aff: Huber loss of coordinates on visible entities.
+        heat: cross-entropy of the heatmap against the true cell.
+        point: Huber loss of the 3D point, normalised units.
+        vel: first differences of the 3D track.
+        acc: second differences of the 3D track.
+        conf: both confidences.
+        bound: raw coordinates outside [0, 1]^2.
+        feat: change of a query's embedding between neighbouring frames.
+        geo: distance of the point to its entity's own screw motion.
+        map: focal loss and offset of the dense affordance map.
+    """
+
+    aff: float = 5.0
+    heat: float = 1.0
+    point: float = 2.0
+    vel: float = 1.0
+    acc: float = 0.5
+    conf: float = 0.3
+    bound: float = 0.1
+    feat: float = 0.02
+    geo: float = 0.2
+    map: float = 1.0

@@ -1,0 +1,86 @@
+"""Quality on windows of validation objects, by which a checkpoint is chosen."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from quest.model.discovery import find_peaks
+from quest.model.network import QuestNetwork
+from quest.model.observation import Observation
+from quest.train.objective import Rollout, is_right, roll_out
+from quest.train.windows import WindowSampler, WindowTruth
+
+_FOUND_PX = 16.0
+_PEAK_LOGIT = -0.5
+
+
+@dataclass(frozen=True)
+class WindowScores:
+    """Quality on fixed windows.
+
+    Attributes:
+        median_px: median distance of visible answers, pixels of the input.
+        mean_distance: mean 3D distance of all answers, normalised units, at most 1 each.
+        right: share of answers with the right identity.
+        discovery_f1: F1 of discovered slots against visible entities, same label and within 16 px.
+        answers: how many answers were judged.
+    """
+
+    median_px: float
+    mean_distance: float
+    right: float
+    discovery_f1: float
+    answers: int
+
+
+def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, device: torch.device) -> WindowScores:
+    """Scores on the same windows at every call; the network is left in training mode."""
+    rng = np.random.default_rng(0)
+    network.eval()
+    px, distance, right = [], [], []
+    found = np.zeros(3)
+    with torch.no_grad():
+        for _ in range(batches):
+            frames, truth = sampler.draw(rng, disturb=False)
+            frames, truth = frames.to(device), truth.to(device)
+            roll = roll_out(network, frames, truth)
+            for values, value in zip((px, distance, right), _score(network, roll, truth), strict=True):
+                values.append(value)
+            if network.config.queries == "anchored":
+                found += _discovery(network, roll.anchor_observed, truth)
+    network.train()
+    all_px, hits, proposed, present = torch.cat(px), *found
+    return WindowScores(
+        median_px=float(all_px.median()) if len(all_px) else math.inf,
+        mean_distance=float(torch.cat(distance).mean()),
+        right=float(torch.cat(right).mean()),
+        discovery_f1=float(2 * hits / max(proposed + present, 1)),
+        answers=sum(len(d) for d in distance),
+    )
+
+
+def _score(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> tuple[Tensor, Tensor, Tensor]:
+    px = (roll.prediction.uv - roll.truth_uv).norm(dim=-1).float() * network.config.encoder.image_size
+    distance = (roll.prediction.point - roll.truth_point).norm(dim=-1) / truth.unit[:, None, None]
+    right, _ = is_right(roll.prediction.point, truth, px)
+    distance = distance.nan_to_num(1.0).clamp(max=1.0)
+    return px[roll.mask & roll.visible], distance[roll.mask].float(), right[roll.mask].float()
+
+
+def _discovery(network: QuestNetwork, observed: Observation, truth: WindowTruth) -> np.ndarray:
+    """Slots that hit an entity of their label, slots, and visible entities at the anchor frames."""
+    counts = np.zeros(3)
+    for b in range(len(truth.unit)):
+        one = Observation(observed.tokens[b : b + 1], observed.fine[b : b + 1], observed.cell_point[b : b + 1])
+        peaks = find_peaks(network, one, radius_cells=1.5)
+        keep = peaks.logit > _PEAK_LOGIT
+        present = truth.visible[b, 0] & truth.exists[b]
+        gap = torch.cdist(truth.uv[b, 0, present], peaks.uv[keep]) * network.config.encoder.image_size
+        hit = (gap < _FOUND_PX) & (truth.label[b, present][:, None] == peaks.label[keep])
+        counts += (int(hit.any(1).sum()), int(keep.sum()), int(present.sum()))
+    return counts

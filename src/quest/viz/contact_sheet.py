@@ -1,0 +1,207 @@
+"""Contact sheets: one picture of a take in which a person sees whether its ground truth is right.
+
+Each view has a row of frames, with the outlines of links, the masks of entities tinted and the entities' true pixels
+marked (filled where visible, hollow where not), and a row of depth. Below are the entities and the joints over time.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from quest.errors import InputError
+from quest.types import LABELS, Take, View
+from quest.viz.ink import Canvas, draw_box, draw_disc, draw_line, draw_path, draw_ring, draw_text, fit_text
+from quest.viz.palette import BACKGROUND, LINE, MUTED, RGB, SURFACE, TEXT, query_colour
+
+_MARGIN, _GAP, _HEAD, _NAME, _ROW = 24, 6, 96, 30, 26
+_TINT = 0.5
+
+
+def contact_sheet(take: Take, *, columns: int = 8, tile_width_px: int = 288) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw a take as one picture.
+
+    Args:
+        take: what to draw; with at least one view.
+        columns: frames to show, spread evenly from the first to the last.
+        tile_width_px: width of each frame on the sheet.
+
+    Raises:
+        InputError: the take has no views, or fewer than one column or pixel is asked for.
+    """
+    if not take.views or columns < 1 or tile_width_px < 16:
+        raise InputError(
+            f"contact sheet of {take.info.name!r}: expected a view, a column and tiles of 16 pixels, "
+            f"got {len(take.views)}, {columns} and {tile_width_px}"
+        )
+    shown = np.unique(np.linspace(0, len(take) - 1, columns).round().astype(int))
+    colours = _entity_colours(take)
+    near_m, far_m = _depth_range(take)
+    rows: list[Canvas] = []
+    for v, view in enumerate(take.views):
+        tiles = [_draw_frame(view, int(t), colours, take.tracked, tile_width_px) for t in shown]
+        rows.append(_row(tiles, f"view {v}    {view.clip.camera.width} x {view.clip.camera.height} px"))
+        if view.clip.depth_m is not None:
+            tiles = [_draw_depth(view.clip.depth_m[t], near_m, far_m, tile_width_px) for t in shown]
+            rows.append(
+                _row(tiles, f"view {v}    depth, {near_m:.2f} m red to {far_m:.2f} m blue, black where missing")
+            )
+    width = max(rows[0].shape[1], 900)
+    foot = _draw_foot(take, shown, colours, width)
+    height = _HEAD + sum(len(row) for row in rows) + len(foot) + _MARGIN
+    sheet = np.empty((height, width + 2 * _MARGIN, 3), dtype=np.uint8)
+    sheet[:] = BACKGROUND
+    _draw_head(sheet[:_HEAD], take, shown, tile_width_px)
+    top = _HEAD
+    for part in (*rows, foot):
+        sheet[top : top + len(part), _MARGIN : _MARGIN + part.shape[1]] = part
+        top += len(part)
+    return sheet
+
+
+def _entity_colours(take: Take) -> list[RGB]:
+    """Bright for what is tracked, grey for hinges."""
+    return [query_colour(e) if entity.label in LABELS else MUTED for e, entity in enumerate(take.info.entities)]
+
+
+def _depth_range(take: Take) -> tuple[float, float]:
+    """Depth between which colours are spread, the same for all views."""
+    valid = [view.clip.depth_m[::4, ::4, ::4].ravel() for view in take.views if view.clip.depth_m is not None]
+    depth_m = np.concatenate(valid) if valid else np.zeros(0, np.float32)
+    depth_m = depth_m[depth_m > 0]
+    if depth_m.size == 0:
+        return 1.0, 2.0
+    near_m, far_m = np.percentile(depth_m, [1, 99])
+    return float(near_m), float(max(far_m, near_m + 1e-3))
+
+
+def _tile(image: np.ndarray, width: int, method: int) -> np.ndarray:
+    height = max(1, round(image.shape[0] * width / image.shape[1]))
+    return cv2.resize(image, (width, height), interpolation=method)
+
+
+def _draw_frame(view: View, t: int, colours: list[RGB], tracked: np.ndarray, width: int) -> Canvas:
+    shrinks = width < view.clip.camera.width
+    tile = _tile(view.clip.rgb[t], width, cv2.INTER_AREA if shrinks else cv2.INTER_CUBIC)
+    mask = _tile(view.entity_id[t], width, cv2.INTER_NEAREST)
+    lookup = np.array([(0, 0, 0), *colours], dtype=np.float32)
+    inside = mask > 0
+    tile[inside] = np.rint(tile[inside] * (1 - _TINT) + lookup[mask[inside]] * _TINT).astype(np.uint8)
+    links = _tile(view.link_id[t], width, cv2.INTER_NEAREST)
+    edge = np.zeros(links.shape, dtype=bool)
+    edge[:, 1:] |= links[:, 1:] != links[:, :-1]
+    edge[1:] |= links[1:] != links[:-1]
+    tile[edge] = np.rint(tile[edge] * 0.5 + 127).astype(np.uint8)
+    scale = width / view.clip.camera.width
+    size = np.array([width, len(tile)])
+    for e, colour in enumerate(colours):
+        uv = view.uv_px[t, e].astype(np.float64) * scale
+        if not ((uv > 0) & (uv < size)).all():  # NaN compares false
+            continue
+        xy = (float(uv[0]), float(uv[1]))
+        radius = 3.5 if e in tracked else 2.5
+        if view.visible[t, e]:
+            draw_disc(tile, xy, radius + 1.5, colour=BACKGROUND)
+            draw_disc(tile, xy, radius, colour=colour)
+        else:
+            draw_ring(tile, xy, radius + 1, colour=BACKGROUND, width=4)
+            draw_ring(tile, xy, radius + 1, colour=colour, width=2)
+        _draw_number(tile, e, xy)
+    return tile
+
+
+def _draw_number(tile: Canvas, number: int, xy: tuple[float, float]) -> None:
+    """Draw an entity's number beside its mark, outlined so that it reads on any background."""
+    right = xy[0] < tile.shape[1] - 24
+    x, y = xy[0] + (8 if right else -8), min(max(xy[1] - 8, 8), len(tile) - 8)
+    for dx, dy, colour in (
+        (-1, 0, BACKGROUND),
+        (1, 0, BACKGROUND),
+        (0, -1, BACKGROUND),
+        (0, 1, BACKGROUND),
+        (0, 0, TEXT),
+    ):
+        draw_text(tile, str(number), (x + dx, y + dy), size=13, colour=colour, align="left" if right else "right")
+
+
+def _draw_depth(depth_m: np.ndarray, near_m: float, far_m: float, width: int) -> Canvas:
+    depth_m = _tile(depth_m, width, cv2.INTER_NEAREST)
+    # Even steps of inverse depth: the object keeps most of the colours however far the background is.
+    inverse = 1 / np.maximum(depth_m, 1e-6)
+    nearness = np.clip((inverse - 1 / far_m) / (1 / near_m - 1 / far_m), 0, 1)
+    tile = cv2.applyColorMap(np.rint(nearness * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1].copy()
+    tile[depth_m <= 0] = 0
+    return tile
+
+
+def _row(tiles: list[Canvas], name: str) -> Canvas:
+    height, width = tiles[0].shape[:2]
+    row = np.empty((_NAME + height + _GAP, len(tiles) * (width + _GAP) - _GAP, 3), dtype=np.uint8)
+    row[:] = BACKGROUND
+    draw_text(row, fit_text(name, 14, row.shape[1]), (0, _NAME / 2 + 2), size=14, colour=MUTED)
+    for i, tile in enumerate(tiles):
+        row[_NAME : _NAME + height, i * (width + _GAP) : i * (width + _GAP) + width] = tile
+    return row
+
+
+def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int) -> None:
+    info = take.info
+    room = head.shape[1] - 2 * _MARGIN
+    draw_text(head, fit_text(info.name, 24, room), (_MARGIN, 28), size=24, colour=TEXT)
+    facts = (
+        f"{info.category} {info.object_id} ({info.source})",
+        f"level {info.level}",
+        f"seed {info.seed}",
+        f"{len(take)} frames at {info.frames_per_s:g}/s",
+        f"half diagonal {info.half_diagonal_m:.3f} m",
+    )
+    draw_text(head, fit_text("    ".join(facts), 15, room), (_MARGIN, 56), size=15, colour=MUTED)
+    for i, t in enumerate(shown):
+        x = _MARGIN + i * (tile_width + _GAP) + tile_width / 2
+        label = f"frame {t}   {take.stamp_s[t]:.2f} s"
+        draw_text(head, fit_text(label, 13, tile_width), (x, 84), size=13, colour=TEXT, align="centre")
+
+
+def _draw_foot(take: Take, shown: np.ndarray, colours: list[RGB], width: int) -> Canvas:
+    """Left the entities, right the joints over time."""
+    height = _NAME + max(len(colours) * _ROW, 7 * _ROW) + _MARGIN
+    foot = np.empty((height, width, 3), dtype=np.uint8)
+    foot[:] = BACKGROUND
+    left = round(0.55 * width)
+    _draw_entities(foot[:, :left], take, colours)
+    _draw_joints(foot[:, left + _MARGIN :], take, shown)
+    return foot
+
+
+def _draw_entities(area: Canvas, take: Take, colours: list[RGB]) -> None:
+    width = area.shape[1]
+    columns = (0.0, 0.46 * width, 0.62 * width, 0.8 * width)
+    for x, title in zip(columns, ("entity", "joint", "moves at most", "seen in views"), strict=True):
+        draw_text(area, title, (x, _NAME / 2 + 4), size=13, colour=MUTED)
+    moves = np.linalg.norm(take.point_world - take.point_world[:1], axis=-1).max(axis=0)
+    for e, entity in enumerate(take.info.entities):
+        y = _NAME + (e + 0.5) * _ROW
+        draw_disc(area, (8, y), 5, colour=colours[e])
+        draw_text(area, fit_text(f"{e}   {entity.name}", 14, columns[1] - 30), (22, y), size=14, colour=TEXT)
+        draw_text(area, take.info.joints[entity.joint].kind, (columns[1], y), size=14, colour=TEXT)
+        reach = f"{moves[e]:.2f} m = {moves[e] / take.info.half_diagonal_m:.2f}"
+        draw_text(area, reach, (columns[2], y), size=14, colour=TEXT if take.moved[e] else MUTED)
+        seen = "   ".join(f"{100 * view.visible[:, e].mean():.0f} %" for view in take.views)
+        draw_text(area, fit_text(seen, 14, width - columns[3]), (columns[3], y), size=14, colour=TEXT)
+
+
+def _draw_joints(area: Canvas, take: Take, shown: np.ndarray) -> None:
+    """Every joint's position between its limits; vertical lines are the frames shown."""
+    draw_text(area, "joints, lower to upper limit", (0, _NAME / 2 + 4), size=13, colour=MUTED)
+    width, top, height = area.shape[1] - 8, _NAME + 4, 7 * _ROW - 8
+    draw_box(area, 0, top, width, height, colour=SURFACE, radius=6)
+    x = 10 + (width - 20) * np.arange(len(take)) / max(len(take) - 1, 1)
+    for t in shown:
+        draw_line(area, (x[t], top + 6), (x[t], top + height - 6), colour=LINE)
+    for j, joint in enumerate(take.info.joints):
+        share = (take.joint_position[:, j] - joint.lower) / max(joint.upper - joint.lower, 1e-9)
+        y = top + height - 12 - (height - 24) * np.clip(share.astype(np.float64), -0.05, 1.05)
+        moved_by = [e for e, entity in enumerate(take.info.entities) if entity.joint == j]
+        colour = query_colour(moved_by[0]) if moved_by and j in take.info.moved_joints else MUTED
+        draw_path(area, np.stack([x, y], axis=-1), colour=colour, width=2)

@@ -1,0 +1,167 @@
+"""Drawing on RGB arrays: anti-aliased text, rounded boxes and translucent lines.
+
+Text comes from Pillow's own font, so that it looks the same on every machine; masks are cached, because a video draws
+the same words on every frame.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Literal
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont
+
+from quest.viz.palette import RGB
+
+Canvas = UInt8[np.ndarray, "_ _ 3"]
+Number = float | int
+XY = tuple[Number, Number]
+_SUBPIXEL_BITS = 4
+
+
+def text_size(text: str, size: int) -> tuple[int, int]:
+    """Width and height in pixels of a line of text."""
+    height, width = _text_mask(text, size).shape
+    return width, height
+
+
+def draw_text(
+    canvas: Canvas,
+    text: str,
+    xy: XY,
+    *,
+    size: int,
+    colour: RGB,
+    align: Literal["left", "centre", "right"] = "left",
+) -> None:
+    """Draw a line of text; ``xy`` is its left end, middle or right end, vertically centred."""
+    mask = _text_mask(text, size)
+    shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align]
+    blend(canvas, mask, round(xy[0] - shift * mask.shape[1]), round(xy[1] - mask.shape[0] / 2), colour)
+
+
+def fit_text(text: str, size: int, width: Number) -> str:
+    """The text, cut with an ellipsis where it is wider than ``width`` pixels."""
+    if text_size(text, size)[0] <= width:
+        return text
+    while text and text_size(text + "...", size)[0] > width:
+        text = text[:-1]
+    return text + "..."
+
+
+def draw_box(
+    canvas: Canvas,
+    x: Number,
+    y: Number,
+    width: Number,
+    height: Number,
+    *,
+    colour: RGB,
+    opacity: Number = 1.0,
+    radius: int = 0,
+) -> None:
+    """Draw a filled box with rounded corners, from its top left corner."""
+    mask = _box_mask(max(1, round(width)), max(1, round(height)), radius)
+    blend(canvas, mask, round(x), round(y), colour, opacity)
+
+
+def draw_line(canvas: Canvas, a: XY, b: XY, *, colour: RGB, width: int = 1, opacity: Number = 1.0) -> None:
+    """Draw an anti-aliased line, translucent if asked."""
+    if opacity >= 1.0:
+        cv2.line(canvas, _fixed(a), _fixed(b), colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+        return
+    margin = width + 2
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    x0, y0 = max(int(low[0]) - margin, 0), max(int(low[1]) - margin, 0)
+    x1, y1 = min(int(high[0]) + margin + 1, canvas.shape[1]), min(int(high[1]) + margin + 1, canvas.shape[0])
+    if x0 >= x1 or y0 >= y1:
+        return
+    region = canvas[y0:y1, x0:x1]
+    drawn = region.copy()
+    cv2.line(
+        drawn,
+        _fixed((a[0] - x0, a[1] - y0)),
+        _fixed((b[0] - x0, b[1] - y0)),
+        colour,
+        width,
+        cv2.LINE_AA,
+        _SUBPIXEL_BITS,
+    )
+    cv2.addWeighted(drawn, opacity, region, 1 - opacity, 0, dst=region)
+
+
+def draw_path(canvas: Canvas, path: Float[np.ndarray, "N 2"], *, colour: RGB, width: int = 1) -> None:
+    """Draw a polyline, interrupted where points are NaN."""
+    known = np.isfinite(path).all(axis=1)
+    edges = np.flatnonzero(np.diff(known.astype(np.int8), prepend=0, append=0))
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        fixed = np.array([_fixed((x, y)) for x, y in path[start:stop]], dtype=np.int32)
+        cv2.polylines(canvas, [fixed], False, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def draw_disc(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB) -> None:
+    """Draw a filled disc."""
+    cv2.circle(canvas, _fixed(centre), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def draw_ring(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB, width: int = 1, dashes: int = 0) -> None:
+    """Draw a circle, or one of ``dashes`` arcs."""
+    if not dashes:
+        cv2.circle(
+            canvas, _fixed(centre), round(radius * 2**_SUBPIXEL_BITS), colour, width, cv2.LINE_AA, _SUBPIXEL_BITS
+        )
+        return
+    axes = (round(radius * 2**_SUBPIXEL_BITS),) * 2
+    for dash in range(dashes):
+        start = 360 * dash / dashes
+        end = start + 220 / dashes
+        cv2.ellipse(canvas, _fixed(centre), axes, 0, start, end, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+
+
+def blend(canvas: Canvas, mask: UInt8[np.ndarray, "h w"], x: int, y: int, colour: RGB, opacity: Number = 1.0) -> None:
+    """Paint ``colour`` through a mask whose top left corner is at ``(x, y)``; what falls off the canvas is cut."""
+    height, width = mask.shape
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + width, canvas.shape[1]), min(y + height, canvas.shape[0])
+    if x0 >= x1 or y0 >= y1:
+        return
+    region = canvas[y0:y1, x0:x1]
+    alpha = mask[y0 - y : y1 - y, x0 - x : x1 - x, None].astype(np.float32) * np.float32(opacity / 255)
+    region[:] = np.rint(region + (np.array(colour, np.float32) - region) * alpha).astype(np.uint8)
+
+
+def _fixed(xy: XY) -> tuple[int, int]:
+    """Fixed-point coordinates for OpenCV, whose pixel centres are at integers."""
+    return _fixed_value(xy[0]), _fixed_value(xy[1])
+
+
+def _fixed_value(value: Number) -> int:
+    limit = 2.0**14  # beyond, OpenCV's fixed-point arithmetic overflows
+    return round((min(max(float(value), -limit), limit) - 0.5) * 2**_SUBPIXEL_BITS)
+
+
+@lru_cache(maxsize=32)
+def _font(size: int) -> ImageFont.FreeTypeFont:
+    font = ImageFont.load_default(size)
+    assert isinstance(font, ImageFont.FreeTypeFont), "wheels of Pillow carry FreeType"
+    return font
+
+
+@lru_cache(maxsize=4096)
+def _text_mask(text: str, size: int) -> np.ndarray:
+    font = _font(size)
+    ascent, descent = font.getmetrics()
+    width = max(1, int(np.ceil(font.getlength(text))) + 1)
+    image = Image.new("L", (width, ascent + descent))
+    ImageDraw.Draw(image).text((0, 0), text, fill=255, font=font)
+    return np.array(image)
+
+
+@lru_cache(maxsize=512)
+def _box_mask(width: int, height: int, radius: int) -> np.ndarray:
+    image = Image.new("L", (4 * width, 4 * height))
+    shape = (0, 0, 4 * width - 1, 4 * height - 1)
+    ImageDraw.Draw(image).rounded_rectangle(shape, radius=4 * min(radius, width // 2, height // 2), fill=255)
+    return np.array(image.resize((width, height), Image.Resampling.BOX))

@@ -1,0 +1,304 @@
+"""Overlay videos: what a tracker answered, drawn on the frames that it saw.
+
+The picture keeps to itself; a panel at its side has the world tracks in 3D and a row per query with its confidence over
+time. A filled mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import UInt8
+
+from quest.data.video import write_video
+from quest.errors import InputError
+from quest.types import Clip, State, Tracks
+from quest.viz.ink import (
+    Canvas,
+    draw_box,
+    draw_disc,
+    draw_line,
+    draw_ring,
+    draw_text,
+    fit_text,
+    text_size,
+)
+from quest.viz.inset import Inset
+from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
+
+SMALLEST_HEIGHT_PX = 720
+MOST_TAGS = 12
+"""With more queries than this, tags on the picture carry numbers only; names stay in the panel."""
+
+
+def write_overlay(clip: Clip, tracks: Tracks, path: str | Path, *, trail_s: float = 1.0) -> None:
+    """Write an overlay video (H.264, MP4), at least 720 pixels high.
+
+    Args:
+        clip: the frames that were tracked.
+        tracks: the answers, one per frame of the clip.
+        path: file to write; replaced if it exists.
+        trail_s: how far back trails reach, seconds.
+
+    Raises:
+        InputError: clip and tracks are of different length.
+    """
+    painter = OverlayPainter(clip, tracks, trail_s=trail_s)
+    seconds = float(clip.stamp_s[-1] - clip.stamp_s[0])
+    rate = (len(clip) - 1) / seconds if seconds > 0 else 30.0
+    write_video(Path(path), painter.frames(), frames_per_s=float(np.clip(rate, 1.0, 120.0)))
+
+
+class OverlayPainter:
+    """Draws single frames of an overlay; :func:`write_overlay` makes a video of all.
+
+    Args:
+        clip: the frames that were tracked.
+        tracks: the answers, one per frame of the clip.
+        trail_s: how far back trails reach, seconds.
+
+    Raises:
+        InputError: clip and tracks are of different length.
+    """
+
+    def __init__(self, clip: Clip, tracks: Tracks, *, trail_s: float = 1.0) -> None:
+        if len(clip) != len(tracks):
+            raise InputError(
+                f"overlay: clip {clip.name!r} has {len(clip)} frames, its tracks {len(tracks)}; track this clip"
+            )
+        self._clip, self._tracks, self._trail_s = clip, tracks, trail_s
+        self._scale = max(1.0, SMALLEST_HEIGHT_PX / clip.camera.height)
+        self._width, self._height = (
+            2 * round(side * self._scale / 2) for side in (clip.camera.width, clip.camera.height)
+        )
+        self._unit = self._height / 720
+        self._panel = 2 * round(180 * self._unit)
+        self._footer = 2 * round(18 * self._unit)
+        self._uv = tracks.uv_px.astype(np.float64) * self._scale
+        self._colours = [query_colour(k) for k in range(len(tracks.names))]
+        self._held, self._lost = (np.asarray(tracks.state == state.value) for state in (State.HELD, State.LOST))
+        self._inset = Inset(
+            tracks.point_world, clip.cam_from_world[0], size=(self._panel, round(0.86 * self._panel)), unit=self._unit
+        )
+        self._tag_side: dict[int, int] = {}
+        self._still = self._draw_still()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the frames, pixels."""
+        return self._width + self._panel, self._height + self._footer
+
+    def frames(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
+        """All frames in order."""
+        for t in range(len(self._clip)):
+            yield self.frame(t)
+
+    def frame(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
+        """Frame ``t``."""
+        canvas = self._still.copy()
+        picture = canvas[: self._height, : self._width]
+        enlarged = self._scale > 1
+        method = cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA
+        picture[:] = cv2.resize(self._clip.rgb[t], (self._width, self._height), interpolation=method)
+        self._draw_trails(picture, t)
+        size = np.array([self._width, self._height])
+        known = [k for k, uv in enumerate(self._uv[t]) if (uv > 0).all() and (uv < size).all()]  # NaN compares false
+        for k in known:
+            self._draw_mark(picture, tuple(self._uv[t, k]), t, k)
+        self._draw_tags(picture, t, known)
+        side = canvas[:, self._width :]
+        self._inset.draw_tracks(side[: round(0.86 * self._panel)], t, self._mark_colours(t), self._tracks.visible)
+        self._draw_rows(side, t)
+        self._draw_footer(canvas, t)
+        return canvas
+
+    def _mark_colours(self, t: int) -> list[RGB]:
+        return [LOST if self._lost[t, k] else self._colours[k] for k in range(len(self._colours))]
+
+    def _draw_still(self) -> Canvas:
+        """Everything that is the same on all frames."""
+        canvas = np.empty((self._height + self._footer, self._width + self._panel, 3), dtype=np.uint8)
+        canvas[:] = BACKGROUND
+        side = canvas[:, self._width :]
+        u = self._unit
+        self._inset.draw_frame(side[: round(0.86 * self._panel)])
+        draw_text(side, "world", (14 * u, 18 * u), size=round(14 * u), colour=MUTED)
+        draw_line(canvas, (self._width, self._height), (canvas.shape[1], self._height), colour=LINE)
+        return canvas
+
+    def _draw_trails(self, picture: Canvas, t: int) -> None:
+        stamp_s = self._clip.stamp_s
+        first = int(np.searchsorted(stamp_s, stamp_s[t] - self._trail_s))
+        width = max(2, round(2.5 * self._unit))
+        for k, colour in enumerate(self._colours):
+            for s in range(first + 1, t + 1):
+                a, b = self._uv[s - 1, k], self._uv[s, k]
+                if not np.abs(a - b).max() > 0.3:  # resting, or NaN
+                    continue
+                if self._held[s, k] and s % 2:  # every other piece is left out: dashed
+                    continue
+                unsure = self._held[s, k] or self._lost[s, k]
+                fade = (s - first) / (t - first)
+                draw_line(
+                    picture,
+                    tuple(a),
+                    tuple(b),
+                    colour=HELD if unsure else colour,
+                    width=width,
+                    opacity=0.15 + 0.75 * fade,
+                )
+
+    def _draw_mark(self, picture: Canvas, xy: tuple[float, ...], t: int, k: int, *, radius: float = 7.0) -> None:
+        u, colour, centre = self._unit, self._colours[k], (xy[0], xy[1])
+        radius, width = radius * u, max(2, round(2 * u))
+        if self._lost[t, k]:
+            arm = 0.8 * radius
+            for colour, thickness in ((BACKGROUND, width + 3), (LOST, width + 1)):
+                for sign in (1, -1):
+                    a, b = (centre[0] - arm, centre[1] - sign * arm), (centre[0] + arm, centre[1] + sign * arm)
+                    draw_line(picture, a, b, colour=colour, width=thickness)
+        elif self._held[t, k]:
+            draw_disc(picture, centre, 0.5 * radius + 1.5 * u, colour=BACKGROUND)
+            draw_disc(picture, centre, 0.5 * radius, colour=colour)
+            draw_ring(picture, centre, 1.35 * radius, colour=BACKGROUND, width=width + 2, dashes=5)
+            draw_ring(picture, centre, 1.35 * radius, colour=HELD, width=width, dashes=5)
+        elif self._tracks.visible[t, k]:
+            draw_disc(picture, centre, radius + 2.5 * u, colour=BACKGROUND)
+            draw_disc(picture, centre, radius + 1.2 * u, colour=(255, 255, 255))
+            draw_disc(picture, centre, radius - 0.8 * u, colour=colour)
+        else:
+            draw_ring(picture, centre, radius, colour=BACKGROUND, width=width + 2)
+            draw_ring(picture, centre, radius, colour=colour, width=width)
+
+    def _tag_text(self, t: int, k: int) -> str:
+        if len(self._colours) > MOST_TAGS:
+            return str(k)
+        doing = "lost" if self._lost[t, k] else "held" if self._held[t, k] else f"{self._tracks.confidence[t, k]:.2f}"
+        return f"{fit_text(self._name(k), round(15 * self._unit), 150 * self._unit)}  {doing}"
+
+    def _name(self, k: int) -> str:
+        name, label = self._tracks.names[k] or f"query {k}", self._tracks.labels[k]
+        return name if not label or label in name else f"{name} ({label})"
+
+    def _draw_tags(self, picture: Canvas, t: int, known: list[int]) -> None:
+        """Place a tag beside every mark where it covers least; a tag moves only if that frees something."""
+        u = self._unit
+        size, height = round(15 * u), 22 * u
+        taken = [(*(self._uv[t, k] - 9 * u), *(self._uv[t, k] + 9 * u)) for k in known]
+        for k in known:
+            text = self._tag_text(t, k)
+            # Digits differ in width: rounding up keeps the box from trembling.
+            width = -(-text_size(text, size)[0] // 8) * 8 + 26 * u
+            boxes = [
+                _clamped(x, y, width, height, self._width, self._height)
+                for x, y in _sides(self._uv[t, k], width, height, u)
+            ]
+            costs = [sum(_overlap(box, other) for other in taken) for box in boxes]
+            kept = self._tag_side.get(k)
+            best = int(np.argmin(costs))
+            if kept is not None and costs[kept] <= costs[best] + 0.1 * width * height:
+                best = kept
+            self._tag_side[k] = best
+            x0, y0, x1, y1 = boxes[best]
+            taken.append(boxes[best])
+            colour = LOST if self._lost[t, k] else HELD if self._held[t, k] else self._colours[k]
+            if best >= 4:  # far from its mark: a leader shows whose it is
+                near = (float(np.clip(self._uv[t, k][0], x0, x1)), float(np.clip(self._uv[t, k][1], y0, y1)))
+                draw_line(picture, tuple(self._uv[t, k]), near, colour=colour, width=max(1, round(u)), opacity=0.8)
+            draw_box(picture, x0, y0, x1 - x0, height, colour=BACKGROUND, opacity=0.78, radius=round(6 * u))
+            draw_box(picture, x0 + 7 * u, y0 + 7 * u, 8 * u, 8 * u, colour=colour, radius=round(4 * u))
+            draw_text(picture, text, (x0 + 20 * u, y0 + height / 2), size=size, colour=TEXT)
+
+    def _draw_rows(self, side: Canvas, t: int) -> None:
+        """One row per query: its mark, name, confidence now and until now."""
+        u = self._unit
+        top, bottom = 0.86 * self._panel + 8 * u, self._height - 6 * u
+        queries = len(self._colours)
+        row = float(np.clip((bottom - top) / max(queries, 1), 22 * u, 46 * u))
+        shown = int((bottom - top) // row)
+        if shown < queries:
+            shown -= 1
+            draw_text(side, f"and {queries - shown} more", (16 * u, bottom - row / 2), size=round(13 * u), colour=MUTED)
+        size = round(15 * u if row > 30 * u else 13 * u)
+        name_width = self._panel - 196 * u
+        for k in range(min(shown, queries)):
+            middle = top + (k + 0.5) * row
+            draw_box(
+                side,
+                8 * u,
+                middle - row / 2 + 2 * u,
+                self._panel - 16 * u,
+                row - 4 * u,
+                colour=SURFACE,
+                radius=round(7 * u),
+            )
+            bound = bool(np.isfinite(self._uv[t, k]).all())
+            if bound:
+                self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
+            draw_text(
+                side,
+                fit_text(self._name(k), size, name_width),
+                (40 * u, middle),
+                size=size,
+                colour=TEXT if bound else MUTED,
+            )
+            value, colour = f"{self._tracks.confidence[t, k]:.2f}", TEXT
+            if not bound:
+                value, colour = "none yet", MUTED
+            elif self._lost[t, k]:
+                value, colour = "lost", LOST
+            elif self._held[t, k]:
+                value, colour = "held", HELD
+            self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
+            draw_text(side, value, (self._panel - 18 * u, middle), size=size, colour=colour, align="right")
+
+    def _draw_curve(self, side: Canvas, k: int, t: int, at: tuple[float, float], size: tuple[float, float]) -> None:
+        """Confidence from the first frame to ``t``, on an axis that is as long as the clip."""
+        draw_line(side, (at[0], at[1] + size[1]), (at[0] + size[0], at[1] + size[1]), colour=LINE)
+        last, columns = max(len(self._tracks) - 1, 1), round(size[0])
+        frames = np.unique(np.linspace(0, last, columns).astype(int))
+        frames = frames[frames <= t]
+        confidence = np.clip(np.nan_to_num(self._tracks.confidence[frames, k].astype(np.float64)), 0, 1)
+        x, y = at[0] + size[0] * frames / last, at[1] + size[1] * (1 - confidence)
+        for i in range(1, len(frames)):
+            f = frames[i]
+            colour = LOST if self._lost[f, k] else HELD if self._held[f, k] else self._colours[k]
+            draw_line(side, (x[i - 1], y[i - 1]), (x[i], y[i]), colour=colour, width=max(1, round(1.3 * self._unit)))
+
+    def _draw_footer(self, canvas: Canvas, t: int) -> None:
+        u, frames = self._unit, len(self._clip)
+        middle, size = self._height + self._footer / 2, round(14 * u)
+        digits = len(str(frames - 1))
+        when = f"frame {t:0{digits}d} / {frames - 1}    {self._clip.stamp_s[t]:.2f} s"
+        draw_text(canvas, when, (canvas.shape[1] - 14 * u, middle), size=size, colour=TEXT, align="right")
+        room = canvas.shape[1] - text_size(when, size)[0] - 44 * u
+        left = "    ".join((self._clip.name, *self._tracks.frame_flags))
+        draw_text(canvas, fit_text(left, size, room), (14 * u, middle), size=size, colour=MUTED)
+        done = canvas.shape[1] * (t + 1) / frames
+        draw_box(canvas, 0, self._height, done, max(2, 2 * u), colour=query_colour(0))
+
+
+def _sides(uv: np.ndarray, width: float, height: float, u: float) -> list[tuple[float, float]]:
+    """Top left corners of a tag round a mark: four near ones, then four farther ones."""
+    x, y = float(uv[0]), float(uv[1])
+    near, far = 13 * u, 40 * u
+    places = []
+    for gap in (near, far):
+        up, down = y - gap - height / 2, y + gap - height / 2
+        places += [(x + gap, up), (x + gap, down), (x - gap - width, up), (x - gap - width, down)]
+    return places
+
+
+def _clamped(
+    x: float, y: float, width: float, height: float, right: float, bottom: float
+) -> tuple[float, float, float, float]:
+    x, y = min(max(x, 3.0), right - width - 3), min(max(y, 3.0), bottom - height - 3)
+    return x, y, x + width, y + height
+
+
+def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Shared area of two boxes, pixels squared."""
+    return max(0.0, min(a[2], b[2]) - max(a[0], b[0])) * max(0.0, min(a[3], b[3]) - max(a[1], b[1]))

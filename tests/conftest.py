@@ -1,0 +1,71 @@
+"""What all tests share: settings, and skipping what this machine cannot do.
+
+Nothing of quest is imported at module level: the jaxtyping hook must come first.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import beartype
+import pytest
+from hypothesis import settings
+
+PARTNET_BESIDE_CHECKOUT = Path(__file__).parents[2] / "shared" / "data" / "partnet-mobility"
+
+# For type checkers an int is a float (PEP 484); beartype agrees only when asked, and the hook of jaxtyping looks
+# it up by this name.
+beartype.beartype = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))
+
+# Derandomised: a test suite that fails once in a while teaches people to run it twice.
+settings.register_profile("quest", deadline=None, derandomize=True, database=None, max_examples=50)
+settings.load_profile("quest")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests marked ``partnet`` and ``render`` where the objects or the renderer are missing."""
+    no_objects = None if _partnet_root() else "no PartNet-Mobility objects: set QUEST_OBJECTS"
+    no_renderer = _why_no_renderer() if any(item.get_closest_marker("render") for item in items) else None
+    for item in items:
+        if no_objects and item.get_closest_marker("partnet"):
+            item.add_marker(pytest.mark.skip(reason=no_objects))
+        if no_renderer and item.get_closest_marker("render"):
+            item.add_marker(pytest.mark.skip(reason=no_renderer))
+
+
+@pytest.fixture(scope="session")
+def partnet_root() -> Path:
+    """Folder of PartNet-Mobility objects; the test is skipped without one."""
+    root = _partnet_root()
+    if root is None:
+        pytest.skip("no PartNet-Mobility objects: set QUEST_OBJECTS")
+    return root
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _few_threads() -> None:
+    """Several workers share the cores, so torch must not take all of them in each."""
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        import torch
+
+        torch.set_num_threads(1)
+
+
+def _partnet_root() -> Path | None:
+    named = os.environ.get("QUEST_OBJECTS")
+    root = Path(named) if named else PARTNET_BESIDE_CHECKOUT
+    return root if root.is_dir() else None
+
+
+def _why_no_renderer() -> str | None:
+    from quest.errors import RendererError
+    from quest.extras import is_installed
+    from quest.render_device import find_vulkan_icd
+
+    if not is_installed("sapien"):
+        return "the sim extra is not installed"
+    try:
+        return None if find_vulkan_icd() else "no Vulkan driver can render here: `make render-deps`"
+    except RendererError as error:
+        return str(error)

@@ -1,0 +1,286 @@
+"""Recordings: round trip, other layouts, and every bad input as an error that says what to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from tests.synthetic import make_take
+
+from quest.data.recording import clean_depth, clip_from_arrays, read_recording, write_recording
+from quest.data.video import write_video
+from quest.errors import InputError, RecordingError
+from quest.types import Camera, Clip
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    clip = make_take(frames=FRAMES, views=2, size=(64, 48)).views[1].clip
+    return replace(clip, name="recording")
+
+
+@pytest.fixture(scope="module")
+def template(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("template") / "recording"
+    write_recording(clip, folder, rgb="png")
+    return folder
+
+
+@pytest.fixture
+def folder(template: Path, tmp_path: Path) -> Path:
+    """A recording of twelve PNG frames that a test may spoil."""
+    return Path(shutil.copytree(template, tmp_path / "recording"))
+
+
+def assert_same(found: Clip, expected: Clip) -> None:
+    assert found.name == expected.name
+    assert found.camera == expected.camera
+    np.testing.assert_array_equal(found.rgb, expected.rgb)
+    np.testing.assert_array_equal(found.depth_m, expected.depth_m)
+    np.testing.assert_array_equal(found.stamp_s, expected.stamp_s)
+    np.testing.assert_array_equal(found.cam_from_world, expected.cam_from_world)
+
+
+def edit_camera(folder: Path, **fields: object) -> None:
+    path = folder / "camera.json"
+    known = json.loads(path.read_text()) | fields
+    path.write_text(json.dumps({key: value for key, value in known.items() if value is not None}))
+
+
+def write_depth(folder: Path, scale: float, *, dtype: type = np.uint16) -> None:
+    """Replace the depth of a recording by a plane that is 2 m away, in other units."""
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((48, 64), 2.0 / scale, dtype=dtype))
+
+
+def test_images_come_back_exactly(folder: Path, clip: Clip):
+    assert_same(read_recording(folder), clip)
+
+
+@pytest.mark.parametrize("size", [(64, 48), (63, 47)])
+def test_video_comes_back_closely(tmp_path: Path, size: tuple[int, int]):
+    clip = replace(make_take(frames=FRAMES, views=1, size=size).views[0].clip, name="video")
+    write_recording(clip, tmp_path / "video")
+    found = read_recording(tmp_path / "video")
+    assert_same(replace(found, rgb=clip.rgb), clip)
+    off = found.rgb.astype(int) - clip.rgb
+    assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 2
+    # Chroma has half the resolution, so single pixels may be off, but not the colours of the picture.
+    assert np.abs(off.mean(axis=(0, 1, 2))).max() < 1.5
+    alone = read_recording(tmp_path / "video" / "rgb.mp4")
+    assert alone.name == "rgb"
+    np.testing.assert_array_equal(alone.rgb, found.rgb)
+    assert alone.depth_m is not None
+
+
+def test_moving_camera_and_far_depth(tmp_path: Path, clip: Clip):
+    poses = clip.cam_from_world.copy()
+    poses[:, 0, 3] += np.linspace(0, 1, FRAMES)
+    assert clip.depth_m is not None
+    far = replace(clip, cam_from_world=poses, depth_m=clip.depth_m + 8)
+    write_recording(far, tmp_path / "recording", rgb="png")
+    found = read_recording(tmp_path / "recording")
+    np.testing.assert_array_equal(found.cam_from_world, poses)
+    assert found.depth_m is not None
+    assert far.depth_m is not None
+    np.testing.assert_allclose(found.depth_m, far.depth_m, atol=0.51e-3)
+
+
+def test_colours_only(folder: Path):
+    shutil.rmtree(folder / "depth")
+    assert read_recording(folder).depth_m is None
+
+
+def test_arguments_override_the_folder(folder: Path, tmp_path: Path, clip: Clip):
+    (folder / "depth").rename(tmp_path / "elsewhere")
+    (folder / "camera.json").unlink()
+    found = read_recording(folder / "rgb", depth=tmp_path / "elsewhere", camera=clip.camera, depth_scale_m=1e-4)
+    np.testing.assert_array_equal(found.depth_m, clip.depth_m)
+    np.testing.assert_allclose(found.stamp_s, np.arange(FRAMES) / 30)
+    np.testing.assert_array_equal(found.cam_from_world, np.tile(np.eye(4), (FRAMES, 1, 1)))
+
+
+def test_pixel_centres_at_integers_gain_half_a_pixel(folder: Path, clip: Clip):
+    edit_camera(folder, pixel_centre="integer")
+    assert read_recording(folder).camera.cx == clip.camera.cx + 0.5
+    edit_camera(folder, pixel_centre=None)
+    assert read_recording(folder).camera.cy == clip.camera.cy + 0.5
+
+
+def test_frame_rate_makes_stamps(folder: Path):
+    edit_camera(folder, stamp_s=None, fps=10)
+    np.testing.assert_allclose(read_recording(folder).stamp_s, np.arange(FRAMES) / 10)
+
+
+def test_frames_are_in_natural_order(folder: Path, clip: Clip):
+    for path in (folder / "rgb").iterdir():
+        path.rename(path.with_name(f"frame{int(path.stem)}.png"))
+    np.testing.assert_array_equal(read_recording(folder).rgb, clip.rgb)
+
+
+def truncate(path: Path, *, keep: float = 0.6) -> None:
+    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
+
+
+def empty(folder: Path) -> None:
+    for path in folder.iterdir():
+        path.unlink()
+
+
+def resize(path: Path) -> None:
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image is not None
+    cv2.imwrite(str(path), image[::2, ::2])
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "no frames": (lambda f: empty(f / "rgb"), "no frames; expected images in .*rgb"),
+    "no colours": (lambda f: shutil.rmtree(f / "rgb"), "no frames; expected images in .*rgb"),
+    "two videos": (
+        lambda f: (shutil.rmtree(f / "rgb"), (f / "a.mp4").touch(), (f / "b.mkv").touch()),
+        "expected one video, got a.mp4, b.mkv",
+    ),
+    "fewer depths": (lambda f: (f / "depth" / "000003.png").unlink(), "11 depth images for 12 colour frames"),
+    "fewer colours": (lambda f: (f / "rgb" / "000003.png").unlink(), "stamp_s .* 12 frames, expected 11"),
+    "no depths": (lambda f: empty(f / "depth"), "0 depth images for 12 colour frames"),
+    "torn colour": (lambda f: truncate(f / "rgb" / "000005.png"), "000005.png: cannot be decoded.*torn"),
+    "torn depth": (lambda f: truncate(f / "depth" / "000005.png"), "000005.png: cannot be decoded.*torn"),
+    "no image": (lambda f: (f / "rgb" / "000005.png").write_text("hello"), "000005.png: not an image"),
+    "colour sizes differ": (
+        lambda f: resize(f / "rgb" / "000005.png"),
+        "000005.png: 32 x 24, but 000000.png is 64 x 48",
+    ),
+    "depth of another size": (
+        lambda f: resize(f / "depth" / "000005.png"),
+        "32 x 24, but colour frames are 64 x 48; align",
+    ),
+    "depth of 8 bits": (lambda f: write_depth(f, 0.1, dtype=np.uint8), "expected 16-bit grey, got mode L"),
+    "depth missing everywhere": (lambda f: write_depth(f, 1e9), "every pixel is missing"),
+    "depth in millimetres read as tenths": (
+        lambda f: edit_camera(f, depth_scale_m=1.0),
+        "depth_scale_m = 0.0001 would give",
+    ),
+    "depth in centimetres read as mm": (
+        lambda f: (write_depth(f, 0.05), edit_camera(f, depth_scale_m=0.001)),
+        "median is 0.04 m with depth_scale_m = 0.001, expected 0.05 to 50 m; the units are wrong",
+    ),
+    "no camera": (lambda f: (f / "camera.json").unlink(), "camera.json: no such file; write one such as"),
+    "torn camera": (lambda f: truncate(f / "camera.json", keep=0.2), "camera.json: cannot be read as JSON"),
+    "camera is a list": (lambda f: (f / "camera.json").write_text("[]"), "expected an object .* got list"),
+    "camera lacks a field": (lambda f: edit_camera(f, fx=None), "lacks fx"),
+    "camera has a misspelt field": (lambda f: edit_camera(f, depth_scale=0.001), "has unknown depth_scale; known are"),
+    "camera of another size": (
+        lambda f: edit_camera(f, width=640, height=480, cx=320),
+        "64 x 48 but the camera is for 640 x 480",
+    ),
+    "focal length of nothing": (lambda f: edit_camera(f, fx=0), "fx, fy > 0"),
+    "focal length is a word": (lambda f: edit_camera(f, fx="wide"), "camera.json: could not convert"),
+    "half a pixel wide": (lambda f: edit_camera(f, width=64.5), "whole pixels"),
+    "unknown pixel centre": (
+        lambda f: edit_camera(f, pixel_centre="corner"),
+        "expected 'integer' .* or 'half-integer'",
+    ),
+    "scale of nothing": (lambda f: edit_camera(f, depth_scale_m=0), "depth_scale_m is 0, expected a positive number"),
+    "rate of nothing": (lambda f: edit_camera(f, fps=-1), "fps is -1, expected a positive number"),
+    "times run backwards": (lambda f: edit_camera(f, stamp_s=list(range(12, 0, -1))), "do not decrease"),
+    "pose is not rigid": (lambda f: edit_camera(f, cam_from_world=(2 * np.eye(4)).tolist()), "not a rigid transform"),
+    "pose is not a matrix": (lambda f: edit_camera(f, cam_from_world=[1, 2, 3]), "expected one 4 x 4 matrix"),
+    "too few poses": (
+        lambda f: edit_camera(f, cam_from_world=[np.eye(4).tolist()] * 3),
+        "cam_from_world .* 3 frames, expected 12",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", BAD)
+def test_bad_recordings(folder: Path, how: str):
+    spoil, message = BAD[how]
+    spoil(folder)
+    with pytest.raises(RecordingError, match=message) as caught:
+        read_recording(folder)
+    assert str(folder.parent) in str(caught.value), "the message names the file"
+
+
+def test_missing_paths(tmp_path: Path, folder: Path):
+    with pytest.raises(RecordingError, match="no such file or folder"):
+        read_recording(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match="no such folder; expected one 16-bit PNG"):
+        read_recording(folder, depth=tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match="positive number"):
+        read_recording(folder, depth_scale_m=-1.0)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.3, 0.95])
+def test_torn_videos(tmp_path: Path, clip: Clip, keep: float):
+    write_recording(clip, tmp_path / "recording")
+    video = tmp_path / "recording" / "rgb.mp4"
+    truncate(video, keep=keep)
+    with pytest.raises(RecordingError, match=r"rgb\.mp4.*torn"):
+        read_recording(tmp_path / "recording")
+
+
+def test_video_and_depth_of_different_length(folder: Path, clip: Clip):
+    shutil.rmtree(folder / "rgb")
+    write_video(folder / "rgb.mp4", clip.rgb[:9], frames_per_s=30)
+    edit_camera(folder, stamp_s=None)
+    with pytest.raises(RecordingError, match="12 depth images for 9 colour frames"):
+        read_recording(folder)
+
+
+def test_a_file_that_is_no_video(folder: Path):
+    (folder / "notes.mp4").write_text("hello")
+    with pytest.raises(RecordingError, match="cannot be decoded at all"):
+        read_recording(folder / "notes.mp4")
+
+
+def test_video_of_no_frames(tmp_path: Path):
+    with pytest.raises(InputError, match="at least one frame"):
+        write_video(tmp_path / "empty.mp4", [], frames_per_s=30)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_nothing_is_overwritten(folder: Path, clip: Clip):
+    with pytest.raises(InputError, match="not an empty folder"):
+        write_recording(clip, folder)
+
+
+def test_arrays_in_memory(clip: Clip):
+    assert clip.depth_m is not None
+    depth_m = clip.depth_m.astype(np.float64)
+    depth_m[0, 0, :4] = [np.nan, np.inf, -np.inf, -1]
+    found = clip_from_arrays(clip.rgb, depth_m, clip.camera, frames_per_s=10)
+    assert found.depth_m is not None
+    assert found.depth_m.dtype == np.float32
+    np.testing.assert_array_equal(found.depth_m[0, 0, :4], 0)
+    np.testing.assert_allclose(found.stamp_s[:3], [0, 0.1, 0.2])
+    assert clip_from_arrays(clip.rgb, None, clip.camera).depth_m is None
+
+
+def test_arrays_in_millimetres(clip: Clip):
+    assert clip.depth_m is not None
+    with pytest.raises(RecordingError, match=r"depth_scale_m = 0\.001 would give"):
+        clip_from_arrays(clip.rgb, (clip.depth_m * 1000).astype(np.uint16), clip.camera)
+
+
+def test_arrays_without_frames_or_with_unsorted_stamps(clip: Clip):
+    with pytest.raises(InputError, match="at least one frame"):
+        clip_from_arrays(clip.rgb[:0], None, clip.camera)
+    with pytest.raises(InputError, match="sort the frames"):
+        clip_from_arrays(clip.rgb, None, clip.camera, stamp_s=clip.stamp_s[::-1].copy())
+
+
+def test_clean_depth_keeps_what_is_valid():
+    np.testing.assert_array_equal(clean_depth(np.array([np.nan, -2.0, 0.0, 1.5, np.inf])), [0, 0, 0, 1.5, 0])
+
+
+def test_opencv_camera_has_its_centre_moved():
+    camera = Camera.from_opencv(np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]), width=64, height=48)
+    assert (camera.cx, camera.cy) == (32, 24)

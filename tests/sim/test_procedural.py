@@ -1,0 +1,181 @@
+"""Procedural objects: same seed same files, sound meshes, enough handled joints, sane geometry."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from quest.errors import ConfigError
+from quest.sim.procedural import CATEGORIES, category_for_seed, make_object
+from quest.sim.procedural.catalogue import build_model
+from quest.sim.procedural.handles import HANDLE_KINDS, HandleStyle, handle_part
+from quest.sim.procedural.model import Link, Mesh, ObjectModel
+
+pytest.importorskip("scene_synthesizer", reason="scene-synthesizer is not installed")
+
+HANDLES = ("handle", "knob")
+ALL = [(category, seed) for category in CATEGORIES for seed in (0, 1, 2)]
+
+
+def volume_m3(mesh: Mesh) -> float:
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum()) / 6
+
+
+def is_closed(mesh: Mesh) -> bool:
+    """Whether every edge is walked as often in one direction as in the other, once equal corners are merged."""
+    _, same = np.unique(np.round(mesh.vertices, 7), axis=0, return_inverse=True)
+    faces = same.reshape(-1)[mesh.faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    count = len(mesh.vertices)
+    return bool(np.array_equal(np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])))
+
+
+def all_meshes(model: ObjectModel) -> list[tuple[str, Mesh]]:
+    parts = [*model.body, *(part for link in model.links for part in link.parts)]
+    return [(part.role, part.mesh) for part in parts]
+
+
+def in_object(link: Link, mesh: Mesh, position: float = 0.0) -> np.ndarray:
+    """Vertices in the object's frame with the link's joint at a position."""
+    vertices, axis = mesh.vertices, np.asarray(link.axis)
+    if link.kind == "prismatic":
+        return vertices + np.asarray(link.origin) + position * axis
+    turned = trimesh.transformations.rotation_matrix(position, axis)[:3, :3]
+    return vertices @ turned.T + np.asarray(link.origin)
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_same_seed_same_files_and_other_seed_other_files(category: str, tmp_path: Path) -> None:
+    first, again, other = (make_object(category, s, tmp_path / n) for s, n in ((3, "a"), (3, "b"), (4, "c")))
+    assert files(first) == files(again)
+    assert files(first) != files(other)
+
+
+@pytest.mark.parametrize(("category", "seed"), ALL)
+def test_meshes_are_closed_and_their_insides_are_inside(category: str, seed: int) -> None:
+    for role, mesh in all_meshes(build_model(category, seed)):
+        assert is_closed(mesh), role
+        assert volume_m3(mesh) > 0, role
+        a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+        along_normal = (np.cross(b - a, c - a) * mesh.normals[mesh.faces].mean(axis=1)).sum(axis=1)
+        assert (along_normal > -1e-12).all(), role
+
+
+@pytest.mark.parametrize(("category", "seed"), ALL)
+def test_sizes_are_those_of_furniture(category: str, seed: int) -> None:
+    model = build_model(category, seed)
+    body = np.concatenate([part.mesh.vertices for part in model.body])
+    assert body[:, 2].min() == pytest.approx(0.0, abs=0.02)
+    assert 0.2 < np.ptp(body, axis=0).max() < 2.7
+    for link in model.links:
+        assert np.linalg.norm(link.axis) == pytest.approx(1.0)
+        if link.kind == "revolute":
+            assert np.deg2rad(79) < link.upper < np.deg2rad(131)
+        else:
+            assert 0.1 < link.upper < 0.85 * np.ptp(body[:, 1])
+
+
+@pytest.mark.parametrize(("category", "seed"), ALL)
+def test_opening_moves_every_link_out_of_the_closed_object(category: str, seed: int) -> None:
+    model = build_model(category, seed)
+    front = min(part.mesh.bounds[0, 1] for part in model.body)
+    for link in model.links:
+        top = max(float(in_object(link, part.mesh)[:, 2].max()) for part in link.parts)
+        opened = np.concatenate([in_object(link, part.mesh, link.upper) for part in link.parts])
+        assert opened[:, 1].min() < front - 0.05 or opened[:, 2].max() > top + 0.1
+
+
+@pytest.mark.parametrize(("category", "seed"), ALL)
+def test_handles_stand_out_of_the_closed_front_and_touch_it(category: str, seed: int) -> None:
+    for link in build_model(category, seed).links:
+        board = np.concatenate([part.mesh.vertices for part in link.parts if part.role not in HANDLES])
+        for part in link.parts:
+            if part.role in HANDLES:
+                low, high = part.mesh.bounds
+                assert low[1] < board[:, 1].min() - 0.01  # out of the foremost face
+                assert high[1] > board[:, 1].min() - 0.004  # no gap behind its foot
+                assert high[1] < board[:, 1].min() + 0.06  # not sunk
+                assert low[2] > board[:, 2].min() - 0.06
+                assert high[2] < board[:, 2].max() + 0.06
+
+
+@pytest.mark.parametrize("category", ["chest", "desk", "cabinet", "lockers", "sideboard", "wardrobe"])
+def test_closed_fronts_do_not_overlap(category: str) -> None:
+    for seed in range(6):
+        boxes = []
+        for link in build_model(category, seed).links:
+            panel = next(part for part in link.parts if part.role in ("drawer_front", "door_panel"))
+            boxes.append(panel.mesh.bounds[:, [0, 2]] + np.asarray(link.origin)[[0, 2]])
+        for i, a in enumerate(boxes):
+            for b in boxes[:i]:
+                assert (np.minimum(a[1], b[1]) <= np.maximum(a[0], b[0]) + 1e-9).any()
+
+
+def test_lockers_are_identical() -> None:
+    model = build_model("lockers", 5)
+    first = model.links[0]
+    for link in model.links[1:]:
+        for a, b in zip(first.parts, link.parts, strict=True):
+            np.testing.assert_allclose(a.mesh.vertices, b.mesh.vertices, atol=1e-9)
+
+
+def test_half_of_the_mix_has_four_handled_joints() -> None:
+    models = [build_model(category_for_seed(seed), seed) for seed in range(120)]
+    share = np.mean([sum(link.has_handle for link in model.links) >= 4 for model in models])
+    assert share >= 0.5
+    links = [link for model in models for link in model.links]
+    assert 0.6 < np.mean([link.has_handle for link in links]) < 0.98  # some are bare on purpose
+
+
+def test_mix_knows_every_category_and_is_stable() -> None:
+    drawn = [category_for_seed(seed) for seed in range(600)]
+    assert set(drawn) == set(CATEGORIES)
+    assert drawn[:20] == [category_for_seed(seed) for seed in range(20)]
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_folder_has_the_shape_of_partnet_mobility(category: str, tmp_path: Path) -> None:
+    folder = make_object(category, 7, tmp_path / "object")
+    model = build_model(category, 7)
+    assert json.loads((folder / "meta.json").read_text())["model_cat"] == model.model_cat
+    robot = ET.parse(folder / "mobility.urdf").getroot()
+    links = {link.get("name"): link for link in robot.findall("link")}
+    joints = robot.findall("joint")
+    assert len(joints) == len(links) - 1
+    for joint in joints:
+        assert joint.find("parent").get("link") in links  # type: ignore[union-attr]
+        assert joint.find("child").get("link") in links  # type: ignore[union-attr]
+    for link in model.links:
+        names = [visual.get("name") or "" for visual in links[link.name].findall("visual")]
+        assert link.has_handle == any(re.fullmatch(r"(handle|knob)-\d+", name) for name in names)
+    for mesh in robot.iter("mesh"):
+        path = folder / str(mesh.get("filename"))
+        loaded = trimesh.load_mesh(path)
+        assert len(loaded.faces) > 0
+
+
+@pytest.mark.parametrize("kind", HANDLE_KINDS)
+@pytest.mark.parametrize("vertical", [False, True])
+def test_handle_fits_the_room_it_is_given(kind: str, vertical: bool) -> None:
+    style = HandleStyle(kind, 0.3, 0.012, 0.035, 1.0, "metal")  # type: ignore[arg-type]
+    part = handle_part(style, at=(0.1, 0.0, 0.2), vertical=vertical, room_m=(0.15, 0.15))
+    size = np.ptp(part.mesh.vertices, axis=0)
+    assert max(size[0], size[2]) <= 0.15
+    assert part.role == ("knob" if kind in ("knob", "disc", "block") else "handle")
+    assert part.mesh.bounds[0, 1] == pytest.approx(-0.035, abs=0.012)
+
+
+def test_unknown_category_and_negative_seed_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="unknown category 'spaceship'"):
+        make_object("spaceship", 0, tmp_path)
+    with pytest.raises(ConfigError, match="seed >= 0"):
+        make_object("chest", -1, tmp_path)

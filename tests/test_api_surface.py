@@ -1,0 +1,71 @@
+"""An inventory of what users may rely on: changing it is a decision, so this file has to change with it."""
+
+from __future__ import annotations
+
+import inspect
+
+import pytest
+
+import quest
+
+PUBLIC = [
+    "LABELS",
+    "Camera",
+    "Clip",
+    "Frame",
+    "Query",
+    "QuestError",
+    "State",
+    "Stream",
+    "StreamState",
+    "Tracker",
+    "Tracks",
+    "load",
+]
+
+COMMANDS = ["data", "doctor", "eval", "generate", "track", "train", "weights"]
+
+ERRORS = [
+    "ConfigError",
+    "InputError",
+    "MissingExtraError",
+    "ObjectError",
+    "QuestError",
+    "RecordingError",
+    "RendererError",
+    "TakeError",
+    "WeightsError",
+]
+
+
+def test_public_names():
+    assert sorted(quest.__all__) == sorted(PUBLIC)
+
+
+@pytest.mark.parametrize("name", PUBLIC)
+def test_public_names_exist_and_are_explained(name):
+    value = getattr(quest, name)
+    if inspect.isclass(value) or inspect.isroutine(value):
+        assert inspect.getdoc(value)
+
+
+def test_commands():
+    from quest.cli import main
+
+    assert sorted(main.COMMANDS) == COMMANDS
+    assert all(inspect.getdoc(command) and callable(command.run) for command in main.COMMANDS.values())
+
+
+def test_errors_are_one_family():
+    from quest import errors
+
+    found = {name: value for name, value in vars(errors).items() if inspect.isclass(value)}
+    assert sorted(found) == ERRORS
+    assert all(issubclass(error, errors.QuestError) for error in found.values())
+
+
+def test_tracker_door():
+    """What DESIGN promises of the tracker: one door for clips, one for streams."""
+    assert list(inspect.signature(quest.Tracker.track).parameters)[:3] == ["self", "clip", "queries"]
+    assert list(inspect.signature(quest.Tracker.stream).parameters)[:3] == ["self", "camera", "queries"]
+    assert next(iter(inspect.signature(quest.load).parameters.values())).default == "quest-s16"

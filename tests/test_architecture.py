@@ -1,0 +1,209 @@
+"""The rooms of the package: who may import whom, and the rules that a linter does not know."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "quest"
+FILES = sorted(SOURCE.rglob("*.py"))
+
+RANKS = {
+    **dict.fromkeys(["geometry"], 0),
+    **dict.fromkeys(["sim", "data", "model", "grounding", "monitor"], 1),
+    **dict.fromkeys(["train", "track", "baselines"], 2),
+    **dict.fromkeys(["evaluation", "viz"], 3),
+    "cli": 4,
+}
+"""Rooms may import rooms of lower rank. Modules at the package's root, such as types and errors, have rank 0."""
+
+ALLOWED_WITHIN_RANK = {("sim", "data")}
+"""Generated takes go into the store."""
+
+MAX_FILE_LINES = 400
+MAX_FUNCTION_LINES = 60
+
+
+def tree(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+def name(path: Path) -> str:
+    return path.relative_to(SOURCE).as_posix()
+
+
+def room(module_parts: tuple[str, ...]) -> str:
+    """Room of a module given by its parts below ``quest``; modules at the root are their own room."""
+    return module_parts[0] if module_parts else "__init__"
+
+
+def room_of_file(path: Path) -> str:
+    return room(path.relative_to(SOURCE).with_suffix("").parts)
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Line and dotted name of everything that a file imports, at any depth."""
+    package = ("quest", *path.relative_to(SOURCE).parent.parts)
+    for node in ast.walk(tree(path)):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            if module == "quest":
+                yield from ((node.lineno, f"quest.{alias.name}") for alias in node.names)
+            else:
+                yield node.lineno, module
+
+
+def may_import(importer: str, imported: str) -> bool:
+    if importer in (imported, "__init__") or (importer, imported) in ALLOWED_WITHIN_RANK:
+        return True  # the package's own __init__ is the public door: it opens onto every room
+    low, high = RANKS.get(imported, 0), RANKS.get(importer, 0)
+    return low < high or low == high == 0
+
+
+def test_every_room_has_a_rank():
+    rooms = {path.name for path in SOURCE.iterdir() if path.is_dir() and any(path.glob("*.py"))}
+    assert rooms <= set(RANKS), "a new room: give it a rank (and a line in the docs)"
+
+
+def test_imports_point_one_way():
+    wrong = [
+        f"{name(path)}:{line} imports {module}"
+        for path in FILES
+        for line, module in imports(path)
+        if module.startswith("quest.") and not may_import(room_of_file(path), room(tuple(module.split(".")[1:])))
+    ]
+    assert not wrong
+
+
+def test_import_rule_itself():
+    assert may_import("cli", "evaluation")
+    assert may_import("sim", "data")
+    assert may_import("types", "errors")
+    assert not may_import("data", "sim")
+    assert not may_import("model", "data")
+    assert not may_import("errors", "data")
+    assert not may_import("geometry", "cli")
+
+
+def test_only_sim_imports_sapien():
+    wrong = [
+        f"{name(path)}:{line}"
+        for path in FILES
+        for line, module in imports(path)
+        if module.partition(".")[0] == "sapien" and room_of_file(path) != "sim"
+    ]
+    assert not wrong
+
+
+def test_no_pickles():
+    """Weights and checkpoints are safetensors: reading them must not run code."""
+    wrong = [
+        f"{name(path)}:{line} imports {module}"
+        for path in FILES
+        for line, module in imports(path)
+        if module.partition(".")[0] in ("pickle", "dill", "cloudpickle", "joblib")
+    ]
+    for path in FILES:
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.Attribute) and ast.unparse(node) in ("torch.load", "torch.save"):
+                wrong.append(f"{name(path)}:{node.lineno} uses {ast.unparse(node)}")
+            if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
+                wrong.append(f"{name(path)}:{node.value.lineno} allows pickles")
+    assert not wrong
+
+
+def test_no_rooms_without_a_name():
+    assert not [name(path) for path in FILES if path.stem in ("utils", "helpers", "common", "misc")]
+
+
+def test_files_and_functions_are_short():
+    long = []
+    for path in FILES:
+        lines = len(path.read_text(encoding="utf-8").splitlines())
+        if lines > MAX_FILE_LINES:
+            long.append(f"{name(path)} has {lines} lines (at most {MAX_FILE_LINES})")
+        for node in ast.walk(tree(path)):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                lines = code_lines(node)
+                if lines > MAX_FUNCTION_LINES:
+                    long.append(
+                        f"{name(path)}:{node.lineno} {node.name} has {lines} lines (at most {MAX_FUNCTION_LINES})"
+                    )
+    assert not long
+
+
+def code_lines(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """Lines of a function without its docstring: explaining more must not cost anything."""
+    first = function.body[0]
+    explained = (
+        isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
+    )
+    docstring = (first.end_lineno or first.lineno) - first.lineno + 1 if explained else 0
+    return (function.end_lineno or function.lineno) - function.lineno + 1 - docstring
+
+
+def test_nothing_reads_the_environment_at_import():
+    wrong = []
+    for path in FILES:
+        for node in at_import(tree(path)):
+            text = ast.unparse(node) if isinstance(node, ast.Attribute) else ""
+            if text in ("os.environ", "os.getenv", "torch.manual_seed", "torch.cuda", "np.random", "torch.device"):
+                wrong.append(f"{name(path)}:{node.lineno} {text}")
+    assert not wrong
+
+
+def at_import(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
+    """Everything that runs when a module is imported: all but bodies of functions and annotations."""
+    for field, value in ast.iter_fields(node):
+        if field in ("annotation", "returns"):
+            continue
+        if field == "body" and isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            continue
+        for child in value if isinstance(value, list) else [value]:
+            if isinstance(child, ast.expr | ast.stmt):
+                yield child
+            if isinstance(child, ast.AST):
+                yield from at_import(child)
+
+
+def dataclass_fields() -> Iterator[tuple[Path, str, str]]:
+    """File, class and field of every configuration: dataclasses called ``...Config`` and all commands."""
+    for path in FILES:
+        for node in ast.walk(tree(path)):
+            if not isinstance(node, ast.ClassDef) or not any(
+                "dataclass" in ast.unparse(d) for d in node.decorator_list
+            ):
+                continue
+            if node.name.endswith("Config") or room_of_file(path) == "cli":
+                for statement in node.body:
+                    if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+                        yield path, node.name, statement.target.id
+
+
+def test_every_setting_is_read():
+    read = {
+        node.attr
+        for path in FILES
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
+    }
+    assert not [f"{name(path)}: {owner}.{field}" for path, owner, field in dataclass_fields() if field not in read]
+
+
+def test_a_wrong_shape_fails_under_the_hook(pytestconfig):
+    """Without beartype in the option nothing is checked and every test would pass for the wrong reason."""
+    if not pytestconfig.getoption("--jaxtyping-packages"):
+        pytest.skip("needs --jaxtyping-packages=quest,beartype.beartype")
+    import numpy as np
+    from jaxtyping import TypeCheckError
+
+    from quest.types import Camera
+
+    with pytest.raises(TypeCheckError):
+        Camera.from_opencv(np.eye(4), width=4, height=4)

@@ -1,0 +1,156 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import dataclass
+
+import pytest
+
+from quest import __version__
+from quest.cli import main as program
+from quest.errors import MissingExtraError, QuestError, RecordingError
+from quest.extras import EXTRA_OF, explain_missing, install_command, require
+
+
+@dataclass(frozen=True)
+class Raises:
+    error: BaseException
+
+    def run(self) -> int:
+        raise self.error
+
+
+def run_with(monkeypatch, error: BaseException) -> int:
+    monkeypatch.setattr(program, "parse", lambda arguments: Raises(error))
+    return program.main(["track"])
+
+
+def python(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False, timeout=60)
+
+
+def test_version(capsys):
+    assert program.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"quest {__version__}\n"
+
+
+def test_runs_as_a_module():
+    done = python("-m", "quest.cli.main", "--version")
+    assert (done.returncode, done.stdout) == (0, f"quest {__version__}\n")
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"]])
+def test_help_lists_the_commands(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        program.main(arguments)
+    assert stop.value.code == 0
+    out = capsys.readouterr().out
+    assert all(command in out for command in program.COMMANDS)
+
+
+@pytest.mark.parametrize("command", sorted(program.COMMANDS))
+def test_every_command_has_help(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        program.main([command, "--help"])
+    assert stop.value.code == 0
+    assert f"quest {command}" in capsys.readouterr().out
+
+
+def test_help_imports_nothing_heavy():
+    """Help must come at once: what is slow to import is imported by the commands that run."""
+    heavy = ("torch", "sapien", "cv2", "av", "pyarrow", "scipy", "zarr", "matplotlib")
+    code = f"import sys, quest.cli.main; print([m for m in {heavy!r} if m in sys.modules])"
+    done = python("-c", code)
+    assert done.stdout == "[]\n", done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["follow"], ["doctor", "--colour", "red"], ["eval"]])
+def test_bad_arguments(arguments, capsys):
+    with pytest.raises(SystemExit) as stop:
+        program.main(arguments)
+    assert stop.value.code == 2
+    assert capsys.readouterr().err
+
+
+def test_an_error_of_ours_is_one_line(monkeypatch, capsys):
+    message = "clip [red]: expected 3 frames,\n got 2; " + "give all of them " * 20
+    assert run_with(monkeypatch, RecordingError(message)) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: clip [red]: expected 3 frames, got 2; give all")
+    assert captured.err.count("\n") == 1
+
+
+def test_other_errors_are_not_hidden(monkeypatch):
+    with pytest.raises(ZeroDivisionError):
+        run_with(monkeypatch, ZeroDivisionError())
+
+
+def test_interrupted(monkeypatch):
+    assert run_with(monkeypatch, KeyboardInterrupt()) == 130
+
+
+def test_missing_extra_is_named(monkeypatch, capsys):
+    assert run_with(monkeypatch, ModuleNotFoundError("No module named 'sapien'", name="sapien")) == 2
+    assert 'pip install "quest-tracker[sim]"' in capsys.readouterr().err
+    with pytest.raises(ModuleNotFoundError):
+        run_with(monkeypatch, ModuleNotFoundError("No module named 'fish'", name="fish"))
+
+
+def test_tracking_needs_no_extra():
+    """The base install tracks a recorded clip: nothing on the way may import what an extra brings."""
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\n"
+        "import quest.track, quest.data.recording, quest.data.tracks_file, quest.viz.overlay, quest.evaluation\n"
+        "import quest.baselines, quest.cli.main"
+    )
+    done = python("-c", code)
+    assert done.returncode == 0, done.stderr
+
+
+def test_require(monkeypatch):
+    import json
+
+    assert require("json") is json
+    monkeypatch.setitem(EXTRA_OF, "quest_not_there", "sim")
+    with pytest.raises(MissingExtraError, match=r'quest_not_there.*pip install "quest-tracker\[sim\]"'):
+        require("quest_not_there.submodule")
+    with pytest.raises(ModuleNotFoundError) as caught:
+        require("fish")
+    assert not isinstance(caught.value, QuestError)
+    assert explain_missing(ModuleNotFoundError("?")) is None
+
+
+def test_extras_are_those_of_the_distribution():
+    import tomllib
+    from pathlib import Path
+
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    for module, extra in EXTRA_OF.items():
+        names = [requirement.split(">")[0].split("=")[0] for requirement in project["optional-dependencies"][extra]]
+        assert module.replace("_", "-") in names, f"{module}: {install_command(extra)} does not install it"
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [("sapien", "sim", ["generate", "--procedural", "1", "--out"]), ("trimesh", "sim", ["generate", "--out"])],
+)
+def test_commands_name_the_extra_that_they_miss(module, extra, arguments, tmp_path):
+    code = f"import sys; sys.modules[{module!r}] = None; from quest.cli.main import main; sys.exit(main(sys.argv[1:]))"
+    done = python("-c", code, *arguments, str(tmp_path / "takes"))
+    assert done.returncode == 2
+    assert install_command(extra) in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_doctor(capsys):
+    code = program.main(["doctor"])
+    out = capsys.readouterr().out
+    assert all(part in out for part in ("torch", "video", "weights", "renderer", "[sim]", "disk"))
+    assert code == 0, out
+
+
+def test_doctor_fails_without_weights(monkeypatch, capsys):
+    monkeypatch.setattr("quest.model.weights.shipped_weights", dict)
+    assert program.main(["doctor"]) == 1
+    assert "cannot track recordings here: weights" in capsys.readouterr().out
