@@ -1,7 +1,7 @@
-"""Write the figures table of the README out of the result files of `quest eval`.
+"""Write the figures of the README and of the model card out of the result files of `quest eval`.
 
     python benchmarks/update_readme.py            # rewrite README.md
-    python benchmarks/update_readme.py --check    # fail if it would change
+    python benchmarks/update_readme.py --check    # fail if either would change
 
 Result files are all `benchmarks/results/*.json`; nothing in the table is typed in.
 """
@@ -33,31 +33,34 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class UpdateReadme:
-    """Rewrite the figures table of the README from the result files."""
+    """Rewrite the figures from the result files."""
 
-    readme: Path = ROOT / "README.md"
+    pages: tuple[Path, ...] = (ROOT / "README.md", ROOT / "src" / "quest" / "assets" / "weights" / "quest-s16.md")
+    """Files with a pair of markers."""
     results: Path = ROOT / "benchmarks" / "results"
     check: bool = False
     """Change nothing; exit with 1 if the table is out of date."""
 
     def run(self) -> int:
-        """Return 0, or 1 if --check finds the table out of date."""
-        text = self.readme.read_text(encoding="utf-8")
-        updated = with_figures(text, figures(self.results))
-        if self.check:
-            if updated != text:
-                print(f"{self.readme} is out of date: python benchmarks/update_readme.py", file=sys.stderr)
-            return int(updated != text)
-        self.readme.write_text(updated, encoding="utf-8")
-        return 0
+        """Return 0, or 1 if --check finds a page out of date."""
+        table, stale = figures(self.results), 0
+        for page in self.pages:
+            text = page.read_text(encoding="utf-8")
+            updated = with_figures(text, table)
+            if self.check and updated != text:
+                print(f"{page} is out of date: python benchmarks/update_readme.py", file=sys.stderr)
+                stale = 1
+            elif updated != text:
+                page.write_text(updated, encoding="utf-8")
+        return stale
 
 
 def with_figures(text: str, table: str) -> str:
-    """The README's text with another table between the markers."""
+    """A page's text with another table between the markers."""
     before, _, rest = text.partition(BEGIN)
     _, _, after = rest.partition(END)
     if not rest or END not in rest:
-        raise SystemExit(f"expected the markers {BEGIN} and {END} in the README")
+        raise SystemExit(f"expected the markers {BEGIN} and {END} in the page")
     return f"{before}{BEGIN}\n{table}\n{END}{after}"
 
 

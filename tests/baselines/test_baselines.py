@@ -7,12 +7,12 @@ import dataclasses
 import cv2
 import numpy as np
 import pytest
-from tests.synthetic import make_take
 
 from quest.baselines import HoldStill, LucasKanade
 from quest.baselines.point_queries import hold_last, lift_pixels
 from quest.errors import ConfigError, InputError
 from quest.types import Camera, Clip, Query, State, Take
+from tests.synthetic import make_take
 
 BASELINES = [HoldStill(), LucasKanade()]
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from tests.synthetic import make_take
 
 from quest.data.recording import clean_depth, clip_from_arrays, read_recording, write_recording
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
+from tests.synthetic import make_take
 
 FRAMES = 12
 

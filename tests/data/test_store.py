@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.synthetic import make_take
 
 from quest.data.store import TakeStore, open_clip
 from quest.errors import InputError, TakeError
 from quest.types import Take
+from tests.synthetic import make_take
 
 
 @pytest.fixture(scope="module")

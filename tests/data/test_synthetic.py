@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from tests.synthetic import make_take
 
 from quest.geometry import lift_depth, project, transform
 from quest.types import Take
+from tests.synthetic import make_take
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,6 @@ import itertools
 from pathlib import Path
 
 import pytest
-from tests.evaluation.fakes import Oracle
-from tests.synthetic import make_take
 
 import quest
 from quest.cli.evaluate import Eval
@@ -19,6 +17,8 @@ from quest.evaluation import evaluate, read_records, read_results
 from quest.evaluation.results import records_path
 from quest.evaluation.selection import part_of, select_takes
 from quest.types import Take, TakeInfo
+from tests.evaluation.fakes import Oracle
+from tests.synthetic import make_take
 
 
 def _take(seed: int, *, level: int = 1) -> Take:

@@ -6,14 +6,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.evaluation.fakes import Oracle
-from tests.synthetic import make_take
 
 from quest.errors import ConfigError
 from quest.evaluation.protocols import assign, evaluate_point, evaluate_semantic, starts_at_rest, unscored_entities
 from quest.evaluation.records import Subject
 from quest.evaluation.summary import Metrics, summarise
 from quest.types import Take
+from tests.evaluation.fakes import Oracle
+from tests.synthetic import make_take
 
 SUBJECT = Subject("oracle", "point", "validation", "procedural", 3, "panels-0")
 

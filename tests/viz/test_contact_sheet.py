@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tests.synthetic import make_take
 
 from quest.cli.data import Data, DataList, DataShow
 from quest.data.store import TakeStore
@@ -16,6 +15,7 @@ from quest.errors import InputError, TakeError
 from quest.types import Take
 from quest.viz.contact_sheet import contact_sheet
 from quest.viz.palette import query_colour
+from tests.synthetic import make_take
 
 
 @pytest.fixture(scope="module")

@@ -8,13 +8,13 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from tests.synthetic import make_take
 
 from quest.data.video import read_video
 from quest.errors import InputError
 from quest.types import State, Take, Tracks
 from quest.viz.overlay import OverlayPainter, write_overlay
 from quest.viz.palette import LOST, query_colour
+from tests.synthetic import make_take
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import sys
+import dataclasses
+import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from quest.data.store import TakeStore
     from quest.sim.generate import TakeSettings
     from quest.sim.plan import ObjectShelf, TakeSpec
+    from quest.sim.renderer import Renderer
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,14 @@ class Generate:
     """Give objects random materials: procedural ones always, others now and then."""
 
     def run(self) -> int:
-        """Render and write; 0 if every planned take is there or was skipped for a stated reason."""
+        """Render and write; 0 if every planned take is there or was skipped for a stated reason.
+
+        Raises:
+            ObjectError: there is no folder of objects to take the named ones from, or not one planned take can be made.
+        """
         from quest.data.store import TakeStore
         from quest.sim.generate import TakeSettings
+        from quest.sim.objects import find_objects
         from quest.sim.plan import ObjectShelf, plan_takes
         from quest.sim.provenance import take_provenance
         from quest.sim.renderer import Renderer
@@ -72,13 +79,33 @@ class Generate:
         )
         console = Console(stderr=True, highlight=False)
         missing = [spec for spec in takes if spec.name not in store]
-        console.print(f"{len(takes)} takes planned, {len(takes) - len(missing)} there already; store {escape(str(self.out))}")
+        console.print(
+            f"{len(takes)} takes planned, {len(takes) - len(missing)} there already; store {escape(str(self.out))}"
+        )
         if not missing:
             return 0
+        if any(spec.source == "partnet" for spec in missing):
+            find_objects(self.objects_root)  # told before the renderer warms up
         renderer = Renderer()
-        provenance = take_provenance(renderer=str(renderer.device), command=" ".join(["quest", *sys.argv[1:]]))
+        provenance = take_provenance(renderer=str(renderer.device), command=self.command_line())
         with ObjectShelf(self.objects_root) as shelf:
-            return _Run(store, shelf, renderer, settings, provenance, console).make(missing)
+            skipped = _Run(store, shelf, renderer, settings, provenance, console).make(missing)
+        if skipped == len(takes):
+            raise ObjectError(f"generate: none of the {skipped} planned takes can be made, for the reasons above")
+        return 0
+
+    def command_line(self) -> str:
+        """The command that makes these takes again, whichever way this one was called."""
+        words = ["quest", "generate"]
+        for field in dataclasses.fields(self):
+            value, flag = getattr(self, field.name), "--" + field.name.replace("_", "-")
+            if value == field.default:
+                continue
+            if isinstance(value, bool):
+                words.append(flag if value else flag.replace("--", "--no-", 1))
+            else:
+                words += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
+        return shlex.join(words)
 
     def _chosen(self) -> list[tuple[str, str]]:
         """Source and id of every object that the arguments name."""
@@ -113,12 +140,13 @@ class _Run:
 
     store: TakeStore
     shelf: ObjectShelf
-    renderer: object
+    renderer: Renderer
     settings: TakeSettings
     provenance: dict
     console: Console
 
     def make(self, takes: list[TakeSpec]) -> int:
+        """Make takes; returns how many were skipped."""
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"),
             TimeElapsedColumn(), TimeRemainingColumn(),
@@ -138,7 +166,7 @@ class _Run:
                 progress.update(bar, advance=1, description=spec.name, speed=speed)
         speed = f" at {frames / seconds:.1f} frames/s" if seconds else ""
         self.console.print(f"{len(takes) - skipped} takes written{speed}, {skipped} skipped; store {self.store.root}")
-        return 0
+        return skipped
 
     def _make_one(self, spec: TakeSpec, warned: set[str]) -> int:
         """Number of frames rendered, all views counted; 0 if the take is impossible, which is said once per reason."""
@@ -148,8 +176,13 @@ class _Run:
             sim_object = self.shelf.load(spec.source, spec.object_id)
             self._warn(spec.object_id, sim_object.warnings, warned)
             take = generate_take(
-                sim_object, spec.level, spec.seed, renderer=self.renderer, settings=self.settings, provenance=self.provenance
-            )  # fmt: skip
+                sim_object,
+                spec.level,
+                spec.seed,
+                renderer=self.renderer,
+                settings=self.settings,
+                provenance=self.provenance,
+            )
         except ObjectError as error:
             self._warn(f"skipped {spec.object_id}", (str(error),), warned)
             return 0

@@ -88,7 +88,9 @@ class Track:
             try:
                 frame, x, y = int(parts[0]), float(parts[1]), float(parts[2])
             except (ValueError, IndexError) as error:
-                raise InputError(f"--point {text!r}: expected FRAME,X,Y or FRAME,X,Y,NAME, such as 0,120.5,88") from error
+                raise InputError(
+                    f"--point {text!r}: expected FRAME,X,Y or FRAME,X,Y,NAME, such as 0,120.5,88"
+                ) from error
             queries.append(Query.point(frame, x, y, name=parts[3] if len(parts) > 3 else ""))
         return queries + [Query.semantic(label) for label in self.label]
 

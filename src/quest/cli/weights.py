@@ -43,12 +43,44 @@ class ImportEncoder:
 
 
 @dataclass(frozen=True)
+class TuneWeights:
+    """Choose the tracker's settings on validation objects and store them with the weights."""
+
+    weights: tyro.conf.Positional[Path]
+    """File of trained weights; it is rewritten."""
+    takes: Path = Path("takes")
+    """Store with takes of validation objects."""
+    level: tuple[int, ...] = (1,)
+    """Levels of the takes to use."""
+
+    def run(self) -> int:
+        """Tune, print every trial, rewrite the file."""
+        from quest.data.store import TakeStore
+        from quest.evaluation.selection import select_takes
+        from quest.evaluation.tuning import tune
+        from quest.model.weights import load_network, save_network
+        from quest.track import load
+
+        console = Console(highlight=False)
+        store = TakeStore(self.takes)
+        takes = select_takes(store.infos(), split=("validation",), levels=self.level)
+        tuned = tune(
+            load(self.weights), store, takes, report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}")
+        )
+        console.print(f"discovery F1 {tuned.discovery_f1:.3f}; settings {tuned.config.to_json()}")
+        loaded = load_network(self.weights)
+        save_network(self.weights, loaded.network, settings=tuned.config.to_json(), about=loaded.about)
+        return 0
+
+
+@dataclass(frozen=True)
 class Weights:
     """Weights that ship with the package, and those that training starts from."""
 
     command: (
         Annotated[ListWeights, tyro.conf.subcommand("list")]
         | Annotated[ImportEncoder, tyro.conf.subcommand("import-encoder")]
+        | Annotated[TuneWeights, tyro.conf.subcommand("tune")]
     )
 
     def run(self) -> int:

@@ -54,7 +54,7 @@ class Letterbox:
     def depth(self, depth_m: Float32[np.ndarray, "H W"]) -> Float32[np.ndarray, "S S"]:
         """Depth on the canvas, never mixed between pixels; NaN, infinite and negative depth becomes 0 (missing)."""
         clean = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
-        return self._place(clean, cv2.INTER_NEAREST)
+        return self._place(clean, cv2.INTER_NEAREST_EXACT)  # the plain one is off by up to half a pixel
 
     def to_canvas(self, uv_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
         """Canvas pixels of source pixels."""

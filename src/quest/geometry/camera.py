@@ -43,7 +43,9 @@ def lift_depth(depth_m: Float[Tensor, "*B H W"], camera: Camera) -> Float[Tensor
     return lift(uv_px, depth_m, camera)
 
 
-def scale_camera(camera: Camera, *, scale: float, pad_left_px: float, pad_top_px: float, width: int, height: int) -> Camera:
+def scale_camera(
+    camera: Camera, *, scale: float, pad_left_px: float, pad_top_px: float, width: int, height: int
+) -> Camera:
     """Intrinsics after resizing an image by ``scale`` and placing it on a canvas.
 
     Args:

@@ -52,7 +52,9 @@ class NetworkConfig:
         if (self.queries, self.head) not in {("anchored", "heatmap"), ("learned", "regression")}:
             raise ConfigError(f"network: queries {self.queries!r} do not go with head {self.head!r}")
         if self.encoder.patch_size != 2 * self.cell_px:
-            raise ConfigError(f"network: expected cells of half a patch ({self.encoder.patch_size // 2} px), got {self.cell_px}")
+            raise ConfigError(
+                f"network: expected cells of half a patch ({self.encoder.patch_size // 2} px), got {self.cell_px}"
+            )
         if min(self.window, self.slots, self.decoder_layers) < 1:
             raise ConfigError("network: window, slots and decoder_layers must be at least 1")
 

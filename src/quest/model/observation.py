@@ -58,7 +58,9 @@ class FrameBatch:
         """The same on a device."""
         return FrameBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
 
-    def to_reference(self, uv_px: Float[Tensor, "B T Q 2"], depth_m: Float[Tensor, "B T Q"]) -> Float[Tensor, "B T Q 3"]:
+    def to_reference(
+        self, uv_px: Float[Tensor, "B T Q 2"], depth_m: Float[Tensor, "B T Q"]
+    ) -> Float[Tensor, "B T Q 3"]:
         """Points of the reference frame under pixels of the input; NaN where depth is 0."""
         fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
         z = torch.where(depth_m > 0, depth_m, torch.full_like(depth_m, torch.nan))

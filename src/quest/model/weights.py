@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -28,12 +27,14 @@ class LoadedNetwork:
         path: file that it came from.
         network: in evaluation mode, on the CPU.
         settings: settings of the tracker that were chosen with these weights, as JSON text.
+        about: where the weights come from.
     """
 
     name: str
     path: Path
     network: QuestNetwork
     settings: str
+    about: str
 
 
 def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str) -> None:
@@ -88,4 +89,4 @@ def load_network(name: str | Path) -> LoadedNetwork:
     except (ConfigError, KeyError) as error:
         raise WeightsError(f"{path}: {error}; the file is of another version of quest") from error
     load_exactly(network, {k: v.to(torch.float32) for k, v in state.items()}, what=f"weights {path}")
-    return LoadedNetwork(str(name), path, network.eval(), metadata.get("settings", "{}"))
+    return LoadedNetwork(str(name), path, network.eval(), metadata.get("settings", "{}"), metadata.get("about", ""))

@@ -29,7 +29,7 @@ class PosedCamera:
 def sample_cameras(
     points: Float[np.ndarray, "N 3"], count: int, rng: np.random.Generator, *, width: int, height: int
 ) -> list[PosedCamera]:
-    """Cameras in the front hemisphere (+x) that see all ``points`` and are at least 18 degrees apart.
+    """Cameras in the front hemisphere (+x) that see all ``points``, about 18 degrees apart or more.
 
     Args:
         points: world points that must stay inside the image; the object in all its joint states.
@@ -51,12 +51,17 @@ def sample_cameras(
         if all(direction @ d < np.cos(apart) for d in directions):
             directions.append(direction)
         else:
-            apart *= 0.97  # more cameras than fit so far apart come closer
+            apart *= 0.97  # so that any number of cameras fits
     return [_aimed(points, d, rng, width=width, height=height) for d in directions]
 
 
 def _aimed(
-    points: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "3"], rng: np.random.Generator, *, width: int, height: int
+    points: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "3"],
+    rng: np.random.Generator,
+    *,
+    width: int,
+    height: int,
 ) -> PosedCamera:
     fov = rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG))
     fill = rng.uniform(*_FILL)

@@ -18,7 +18,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from quest.sim.articulation import Articulation, apply
 
@@ -99,9 +99,7 @@ def find_entities(articulation: Articulation, half_diagonal_m: float) -> tuple[S
     return _with_unique_names(kept + hinges)
 
 
-def _handles(
-    articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float
-) -> list[SimEntity]:
+def _handles(articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float) -> list[SimEntity]:
     found = []
     for label in ("handle", "knob"):
         parts = [i for i in articulation.body_parts(1 + joint) if part_label(articulation.parts[i].name) == label]
@@ -117,7 +115,12 @@ def _handles(
 
 
 def _entity(
-    articulation: Articulation, joint: int, label: str, point: Float[np.ndarray, "3"], inside: bool, parts: tuple[int, ...]
+    articulation: Articulation,
+    joint: int,
+    label: str,
+    point: Float[np.ndarray, "3"],
+    inside: bool,
+    parts: tuple[int, ...],
 ) -> SimEntity:
     rest = articulation.rest
     start = apply(articulation.poses(rest)[1 + joint], point)
@@ -143,7 +146,7 @@ def _near_groups(meshes: list[trimesh.Trimesh], gap: float) -> list[list[int]]:
     if not meshes:
         return []
     points = [_sample(m, 300)[0] for m in meshes]
-    trees = [cKDTree(p) for p in points]
+    trees = [KDTree(p) for p in points]
     near = np.eye(len(meshes), dtype=bool)
     for a in range(len(meshes)):
         for b in range(a):
@@ -166,6 +169,12 @@ def _sample(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "N 3"]
     return points, np.asarray(mesh.face_normals)[face]
 
 
+def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
+    joined = trimesh.util.concatenate(meshes)
+    assert isinstance(joined, trimesh.Trimesh)
+    return joined
+
+
 class _Surfaces:
     """Surfaces of an object at rest, with what can be seen of them from the front."""
 
@@ -174,7 +183,7 @@ class _Surfaces:
         self._half_diagonal_m = half_diagonal_m
         self._poses = articulation.poses(articulation.rest)
         self._world = [p.surface.copy().apply_transform(self._poses[p.body]) for p in articulation.parts]
-        self._scene = trimesh.util.concatenate(self._world)
+        self._scene = _joined(self._world)
         angles = np.deg2rad(_SEEN_FROM_DEG)
         azimuth, elevation = angles[:, 0], angles[:, 1]
         self._towards = np.stack(
@@ -204,7 +213,7 @@ class _Surfaces:
         if inside:
             # Inside the closed object: judge the body alone, as it will look when pulled out.
             own = [self._world[i] for i in self._articulation.body_parts(body)]
-            seen = self._seen_share(points, trimesh.util.concatenate(own))
+            seen = self._seen_share(points, _joined(own))
         return seen >= 0.5 * seen.max(), inside
 
     def _seen_share(self, points: Float[np.ndarray, "N 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " N"]:

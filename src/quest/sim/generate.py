@@ -104,7 +104,7 @@ def generate_take(
     flow = np.zeros_like(points)
     flow[:-1] = np.diff(points, axis=0)
     return Take(
-        info=_info(sim_object, name, level, seed, moved_joints, provenance or {}),
+        info=_info(sim_object, name, level, seed, moved_joints, FRAMES_PER_S / settings.every, provenance or {}),
         views=tuple(r.view(f"{name}/view{v}", stamp_s) for v, r in enumerate(recorders)),
         stamp_s=stamp_s,
         point_world=points.astype(np.float32),
@@ -206,7 +206,9 @@ def _cameras(
         stage = renderer.stage(sim_object, cameras, lambda scene, bodies: None)
         stage.pose(rest_poses)
         pictures = stage.pictures()
-        seen = np.stack([_seen(sim_object, c, p, rest_points)[1][followed] for c, p in zip(cameras, pictures, strict=True)])
+        seen = np.stack(
+            [_seen(sim_object, c, p, rest_points)[1][followed] for c, p in zip(cameras, pictures, strict=True)]
+        )
         score = (int(seen.any(axis=1).sum()), int(seen.any(axis=0).sum()))
         if best is None or score > best[0]:
             best = (score, cameras)
@@ -217,7 +219,13 @@ def _cameras(
 
 
 def _info(
-    sim_object: SimObject, name: str, level: int, seed: int, moved_joints: tuple[int, ...], provenance: dict[str, Any]
+    sim_object: SimObject,
+    name: str,
+    level: int,
+    seed: int,
+    moved_joints: tuple[int, ...],
+    frames_per_s: float,
+    provenance: dict[str, Any],
 ) -> TakeInfo:
     return TakeInfo(
         name=name,
@@ -227,7 +235,7 @@ def _info(
         level=level,
         seed=seed,
         half_diagonal_m=sim_object.half_diagonal_m,
-        frames_per_s=FRAMES_PER_S,
+        frames_per_s=frames_per_s,
         entities=tuple(Entity(e.name, e.label, e.body, e.joint) for e in sim_object.entities),
         joints=tuple(j.joint for j in sim_object.articulation.joints),
         moved_joints=moved_joints,

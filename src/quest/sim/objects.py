@@ -99,7 +99,9 @@ def find_objects(root: Path | None = None) -> list[Path]:
             )
         root = Path(value)
     if not root.is_dir():
-        raise ObjectError(f"{root}: expected a folder of PartNet-Mobility objects, found none; check {OBJECTS_VARIABLE}")
+        raise ObjectError(
+            f"{root}: expected a folder of PartNet-Mobility objects, found none; check {OBJECTS_VARIABLE}"
+        )
     folders = sorted(f.parent for f in root.glob("*/mobility.urdf"))
     if not folders:
         raise ObjectError(f"{root}: expected folders that each hold a mobility.urdf, found none")
@@ -132,7 +134,9 @@ def load_object(folder: Path) -> SimObject:
     half_diagonal_m = float(np.linalg.norm(extent)) / 2
     entities = find_entities(articulation, half_diagonal_m)
     if all(e.label == "hinge" for e in entities):
-        raise ObjectError(f"{folder}: expected a moving link with a handle, rim or front, found none; use another object")
+        raise ObjectError(
+            f"{folder}: expected a moving link with a handle, rim or front, found none; use another object"
+        )
     return SimObject(
         source, folder.name, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
     )  # fmt: skip
@@ -181,7 +185,8 @@ def _with_scaled_origins(urdf: Urdf, warnings: list[str]) -> Urdf:
         return pose
 
     links = {
-        name: tuple(replace(v, link_from_visual=scaled(v.link_from_visual)) for v in vs) for name, vs in urdf.links.items()
+        name: tuple(replace(v, link_from_visual=scaled(v.link_from_visual)) for v in vs)
+        for name, vs in urdf.links.items()
     }
     joints = []
     for j in urdf.joints:
@@ -228,7 +233,9 @@ def _articulation(urdf: Urdf, folder: Path, warnings: list[str]) -> Articulation
             f"(first: {missing[0] if missing else 'none named'}); copy the object's textured_objs folder too"
         )
     if missing:
-        warnings.append(f"{len(missing)} meshes are missing or have no faces and were left out: {', '.join(missing[:5])}")
+        warnings.append(
+            f"{len(missing)} meshes are missing or have no faces and were left out: {', '.join(missing[:5])}"
+        )
     return Articulation(names, tuple(parts), tuple(joints), np.eye(4))
 
 
@@ -341,7 +348,9 @@ def _scaled(articulation: Articulation, scale: float) -> Articulation:
         factor = scale if j.joint.kind == "prismatic" else 1.0
         record = replace(j.joint, lower=j.joint.lower * factor, upper=j.joint.upper * factor)
         joints.append(replace(j, joint=record, parent_from_joint=pose(j.parent_from_joint), rest=j.rest * factor))
-    return replace(articulation, parts=tuple(parts), joints=tuple(joints), world_from_root=pose(articulation.world_from_root))
+    return replace(
+        articulation, parts=tuple(parts), joints=tuple(joints), world_from_root=pose(articulation.world_from_root)
+    )
 
 
 def _placed(articulation: Articulation) -> Articulation:

@@ -17,7 +17,12 @@ def take_provenance(*, renderer: str, command: str) -> dict[str, Any]:
         renderer: device that renders.
         command: command line that was called.
     """
-    return {"commit": _commit(), "versions": {p: _version(p) for p in _PACKAGES}, "renderer": renderer, "command": command}
+    return {
+        "commit": _commit(),
+        "versions": {p: _version(p) for p in _PACKAGES},
+        "renderer": renderer,
+        "command": command,
+    }
 
 
 def _version(package: str) -> str | None:
@@ -33,7 +38,9 @@ def _commit() -> str | None:
     git = ["git", "-C", str(folder)]
     try:
         commit = subprocess.run([*git, "rev-parse", "HEAD"], capture_output=True, text=True, check=True).stdout.strip()
-        changed = subprocess.run([*git, "status", "--porcelain", "--", str(folder)], capture_output=True, text=True, check=True)
+        changed = subprocess.run(
+            [*git, "status", "--porcelain", "--", str(folder)], capture_output=True, text=True, check=True
+        )
     except (OSError, subprocess.CalledProcessError):
         return None
     return commit + ("+" if changed.stdout.strip() else "")

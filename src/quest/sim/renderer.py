@@ -79,7 +79,9 @@ class Renderer:
             self._latest = Stage(self._sapien, sim_object, cameras, dress)
             return self._latest
         except RuntimeError as error:
-            raise RendererError(f"{sim_object.object_id}: SAPIEN cannot set up the scene ({error}); {REMEDY}") from error
+            raise RendererError(
+                f"{sim_object.object_id}: SAPIEN cannot set up the scene ({error}); {REMEDY}"
+            ) from error
 
 
 class Stage:
@@ -123,7 +125,8 @@ class Stage:
     def pose(self, world_from_body: Float[np.ndarray, "B 4 4"]) -> None:
         """Moves the bodies."""
         for b, matrix in enumerate(world_from_body):
-            if self._posed[b] is not None and np.array_equal(self._posed[b], matrix):
+            last = self._posed[b]
+            if last is not None and np.array_equal(last, matrix):
                 continue
             pose = self._sapien.Pose(matrix)
             for actor in self._bodies[b]:

@@ -149,7 +149,11 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
     if shape.tag == "mesh":
         mesh = folder / shape.attrib["filename"].removeprefix("file://").removeprefix("package://")
         scale_text = shape.get("scale")
-        scale = _numbers(scale_text, (1, 1, 1)) if len((scale_text or "1 1 1").split()) == 3 else np.full(3, float(scale_text or 1))
+        scale = (
+            _numbers(scale_text, (1, 1, 1))
+            if len((scale_text or "1 1 1").split()) == 3
+            else np.full(3, float(scale_text or 1))
+        )
     elif shape.tag == "box":
         size = _numbers(shape.attrib["size"], (0, 0, 0))
     elif shape.tag == "cylinder":
@@ -161,7 +165,9 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
     material = element.find("material")
     rgba = None if material is None else _rgba(material) or colours.get(material.get("name"))
     sx, sy, sz = scale.tolist()
-    return UrdfVisual(element.get("name") or "", _origin(element), mesh, (sx, sy, sz), shape.tag, tuple(size.tolist()), rgba)
+    return UrdfVisual(
+        element.get("name") or "", _origin(element), mesh, (sx, sy, sz), shape.tag, tuple(size.tolist()), rgba
+    )
 
 
 def _joint(element: ElementTree.Element) -> UrdfJoint:
@@ -204,7 +210,9 @@ def _ordered(joints: list[UrdfJoint], links: dict, path: Path) -> tuple[UrdfJoin
     while remaining:
         ready = [j for j in remaining if j.parent in reached]
         if not ready:
-            raise ObjectError(f"{path}: expected links that form a tree, found a cycle; restore the file from its source")
+            raise ObjectError(
+                f"{path}: expected links that form a tree, found a cycle; restore the file from its source"
+            )
         order += ready
         reached |= {j.child for j in ready}
         remaining = [j for j in remaining if j.child not in reached]

@@ -1,8 +1,8 @@
 """Where an entity may be, over the cells of the newest frame, carried from frame to frame.
 
 Every frame is matched with the unchanged anchor; the belief only says that things do not jump. It is the forward
-recursion of a hidden Markov model whose states are the cells, so nothing is committed to and a wrong belief is left again
-through the jump probability.
+recursion of a hidden Markov model whose states are the cells, so nothing is committed to and a wrong belief is left
+again through the jump probability.
 
 Reference: Rabiner, A Tutorial on Hidden Markov Models, Proceedings of the IEEE 1989, section III.
 """

@@ -14,13 +14,13 @@ from torch import Tensor
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
 from quest.geometry import invert, transform
-from quest.model.discovery import find_peaks
 from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
 from quest.track.belief import Belief, update
 from quest.track.settings import TrackerConfig
-from quest.types import LABELS, Camera, Query, State
+from quest.types import LABELS, Camera, Frame, Query, State
 
 _LOST_BELOW = 0.3
 
@@ -39,6 +39,7 @@ class StreamState:
         state: :class:`~quest.types.State` per query.
         stamp_s: the frame's time.
         has_depth: whether the frame brought any depth.
+        query: which of the queries, in the order in which they were asked, each row answers; discovered slots count up.
     """
 
     names: tuple[str, ...]
@@ -50,12 +51,14 @@ class StreamState:
     state: tuple[State, ...]
     stamp_s: float
     has_depth: bool
+    query: tuple[int, ...]
 
 
 @dataclass
 class _Bound:
     """A query that has found its entity."""
 
+    query: int
     name: str
     label: str | None
     slot: int | None
@@ -74,6 +77,9 @@ class Stream:
         queries: what to follow; None discovers entities in the first frame.
         device: where the network runs.
         autocast: whether the network computes in bfloat16.
+
+    Raises:
+        InputError: a point query lies outside the image.
     """
 
     def __init__(
@@ -90,7 +96,9 @@ class Stream:
         self._config = config
         self._letterbox = Letterbox(camera, network.config.encoder.image_size)
         self._discover_all = queries is None
-        self._waiting = list(queries or ())
+        self._waiting = list(enumerate(queries or ()))
+        for _, query in self._waiting:
+            _check_pixel(query, camera)
         self._device = device
         self._autocast = autocast
         self._ring: deque[Observation] = deque(maxlen=network.config.window)
@@ -103,7 +111,7 @@ class Stream:
     @property
     def unbound(self) -> tuple[Query, ...]:
         """Queries that have not found their entity, and point queries whose frame has not come."""
-        return tuple(self._waiting)
+        return tuple(query for _, query in self._waiting)
 
     def step(
         self,
@@ -121,9 +129,9 @@ class Stream:
             cam_from_world: pose of the camera; the world is the camera if None.
 
         Raises:
-            InputError: the frame does not have the camera's size or type.
+            InputError: the frame does not have the camera's size or type, or the pose is no 4 x 4 matrix.
         """
-        self._check(rgb, depth_m)
+        self._check(rgb, depth_m, cam_from_world)
         with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
             frames = self._frame_batch(rgb, depth_m, np.eye(4) if cam_from_world is None else cam_from_world)
             observed = self._network.observe(frames)
@@ -135,7 +143,19 @@ class Stream:
         self._t += 1
         return state
 
-    def _check(self, rgb: np.ndarray, depth_m: np.ndarray | None) -> None:
+    def candidates(self, frame: Frame) -> Peaks:
+        """What discovery would choose from in a frame, whatever its score; nothing is bound.
+
+        Raises:
+            InputError: the frame does not have the camera's size or type, or the pose is no 4 x 4 matrix.
+        """
+        self._check(frame.rgb, frame.depth_m, frame.cam_from_world)
+        with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
+            frames = self._frame_batch(frame.rgb, frame.depth_m, frame.cam_from_world)
+            observed = self._network.observe(frames)
+            return find_peaks(self._network, observed, radius_cells=self._config.slot_radius_cells)
+
+    def _check(self, rgb: np.ndarray, depth_m: np.ndarray | None, cam_from_world: np.ndarray | None) -> None:
         camera = self._letterbox.source
         expected = (camera.height, camera.width, 3)
         if rgb.shape != expected or rgb.dtype != np.uint8:
@@ -145,6 +165,9 @@ class Stream:
                 f"frame {self._t}: expected depth {expected[:2]} in metres as float, got {depth_m.shape} of "
                 f"{depth_m.dtype}; multiply raw units by their size in metres"
             )
+        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(f"frame {self._t}: expected a finite 4 x 4 cam_from_world, got {pose.tolist()}")
 
     def _frame_batch(self, rgb: np.ndarray, depth_m: np.ndarray | None, cam_from_world: np.ndarray) -> FrameBatch:
         network, box = self._network, self._letterbox
@@ -155,7 +178,8 @@ class Stream:
         cells = cell_depth(depth, network.config.cell_px)
         camera = box.camera
         intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=self._device)
-        pose = torch.from_numpy(np.asarray(cam_from_world, np.float64)).to(self._device)
+        # Poses stay on the CPU in double precision, which not every device has.
+        pose = torch.from_numpy(np.asarray(cam_from_world, np.float64))
         has_depth = bool((depth > 0).any())
         if self._reference is None or (has_depth and not self._reference_has_depth):
             # Coordinates change with the reference, so nothing observed before may be mixed with it.
@@ -171,7 +195,7 @@ class Stream:
             depth_m=depth[None],
             cell_depth_m=cells[None],
             intrinsics=intrinsics,
-            ref_from_cam=(ref_pose @ invert(pose)).float()[None, None],
+            ref_from_cam=(ref_pose @ invert(pose)).float().to(self._device)[None, None],
             center=center,
             scale=scale,
         )
@@ -180,38 +204,42 @@ class Stream:
         if self._network.config.queries == "learned":
             self._bind_learned(frames)
             return
-        if self._t == 0 and (self._discover_all or any(q.kind != "point" for q in self._waiting)):
+        if self._t == 0 and (self._discover_all or any(q.kind != "point" for _, q in self._waiting)):
             self._bind_slots(observed, frames)
-        due = [q for q in self._waiting if q.kind == "point" and q.frame == self._t]
+        due = self._due()
         if due:
             size = self._network.config.encoder.image_size
-            uv_px = np.array([q.uv_px for q in due], np.float32)
+            uv_px = np.array([q.uv_px for _, q in due], np.float32)
             uv = torch.from_numpy(self._letterbox.to_canvas(uv_px) / size)
-            label = torch.tensor([LABELS.index(q.label) if q.label else UNKNOWN_LABEL for q in due])
+            label = torch.tensor([LABELS.index(q.label) if q.label else UNKNOWN_LABEL for _, q in due])
             self._join(observed, frames, uv, label)
-            for query in due:
-                name = query.name or f"point {len(self._bound)}"
-                self._bound.append(_Bound(name, query.label, None))
-                self._waiting.remove(query)
+            for i, query in due:
+                self._bound.append(_Bound(i, query.name or f"point {i}", query.label, None))
+                self._waiting.remove((i, query))
+
+    def _due(self) -> list[tuple[int, Query]]:
+        return [(i, q) for i, q in self._waiting if q.kind == "point" and q.frame == self._t]
 
     def _bind_slots(self, observed: Observation, frames: FrameBatch) -> None:
         config = self._config
         slots = find_peaks(self._network, observed, radius_cells=config.slot_radius_cells)
         existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
         found = [LABELS[int(n)] for n in slots.label]
-        chosen: list[tuple[int, str]] = []
+        bound: list[_Bound] = []
         if self._discover_all:
-            chosen = [(i, "") for i, e in enumerate(existence) if e > config.slot_threshold]
-        for query in [q for q in self._waiting if q.kind != "point"]:
-            used = {i for i, _ in chosen}
-            fits = [i for i, n in enumerate(found) if i not in used and query.label in (None, n)]
+            good = [i for i, e in enumerate(existence) if e > config.slot_threshold]
+            bound = [_Bound(n, f"{found[i]} {n}", found[i], i) for n, i in enumerate(good)]
+        for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
+            used = {b.slot for b in bound}
+            fits = [i for i, label in enumerate(found) if i not in used and query.label in (None, label)]
             if fits and existence[fits[0]] > config.prompt_threshold:
-                chosen.append((fits[0], query.name or f"{found[fits[0]]} {len(chosen)}"))
-                self._waiting.remove(query)
-        if chosen:
-            index = torch.tensor([i for i, _ in chosen])
+                slot = fits[0]
+                bound.append(_Bound(n, query.name or f"{found[slot]} {n}", found[slot], slot))
+                self._waiting.remove((n, query))
+        if bound:
+            index = torch.tensor([b.slot for b in bound])
             self._join(observed, frames, slots.uv[index], slots.label[index])
-            self._bound += [_Bound(name or f"{found[i]} {n}", found[i], None) for n, (i, name) in enumerate(chosen)]
+            self._bound += bound
 
     def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor) -> None:
         """Bind more queries; the anchors of the others stay as they are."""
@@ -232,27 +260,28 @@ class Stream:
         if self._t == 0:
             label = self._network.learned_label(self._anchor.content)[0].argmax(dim=-1)
             if self._discover_all:
-                self._bound = [_Bound(f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
-            for query in [q for q in self._waiting if q.kind != "point"]:
+                self._bound = [_Bound(i, f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
+            for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
                 used = {b.slot for b in self._bound}
-                fits = [i for i, n in enumerate(label) if i not in used and query.label in (None, LABELS[int(n)])]
+                fits = [i for i, k in enumerate(label) if i not in used and query.label in (None, LABELS[int(k)])]
                 if fits:
-                    self._bound.append(_Bound(query.name or f"slot {fits[0]}", LABELS[int(label[fits[0]])], fits[0]))
-                    self._waiting.remove(query)
-        due = [q for q in self._waiting if q.kind == "point" and q.frame == self._t]
+                    slot = fits[0]
+                    self._bound.append(_Bound(n, query.name or f"slot {slot}", LABELS[int(label[slot])], slot))
+                    self._waiting.remove((n, query))
+        due = self._due()
         if due:
             prediction = self._network.decode(self._anchor, self._ring[-1], frames)
             size = self._network.config.encoder.image_size
-            for query in due:
+            for i, query in due:
                 uv = torch.from_numpy(self._letterbox.to_canvas(np.array(query.uv_px)) / size).to(prediction.uv)
                 slot = int((prediction.uv[0, -1] - uv).norm(dim=-1).argmin())
-                self._bound.append(_Bound(query.name or f"point {len(self._bound)}", query.label, slot))
-                self._waiting.remove(query)
+                self._bound.append(_Bound(i, query.name or f"point {i}", query.label, slot))
+                self._waiting.remove((i, query))
 
     def _answer(self, frames: FrameBatch, stamp_s: float, has_depth: bool) -> StreamState:
         if not self._bound or self._anchor is None:
             empty = np.zeros((0, 3), np.float32)
-            return StreamState((), (), empty[:, :2], empty, empty[:, 0], empty[:, 0] > 0, (), stamp_s, has_depth)
+            return StreamState((), (), empty[:, :2], empty, empty[:, 0], empty[:, 0] > 0, (), stamp_s, has_depth, ())
         window = Observation.stack(list(self._ring))
         head = self._network.head
         if isinstance(head, HeatmapHead):
@@ -283,6 +312,7 @@ class Stream:
             ),
             stamp_s=stamp_s,
             has_depth=has_depth,
+            query=tuple(b.query for b in self._bound),
         )
 
     def _track_cells(self, head: HeatmapHead, x: Tensor, newest: Observation) -> Prediction:
@@ -293,9 +323,10 @@ class Stream:
         size = self._network.config.encoder.image_size
         cell_uv = 2 * cell_centres(self._network.config, device=logits.device) / size - 1
         posterior = torch.empty_like(logits[0, 0])
-        # Queries that bound at the same frame share the cells that their beliefs live on.
-        for fresh in (True, False):
-            rows = [i for i, b in enumerate(self._bound) if (b.belief is None) == fresh]
+        # Queries that have just bound have no belief yet; those of all others live on the previous frame's cells.
+        fresh_rows = [i for i, b in enumerate(self._bound) if b.belief is None]
+        known_rows = [i for i, b in enumerate(self._bound) if b.belief is not None]
+        for rows, fresh in ((fresh_rows, True), (known_rows, False)):
             if not rows:
                 continue
             before = None if fresh else self._joint_belief(rows)
@@ -335,7 +366,17 @@ class Stream:
     def _to_world(self, point: Tensor, has_depth: bool) -> Float32[np.ndarray, "K 3"]:
         assert self._reference is not None
         pose, center, scale = self._reference
-        metric = point.double() * scale.double() + center.double()
+        metric = point.cpu().double() * scale.cpu().double() + center.cpu().double()
         if not has_depth:
             metric = torch.full_like(metric, torch.nan)
-        return transform(invert(pose)[None], metric).cpu().numpy().astype(np.float32)
+        return transform(invert(pose)[None], metric).numpy().astype(np.float32)
+
+
+def _check_pixel(query: Query, camera: Camera) -> None:
+    if query.uv_px is None:
+        return
+    x, y = query.uv_px
+    if not (0 <= x <= camera.width and 0 <= y <= camera.height):
+        raise InputError(
+            f"query {query.name!r}: expected a pixel within {camera.width} x {camera.height}, got ({x:.1f}, {y:.1f})"
+        )

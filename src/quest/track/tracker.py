@@ -44,10 +44,11 @@ class Tracker:
         Args:
             camera: intrinsics of the frames.
             queries: what to follow; None discovers entities in the first frame.
+
+        Raises:
+            InputError: a point query lies outside the image.
         """
-        return Stream(
-            self.network, self.config, camera, queries, device=self.device, autocast=self._autocast
-        )
+        return Stream(self.network, self.config, camera, queries, device=self.device, autocast=self._autocast)
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
         """Track a whole clip: the stream's step in a loop.
@@ -60,13 +61,16 @@ class Tracker:
             InputError: a point query lies outside the clip.
         """
         for query in queries or ():
-            _check_query(query, clip)
+            if query.frame >= len(clip):
+                raise InputError(
+                    f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames"
+                )
         stream = self.stream(clip.camera, queries)
         states = []
         for t in range(len(clip)):
             frame = clip.frame(t)
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
-        return collect(states, stream.unbound)
+        return collect(states, queries)
 
 
 def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker:
@@ -104,46 +108,39 @@ def fast_bfloat16(device: torch.device) -> bool:
     """Whether bfloat16 is faster than float32 there."""
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported()
-    return device.type == "cpu" and bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    if device.type != "cpu" or not torch.backends.mkldnn.is_available():
+        return False
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
-def collect(states: Sequence[StreamState], unbound: Sequence[Query] = ()) -> Tracks:
+def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> Tracks:
     """Join the answers of successive frames; before a query binds its answers are NaN.
 
     Args:
         states: answers of all frames, in order.
-        unbound: queries that never found their entity; they are lost in every frame, and flagged.
+        queries: what was asked, which gives the order of the tracks; None where the stream discovered entities. Those
+            that never found their entity are lost in every frame, and flagged.
     """
     last = states[-1]
-    names = (*last.names, *(q.name or q.label or q.kind for q in unbound))
-    labels = (*last.labels, *(q.label for q in unbound))
-    t, k = len(states), len(names)
+    t, k = len(states), len(last.names) if queries is None else len(queries)
+    names, labels = [q.name or q.label or q.kind for q in queries or ()], [q.label for q in queries or ()]
+    names, labels = names or [""] * k, labels or [None] * k
+    for i, name, label in zip(last.query, last.names, last.labels, strict=True):
+        names[i], labels[i] = name, label
     uv = np.full((t, k, 2), np.nan, np.float32)
     point = np.full((t, k, 3), np.nan, np.float32)
     confidence = np.zeros((t, k), np.float32)
     visible = np.zeros((t, k), bool)
     state = np.full((t, k), State.LOST.value, dtype="<U8")
     for i, s in enumerate(states):
-        n = len(s.names)
-        uv[i, :n], point[i, :n] = s.uv_px, s.point_world
-        confidence[i, :n], visible[i, :n] = s.confidence, s.visible
-        state[i, :n] = [value.value for value in s.state]
+        rows = list(s.query)
+        uv[i, rows], point[i, rows] = s.uv_px, s.point_world
+        confidence[i, rows], visible[i, rows] = s.confidence, s.visible
+        state[i, rows] = [value.value for value in s.state]
     with_depth = [s.has_depth for s in states]
     flags = [] if all(with_depth) else [PARTLY_NO_DEPTH_FLAG if any(with_depth) else NO_DEPTH_FLAG]
-    flags += [f"query {name!r} found no entity: lost in every frame" for name in names[len(last.names) :]]
-    flags += [NOTHING_FOUND_FLAG] if not names else []
+    lost = [names[i] for i in range(k) if i not in last.query]
+    flags += [f"query {name!r} found no entity: lost in every frame" for name in lost]
+    flags += [NOTHING_FOUND_FLAG] if queries is None and not k else []
     stamps = np.array([s.stamp_s for s in states])
-    return Tracks(names, labels, uv, point, confidence, visible, state, stamps, tuple(flags))
-
-
-def _check_query(query: Query, clip: Clip) -> None:
-    if query.uv_px is None:
-        return
-    x, y = query.uv_px
-    if query.frame >= len(clip):
-        raise InputError(f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames")
-    if not (0 <= x <= clip.camera.width and 0 <= y <= clip.camera.height):
-        raise InputError(
-            f"clip {clip.name!r}: query pixel ({x:.1f}, {y:.1f}) lies outside the "
-            f"{clip.camera.width} x {clip.camera.height} image"
-        )
+    return Tracks(tuple(names), tuple(labels), uv, point, confidence, visible, state, stamps, tuple(flags))

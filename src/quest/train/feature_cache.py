@@ -6,6 +6,7 @@ entries or nothing. An entry is stale when the take or the encoder changed, and 
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import shutil
@@ -71,7 +72,9 @@ class CachedView:
         return len(self.rgb)
 
 
-_ARRAYS = tuple(f for f in CachedView.__dataclass_fields__ if f not in {"name", "object_id", "camera", "half_diagonal_m"})
+_ARRAYS = tuple(
+    f for f in CachedView.__dataclass_fields__ if f not in {"name", "object_id", "camera", "half_diagonal_m"}
+)
 
 
 class FeatureCache:
@@ -106,9 +109,11 @@ class FeatureCache:
         for name in names:
             stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
             entries = self._entries(name)
-            if entries and all(self._stamp(entry) == stamp for entry in entries):
+            if self._complete(entries, stamp):
                 yield from (len(np.load(e / "visible.npy", mmap_mode="r")) for e in entries)
                 continue
+            for entry in entries:
+                shutil.rmtree(entry)  # also of views that the take no longer has
             take = store.read(name)
             for view in range(len(take.views)):
                 yield self._write(take, view, stamp, device)
@@ -126,10 +131,13 @@ class FeatureCache:
         return views
 
     def _entries(self, name: str) -> list[Path]:
-        return sorted(self.root.glob(f"{name}-v[0-9]*"))
+        found = self.root.glob(f"{glob.escape(name)}-v*")
+        return sorted(path for path in found if path.name.removeprefix(f"{name}-v").isdigit())
 
-    def _stamp(self, entry: Path) -> dict[str, str]:
-        return json.loads((entry / "meta.json").read_text())["stamp"]
+    def _complete(self, entries: list[Path], stamp: dict[str, str]) -> bool:
+        """Whether every view of a take is there and of this take and encoder."""
+        metas = [json.loads((entry / "meta.json").read_text()) for entry in entries]
+        return bool(metas) and all(m["stamp"] == stamp and m.get("views", len(metas)) == len(metas) for m in metas)
 
     def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> int:
         clip, truth, tracked = take.views[view].clip, take.views[view], take.tracked
@@ -154,6 +162,7 @@ class FeatureCache:
         }
         meta = {
             "stamp": stamp,
+            "views": len(take.views),
             "object_id": take.info.object_id,
             "camera": asdict(box.camera),
             "half_diagonal_m": take.info.half_diagonal_m,

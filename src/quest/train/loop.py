@@ -136,7 +136,8 @@ def _advance(progress: Progress, *, step: int, rng: np.random.Generator) -> Prog
 
 
 def _judge(progress: Progress, scores: WindowScores) -> Progress:
-    better = scores.mean_distance < progress.best
+    # The first score is the best so far whatever it is, so that there always is a best checkpoint.
+    better = scores.mean_distance < progress.best or progress.best_step == 0
     return Progress(
         progress.step,
         scores.mean_distance if better else progress.best,
@@ -151,7 +152,7 @@ def _rng_state(rng: np.random.Generator) -> str:
     return json.dumps(rng.bit_generator.state)
 
 
-def _log(writer, terms: LossTerms, loss: Tensor, step: int) -> None:  # noqa: ANN001 (tensorboard has no types)
+def _log(writer, terms: LossTerms, loss: Tensor, step: int) -> None:
     if step % 10 == 0 or step == 1:
         writer.add_scalar("loss/total", float(loss.detach()), step)
         for f in fields(terms):

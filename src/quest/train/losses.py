@@ -50,7 +50,10 @@ def heatmap_loss(
 
 
 def point_loss(
-    point: Float[Tensor, "B T K 3"], target: Float[Tensor, "B T K 3"], unit: Float[Tensor, " B"], mask: Bool[Tensor, "B T K"]
+    point: Float[Tensor, "B T K 3"],
+    target: Float[Tensor, "B T K 3"],
+    unit: Float[Tensor, " B"],
+    mask: Bool[Tensor, "B T K"],
 ) -> Float[Tensor, ""]:
     """Huber loss of the 3D distance in normalised units, linear above 0.05."""
     mask = mask & torch.isfinite(point).all(-1) & torch.isfinite(target).all(-1)
@@ -76,7 +79,9 @@ def difference_loss(
     return masked_mean(error.abs().clamp(max=0.5).sum(-1), mask)
 
 
-def confidence_loss(logit: Float[Tensor, "*B"], target: Bool[Tensor, "*B"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
+def confidence_loss(
+    logit: Float[Tensor, "*B"], target: Bool[Tensor, "*B"], mask: Bool[Tensor, "*B"]
+) -> Float[Tensor, ""]:
     """L_conf: binary cross-entropy."""
     return masked_mean(F.binary_cross_entropy_with_logits(logit, target.to(logit.dtype), reduction="none"), mask)
 

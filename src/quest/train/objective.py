@@ -162,7 +162,9 @@ def stage_one(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> 
 def is_right(
     point: Float[Tensor, "B T K 3"], truth: WindowTruth, px: Float[Tensor, "B T K"]
 ) -> tuple[Bool[Tensor, "B T K"], Bool[Tensor, "B T K"]]:
-    """Whether the nearest true entity is the own one and within 0.1 normalised units; by pixels where nothing is lifted.
+    """Whether the nearest true entity is the own one and within 0.1 normalised units.
+
+    Where nothing is lifted, the distance in pixels decides.
 
     Returns:
         The answer, and whether it can be judged at all.

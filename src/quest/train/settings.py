@@ -84,7 +84,7 @@ class LossWeights:
         map: focal loss and offset of the dense affordance map.
     """
 
-    aff: float = 5.0
+    aff: float = 20.0
     heat: float = 1.0
     point: float = 2.0
     vel: float = 1.0

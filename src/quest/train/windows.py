@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from quest.errors import ConfigError
 from quest.geometry import transform
 from quest.model.config import NetworkConfig
 from quest.model.network import UNKNOWN_LABEL
@@ -61,6 +62,9 @@ class WindowSampler:
         views: prepared views; objects are drawn evenly, then their views.
         network: network that the windows are for.
         config: how windows are drawn.
+
+    Raises:
+        ConfigError: nothing is visible in any view.
     """
 
     def __init__(self, views: list[CachedView], network: NetworkConfig, config: WindowConfig) -> None:
@@ -71,6 +75,8 @@ class WindowSampler:
             if view.visible.any():
                 self.by_object.setdefault(view.object_id, []).append(view)
         self.objects = sorted(self.by_object)
+        if not self.objects:
+            raise ConfigError(f"training: no entity is visible in any of {len(views)} views; use other takes")
 
     def draw(self, rng: np.random.Generator, *, disturb: bool = True) -> tuple[FrameBatch, WindowTruth]:
         """One batch; ``disturb`` turns on everything that is random beyond the choice of frames."""
@@ -135,8 +141,8 @@ class WindowSampler:
             shape = list(sample[0].shape)
             shape[axis] = most
             out = np.zeros((b, *shape), sample[0].dtype)
-            for row, array in zip(out, sample, strict=True):
-                row[(slice(None),) * axis + (slice(0, array.shape[axis]),)] = array
+            for i, array in enumerate(sample):
+                out[(i, *(slice(None),) * axis, slice(0, array.shape[axis]))] = array
             return torch.from_numpy(out)
 
         exists = torch.tensor([[k < view.visible.shape[1] for k in range(most)] for view, _ in picks])

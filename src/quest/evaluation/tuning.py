@@ -1,0 +1,190 @@
+"""Choose the tracker's settings on validation objects.
+
+One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``,
+PartNet-Mobility and procedural objects alike); the threshold of discovery by its F1 in the first frame.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.evaluation.records import EntityRecord
+from quest.evaluation.runner import evaluate
+from quest.evaluation.selection import SplitPart
+from quest.model.network import QuestNetwork
+from quest.track import Tracker, TrackerConfig
+from quest.types import LABELS, Take
+
+GRID: dict[str, tuple[float, ...]] = {
+    "move_sigma": (0.04, 0.08, 0.16),
+    "jump": (0.002, 0.02, 0.1),
+    "temperature": (0.7, 1.0, 1.5, 2.5),
+    "lift_tolerance": (0.0, 0.03, 0.06, 0.1),
+}
+"""Values that are tried, in this order of settings."""
+
+_SLOT_RADIUS_PX = 16.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One setting that was tried.
+
+    Attributes:
+        name: which setting.
+        value: its value.
+        ape: mean 3D distance of moved entities, normalised units.
+    """
+
+    name: str
+    value: float
+    ape: float
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """What came of it.
+
+    Attributes:
+        config: the chosen settings.
+        trials: everything that was tried.
+        discovery_f1: F1 of discovery at the chosen threshold.
+    """
+
+    config: TrackerConfig
+    trials: tuple[Trial, ...]
+    discovery_f1: float
+
+
+def tune(
+    tracker: Tracker, store: TakeStore, takes: Mapping[str, SplitPart], *, report: Callable[[Trial], None]
+) -> Tuned:
+    """Choose settings for a tracker's network.
+
+    Args:
+        tracker: network and settings to start from.
+        store: where the takes are.
+        takes: takes of validation objects, by name.
+        report: told of every trial.
+
+    Raises:
+        ConfigError: a take is not of a validation object, or nothing moves in them.
+    """
+    wrong = [name for name, part in takes.items() if part != "validation"]
+    if wrong or not takes:
+        raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
+    config, trials = tracker.config, []
+    _remember_features(tracker.network)
+    bias, f1 = discovery_bias(tracker, store, list(takes))
+    config = replace(config, slot_bias=bias)
+    for name, values in GRID.items():
+        scores = _scores(tracker, [replace(config, **{name: v}) for v in values], store, takes)
+        tried = [Trial(name, v, s) for v, s in zip(values, scores, strict=True)]
+        for trial in tried:
+            report(trial)
+        trials += tried
+        config = replace(config, **{name: min(tried, key=lambda t: t.ape).value})
+    return Tuned(config, tuple(trials), f1)
+
+
+def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> tuple[float, float]:
+    """Bias of the affordance logit at which discovery in the first frame has its best F1, and that F1.
+
+    A slot counts as found if an unclaimed visible entity of its label lies within 16 px of the network's input.
+    """
+    logits: list[float] = []
+    hits: list[bool] = []
+    present = 0
+    for name in names:
+        take = store.read(name, frames=slice(0, 1))
+        for view in range(len(take.views)):
+            found = _slots(tracker, take, view)
+            hit, count = _match(take, view, *found, size=tracker.network.config.encoder.image_size)
+            logits += found[2]
+            hits += hit
+            present += count
+    order = np.argsort(-np.array(logits))
+    right = np.cumsum(np.array(hits)[order])
+    f1 = 2 * right / (np.arange(1, len(order) + 1) + max(present, 1))
+    best = int(f1.argmax())
+    threshold = logits[order[best]] if best + 1 == len(order) else (logits[order[best]] + logits[order[best + 1]]) / 2
+    return -float(threshold), float(f1[best])
+
+
+def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[str], list[float]]:
+    """Canvas pixels, labels and logits of all candidates in a view's first frame, best first."""
+    clip = take.views[view].clip
+    peaks = tracker.stream(clip.camera).candidates(clip.frame(0))
+    size = tracker.network.config.encoder.image_size
+    return peaks.uv.cpu().numpy() * size, [LABELS[int(n)] for n in peaks.label], peaks.logit.tolist()
+
+
+def _match(
+    take: Take, view: int, uv: np.ndarray, labels: list[str], logits: list[float], *, size: int
+) -> tuple[list[bool], int]:
+    truth, camera = take.views[view], take.views[view].clip.camera
+    scale = size / max(camera.width, camera.height)
+    pad = (size - scale * np.array([camera.width, camera.height])) / 2
+    entities = [e for e in take.tracked if truth.visible[0, e]]
+    free = set(entities)
+    hits = []
+    for place, label, _ in zip(uv, labels, logits, strict=True):
+        gap = {
+            e: float(np.linalg.norm(truth.uv_px[0, e] * scale + pad - place))
+            for e in free
+            if take.info.entities[e].label == label
+        }
+        nearest = min(gap, key=lambda e: gap[e], default=None)
+        hit = nearest is not None and gap[nearest] < _SLOT_RADIUS_PX
+        hits.append(hit)
+        if hit:
+            free.discard(nearest)
+    return hits, len(entities)
+
+
+def _scores(
+    tracker: Tracker, configs: Sequence[TrackerConfig], store: TakeStore, takes: Mapping[str, SplitPart]
+) -> list[float]:
+    """Mean over sources of the mean 3D distance of moved entities, for every configuration."""
+    trials = [_Named(tracker, config, f"{i}") for i, config in enumerate(configs)]
+    records = evaluate(store, takes, trials, protocols=("point",)).records
+    return [_ape([r for r in records if r.subject.tracker == trial.name]) for trial in trials]
+
+
+def _ape(records: list[EntityRecord]) -> float:
+    by_source: dict[str, list[np.ndarray]] = {}
+    for r in records:
+        if r.moved:
+            by_source.setdefault(r.subject.source, []).append(r.distance[r.first_frame :])
+    if not by_source:
+        raise ConfigError("tuning: no entity moves in these takes")
+    return float(np.mean([np.concatenate(d).mean() for d in by_source.values()]))
+
+
+class _Named(Tracker):
+    """A tracker that shares another's network under settings and a name of its own."""
+
+    def __init__(self, tracker: Tracker, config: TrackerConfig, name: str) -> None:
+        super().__init__(tracker.network, config, device=tracker.device)
+        self.name = name
+
+
+def _remember_features(network: QuestNetwork) -> None:
+    """Make the network's encoder remember images, since every trial looks at the same ones."""
+    encode, known = network.encode, {}
+
+    def remembered(rgb: Tensor) -> Tensor:
+        key = hashlib.blake2b(rgb.cpu().numpy().tobytes(), digest_size=16).digest()
+        if key not in known:
+            known[key] = encode(rgb).to(torch.float16)
+        return known[key]
+
+    network.encode = remembered  # type: ignore[method-assign]

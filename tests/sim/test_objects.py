@@ -1,0 +1,236 @@
+"""Object folders: what is read from them, and what is said about bad ones."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, write_cabinet, write_object
+
+from quest.errors import ObjectError
+from quest.sim.articulation import MAX_TURN_RAD
+from quest.sim.objects import find_objects, load_object
+
+
+def test_cabinet(tmp_path: Path) -> None:
+    cabinet = load_object(write_cabinet(tmp_path / "cabinet"))
+    assert (cabinet.source, cabinet.object_id, cabinet.category) == ("partnet-mobility", "cabinet", "StorageFurniture")
+    assert cabinet.scale == pytest.approx(0.8)  # one unit high, and a cabinet is 0.8 m
+    assert cabinet.warnings == ()
+    points = cabinet.articulation.world_points(cabinet.articulation.rest)
+    assert points[:, 2].min() == pytest.approx(0, abs=1e-9)
+    assert np.ptp(points[:, 2]) == pytest.approx(0.8)
+    assert cabinet.half_diagonal_m == pytest.approx(np.linalg.norm(np.ptp(points, axis=0)) / 2)
+    joints = [j.joint for j in cabinet.articulation.joints]
+    assert [(j.name, j.kind) for j in joints] == [("joint_drawer", "prismatic"), ("joint_door", "revolute")]
+    assert joints[0].upper == pytest.approx(0.35 * 0.8)  # metres
+    assert joints[1].upper == pytest.approx(1.5)  # radians
+    assert cabinet.movable == (0, 1)
+
+
+@pytest.mark.parametrize("yaw", [0.0, np.pi / 2, np.pi, -np.pi / 2])
+def test_front_looks_towards_plus_x_however_the_object_was_modelled(tmp_path: Path, yaw: float) -> None:
+    turned = [
+        Link("turn", (), yaw=yaw),
+        *(replace(link, parent="turn") for link in (CARCASS, DRAWER, DOOR)),
+    ]
+    cabinet = load_object(write_object(tmp_path / "cabinet", *turned))
+    articulation = cabinet.articulation
+    axes = articulation.axes(articulation.poses(articulation.rest))
+    np.testing.assert_allclose(axes[0, 3:], [1, 0, 0], atol=1e-9)
+
+
+def test_links_that_fixed_joints_hold_together_are_one_body(tmp_path: Path) -> None:
+    bar = Link("bar", (HANDLE,), parent="door", origin=(0.0, 0.3, 0.0))
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, DRAWER, DOOR, bar))
+    assert cabinet.articulation.body_names == ("base", "drawer", "door")
+    assert [e.name for e in cabinet.entities] == ["drawer/handle", "door/handle", "door/hinge"]
+
+
+def test_poses_turn_and_slide(tmp_path: Path) -> None:
+    cabinet = load_object(write_cabinet(tmp_path / "cabinet"))
+    rest = cabinet.articulation.poses(np.zeros(2))
+    moved = cabinet.articulation.poses(np.array([0.1, np.pi / 2]))
+    np.testing.assert_allclose(moved[1, :3, 3] - rest[1, :3, 3], [0.1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(moved[2, :3, 3], rest[2, :3, 3], atol=1e-12)  # its origin lies on the hinge
+    np.testing.assert_allclose(moved[2, :3, :3] @ [0, 1, 0], [1, 0, 0], atol=1e-12)  # the leaf opens to the front
+
+
+def test_joint_without_limits_turns_a_quarter(tmp_path: Path) -> None:
+    door = replace(DOOR, kind="continuous", limits=None)
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, door))
+    assert cabinet.articulation.joints[0].travel() == pytest.approx((0, np.pi / 2))
+
+
+def test_travel_is_capped(tmp_path: Path) -> None:
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, replace(DOOR, limits=(0, 3.1))))
+    assert cabinet.articulation.joints[0].travel() == pytest.approx((0, MAX_TURN_RAD))
+
+
+def test_door_modelled_half_open_is_closed(tmp_path: Path) -> None:
+    # At position 0 the leaf stands 45 degrees open; closed is at the lower limit.
+    door = replace(DOOR, yaw=-np.pi / 4, limits=(-np.pi / 4, np.pi / 4))
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, DRAWER, door))
+    closed = load_object(write_cabinet(tmp_path / "closed"))
+    joint = cabinet.articulation.joints[1]
+    assert joint.rest == pytest.approx(-np.pi / 4)
+    assert joint.opening() == pytest.approx(np.pi / 2)
+    assert cabinet.half_diagonal_m == pytest.approx(closed.half_diagonal_m)
+
+
+def test_origins_left_in_old_units_are_mended(tmp_path: Path) -> None:
+    """Meshes scaled by 0.1 about a joint origin that was not: the bucket of PartNet-Mobility."""
+    folder = write_cabinet(tmp_path / "cabinet")
+    text = (folder / "mobility.urdf").read_text().replace('.obj"/>', '.obj" scale="0.1 0.1 0.1"/>')
+    for link in (DRAWER, DOOR):  # meshes of one common frame: the visual takes the joint's origin back
+        back = '<visual name="{}"><origin xyz="{} {} {}"/>'
+        for box in link.boxes:
+            text = text.replace(f'<visual name="{box.name}">', back.format(box.name, *(-x for x in link.origin)))
+    (folder / "mobility.urdf").write_text(text)
+    cabinet = load_object(folder)
+    assert any("scaled" in warning for warning in cabinet.warnings)
+    axes = cabinet.articulation.axes(cabinet.articulation.poses(cabinet.articulation.rest))
+    assert np.abs(axes[:, :3]).max() < 1  # inside the object, not ten times as far away
+    assert cabinet.articulation.joints[0].joint.upper == pytest.approx(0.1 * 0.35 * cabinet.scale)
+
+
+@pytest.mark.parametrize("file", ["result_after_merging.json", "mobility_v2.json"])
+def test_names_come_from_the_annotation_where_the_urdf_has_none(tmp_path: Path, file: str) -> None:
+    nameless = replace(DRAWER, boxes=tuple(replace(box, name="") for box in DRAWER.boxes))
+    folder = write_object(tmp_path / "cabinet", CARCASS, nameless)
+    tree = [{"name": "drawer", "id": 1, "objs": ["drawer-0"]}, {"name": "handle", "id": 2, "objs": ["drawer-1"]}]
+    key = "parts" if file.startswith("mobility") else "children"
+    (folder / file).write_text(json.dumps([{"name": "cabinet", "id": 0, key: tree}]))
+    assert [e.label for e in load_object(folder).entities] == ["handle"]
+
+
+def test_category_unknown_is_flagged(tmp_path: Path) -> None:
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, DRAWER, category=None))
+    assert cabinet.category == "Unknown"
+    assert any("category" in warning for warning in cabinet.warnings)
+    extent = np.ptp(cabinet.articulation.world_points(cabinet.articulation.rest), axis=0)
+    assert extent.max() == pytest.approx(0.8)
+
+
+def test_unreadable_meta_is_flagged(tmp_path: Path) -> None:
+    folder = write_cabinet(tmp_path / "cabinet")
+    (folder / "meta.json").write_text("{")
+    assert any("meta.json" in warning for warning in load_object(folder).warnings)
+
+
+def test_missing_and_empty_meshes_are_left_out_and_flagged(tmp_path: Path) -> None:
+    ghost, empty = Box("handle-20", (1, 1, 1), missing=True), Box("drawer_side-21", (1, 1, 1))
+    folder = write_object(tmp_path / "cabinet", CARCASS, replace(DRAWER, boxes=(*DRAWER.boxes, ghost, empty)))
+    (folder / "textured_objs" / "drawer-3.obj").write_text("v 0 0 0\n")
+    cabinet = load_object(folder)
+    (warning,) = cabinet.warnings
+    assert "2 meshes" in warning
+    assert "drawer-2.obj, drawer-3.obj" in warning
+    assert [e.name for e in cabinet.entities] == ["drawer/handle"]
+
+
+def bad_folder(folder: Path, what: str) -> Path:
+    """A folder that is spoilt in one way."""
+    if what == "no folder":
+        return folder
+    links: tuple[Link, ...] = (CARCASS, DRAWER)
+    if what == "no meshes":
+        links = tuple(replace(link, boxes=tuple(replace(b, missing=True) for b in link.boxes)) for link in links)
+    elif what == "nothing moves":
+        links = (CARCASS, replace(DRAWER, kind="fixed", limits=None))
+    elif what == "no travel":
+        links = (CARCASS, replace(DRAWER, limits=(0, 0)))
+    elif what == "nothing to follow":
+        links = (CARCASS, replace(DRAWER, boxes=()))
+    elif what == "limits":
+        links = (CARCASS, replace(DRAWER, limits=(0, float("nan"))))
+    elif what == "axis":
+        links = (CARCASS, replace(DRAWER, axis=(0, 0, 0)))
+    elif what == "unknown parent":
+        links = (CARCASS, replace(DRAWER, parent="nobody"))
+    elif what == "cycle":
+        links = (CARCASS, replace(DRAWER, parent="door"), replace(DOOR, parent="drawer"))
+    write_object(folder, *links)
+    urdf = folder / "mobility.urdf"
+    if what == "no urdf":
+        urdf.unlink()
+    elif what == "torn urdf":
+        urdf.write_text(urdf.read_text()[:300])
+    elif what == "not xml":
+        urdf.write_bytes(b"\x00\xff\x00")
+    elif what == "no geometry":
+        urdf.write_text(urdf.read_text().replace("geometry>", "shape>"))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("what", "named"),
+    [
+        ("no folder", "expected an object folder"),
+        ("no urdf", "expected a URDF file"),
+        ("torn urdf", "not a readable URDF"),
+        ("not xml", "not a readable URDF"),
+        ("no geometry", "no geometry"),
+        ("limits", "limits"),
+        ("axis", "axis of length zero"),
+        ("unknown parent", "nobody"),
+        ("cycle", "cycle"),
+        ("no meshes", "expected meshes"),
+        ("nothing moves", "expected a joint that moves"),
+        ("no travel", "expected a joint that moves"),
+        ("nothing to follow", "expected a moving link"),
+    ],
+)
+def test_bad_folders_are_told_with_name_and_remedy(tmp_path: Path, what: str, named: str) -> None:
+    with pytest.raises(ObjectError, match=named) as error:
+        load_object(bad_folder(tmp_path / "cabinet", what))
+    assert str(tmp_path / "cabinet") in str(error.value)
+    assert any(word in str(error.value) for word in ("restore", "check", "copy", "use another", "name a folder"))
+
+
+def test_folder_of_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("QUEST_OBJECTS", raising=False)
+    with pytest.raises(ObjectError, match="QUEST_OBJECTS"):
+        find_objects()
+    with pytest.raises(ObjectError, match="check QUEST_OBJECTS"):
+        find_objects(tmp_path / "nowhere")
+    with pytest.raises(ObjectError, match=r"mobility\.urdf"):
+        find_objects(tmp_path)
+    for name in ("b", "a"):
+        write_cabinet(tmp_path / name)
+    monkeypatch.setenv("QUEST_OBJECTS", str(tmp_path))
+    assert [folder.name for folder in find_objects()] == ["a", "b"]
+
+
+@pytest.mark.partnet
+@pytest.mark.parametrize(
+    ("object_id", "labels"),
+    [
+        ("44817", {"handle"}),
+        ("7320", None),  # names meshes that do not exist
+        ("kettle_dh", {"front"}),  # its meshes, but not its joint limits, carry a scale
+        ("bucket_dh", {"handle", "hinge"}),  # its origins lack the scale of its meshes
+    ],
+)
+def test_real_objects_have_plausible_sizes_and_travels(partnet_root: Path, object_id: str, labels: set | None) -> None:
+    folder = partnet_root / object_id
+    if not folder.is_dir():
+        pytest.skip(f"no object {object_id}")
+    thing = load_object(folder)
+    assert thing.movable
+    assert labels is None or {e.label for e in thing.entities} == labels
+    points = thing.articulation.world_points(thing.articulation.rest)
+    for line in thing.articulation.axes(thing.articulation.poses(thing.articulation.rest)):
+        assert (line[:3] > points.min(axis=0) - thing.half_diagonal_m).all()
+        assert (line[:3] < points.max(axis=0) + thing.half_diagonal_m).all()
+    assert all(e.travel_m < 3 * thing.half_diagonal_m for e in thing.entities)
+
+
+@pytest.mark.partnet
+def test_kettle_lid_lifts_off_by_a_few_centimetres(partnet_root: Path) -> None:
+    folder = partnet_root / "kettle_dh"
+    if not folder.is_dir():
+        pytest.skip("no object kettle_dh")
+    (lid,) = load_object(folder).entities
+    assert 0.02 < lid.travel_m < 0.1

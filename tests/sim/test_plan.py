@@ -1,0 +1,102 @@
+"""Which takes a run makes, where objects come from, and the command that says so."""
+
+import shlex
+from pathlib import Path
+
+import pytest
+from tests.sim.small_objects import write_cabinet
+
+from quest.cli import main as program
+from quest.cli.generate import Generate
+from quest.errors import ConfigError, ObjectError
+from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
+from quest.sim.procedural import CATEGORIES
+
+
+def test_all_objects_come_once_before_any_comes_again() -> None:
+    takes = plan_takes([("partnet", "1"), ("partnet", "2")], levels=(1, 3), takes_per_object=2, first_seed=5)
+    assert [t.name for t in takes] == [
+        "1-L1-s000005", "2-L1-s000005", "1-L3-s000005", "2-L3-s000005",
+        "1-L1-s000006", "2-L1-s000006", "1-L3-s000006", "2-L3-s000006",
+    ]  # fmt: skip
+
+
+def test_names_of_objects() -> None:
+    assert parse_object("partnet:44817, 23724") == [("partnet", "44817"), ("partnet", "23724")]
+    assert parse_object("44817") == [("partnet", "44817")]
+    assert parse_object("procedural:chest-12") == [("procedural", "chest-12")]
+    for text in ("", "partnet:", "shapenet:1"):
+        with pytest.raises(ObjectError, match="partnet:44817"):
+            parse_object(text)
+
+
+def test_procedural_objects_are_named_by_category_and_seed() -> None:
+    named = procedural_objects(20, 100)
+    assert [object_id.rpartition("-")[2] for _, object_id in named] == [str(seed) for seed in range(100, 120)]
+    assert {object_id.rpartition("-")[0] for _, object_id in named} <= set(CATEGORIES)
+    assert named == procedural_objects(20, 100)
+
+
+def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
+    folder = write_cabinet(tmp_path / "cabinet")
+    write_cabinet(tmp_path / "broken")
+    (tmp_path / "broken" / "mobility.urdf").write_text("<robot")
+    with ObjectShelf(tmp_path) as shelf:
+        assert shelf.load("partnet", "cabinet").folder == folder
+        assert shelf.load("partnet", "cabinet") is shelf.load("partnet", "cabinet")
+        with pytest.raises(ObjectError, match="not a readable URDF") as first:
+            shelf.load("partnet", "broken")
+        with pytest.raises(ObjectError) as again:
+            shelf.load("partnet", "broken")
+        assert first.value is again.value
+        with pytest.raises(ObjectError, match="found none of that name"):
+            shelf.load("partnet", "99999999")
+        for object_id in ("spaceship-1", "chest", "chest-x"):
+            with pytest.raises(ObjectError, match="CATEGORY-SEED"):
+                shelf.load("procedural", object_id)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--out a --objects partnet:1,2 procedural:chest-12 --level 1 2 --every 5",
+        "--out 'with space' --split train --no-partnet --procedural 3 --seeds 4..9 --no-randomize-materials",
+        "--out a --split validation --objects-root there --takes-per-object 2 --seed 7 --views 1 --size 64",
+    ],
+)
+def test_recorded_command_makes_the_same_run(words: str) -> None:
+    command = program.parse(["generate", *shlex.split(words)])
+    assert isinstance(command, Generate)
+    name, *again = shlex.split(command.command_line())
+    assert (name, again[0]) == ("quest", "generate")
+    assert program.parse(again) == command
+    assert sorted(shlex.split(words)) == sorted(again[1:])
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        ({}, "no objects"),
+        ({"objects": ("partnet:1",), "level": (0,)}, "--level"),
+        ({"objects": ("partnet:1",), "takes_per_object": 0}, "--takes-per-object"),
+        ({"objects": ("partnet:1",), "every": 9}, "every"),
+        ({"objects": ("partnet:1",), "views": 0}, "view"),
+        ({"seeds": "5..1"}, "A..B"),
+        ({"seeds": "few"}, "A..B"),
+        ({"procedural": 5, "seeds": "1..3"}, "do not fit"),
+    ],
+)
+def test_settings_that_cannot_be(tmp_path: Path, words: dict, named: str) -> None:
+    with pytest.raises(ConfigError, match=named):
+        Generate(out=tmp_path / "takes", **words).run()
+
+
+def test_missing_folder_of_objects_is_told_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = str(tmp_path / "nowhere")
+    code = program.main(
+        ["generate", "--out", str(tmp_path / "takes"), "--objects", "partnet:44817", "--objects-root", root]
+    )
+    assert code == program.EXIT_ERROR
+    message = capsys.readouterr().err
+    assert root in message
+    assert "QUEST_OBJECTS" in message
