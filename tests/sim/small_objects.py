@@ -68,6 +68,14 @@ DOOR = Link(
     axis=(0, 0, -1),
     limits=(0, 1.5),
 )
+TRAY = Link(
+    "tray",
+    (Box("tray-40", (0.4, 0.5, 0.02)), Box("handle-41", (0.03, 0.2, 0.03), (0.2, 0, 0.02))),
+    kind="prismatic",
+    origin=(0, 0, 0.2),
+    limits=(0, 0.3),
+)
+"""Behind the door."""
 
 
 def write_object(folder: Path, *links: Link, category: str | None = "StorageFurniture") -> Path:
@@ -87,8 +95,10 @@ def write_object(folder: Path, *links: Link, category: str | None = "StorageFurn
         text.append("</link>")
         limit = "" if link.limits is None else '<limit lower="{}" upper="{}"/>'.format(*link.limits)
         text.append(
-            f'<joint name="joint_{link.name}" type="{link.kind}"><parent link="{link.parent}"/><child link="{link.name}"/>'
-            f'<origin xyz="{_words(link.origin)}" rpy="0 0 {link.yaw}"/><axis xyz="{_words(link.axis)}"/>{limit}</joint>'
+            f'<joint name="joint_{link.name}" type="{link.kind}">'
+            f'<parent link="{link.parent}"/><child link="{link.name}"/>'
+            f'<origin xyz="{_words(link.origin)}" rpy="0 0 {link.yaw}"/><axis xyz="{_words(link.axis)}"/>{limit}'
+            "</joint>"
         )
     (folder / "mobility.urdf").write_text(f'<robot name="test">{"".join(text)}</robot>')
     if category is not None:

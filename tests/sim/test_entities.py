@@ -6,16 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, write_cabinet, write_object
 
 from quest.sim.articulation import apply
 from quest.sim.entities import SimEntity, part_label
 from quest.sim.objects import SimObject, load_object
-
-
-@pytest.fixture(scope="module")
-def cabinet(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
-    return load_object(write_cabinet(tmp_path_factory.mktemp("objects") / "cabinet"))
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, TRAY, Box, Link, write_object
 
 
 def entity(thing: SimObject, name: str) -> SimEntity:
@@ -107,7 +102,9 @@ def test_handles_on_what_never_moves_are_none(tmp_path: Path) -> None:
 
 
 def test_what_hardly_moves_is_followed_only_if_there_is_nothing_else(tmp_path: Path) -> None:
-    button = Link("button", (Box("button-30", (0.02, 0.04, 0.04)),), kind="prismatic", origin=(0.26, 0.2, 0.6), limits=(0, 0.01))
+    button = Link(
+        "button", (Box("button-30", (0.02, 0.04, 0.04)),), kind="prismatic", origin=(0.26, 0.2, 0.6), limits=(0, 0.01)
+    )
     alone = load_object(write_object(tmp_path / "alone", CARCASS, button))
     assert [e.name for e in alone.entities] == ["button/front"]
     assert alone.movable == ()
@@ -116,12 +113,7 @@ def test_what_hardly_moves_is_followed_only_if_there_is_nothing_else(tmp_path: P
 
 
 def test_entity_behind_a_closed_door_is_inside(tmp_path: Path) -> None:
-    tray = Link(
-        "tray",
-        (Box("tray-40", (0.4, 0.5, 0.02)), Box("handle-41", (0.03, 0.2, 0.03), (0.2, 0, 0.02))),
-        kind="prismatic", origin=(0, 0, 0.2), limits=(0, 0.3),
-    )  # fmt: skip
-    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, DRAWER, DOOR, tray))
+    cabinet = load_object(write_object(tmp_path / "cabinet", CARCASS, DRAWER, DOOR, TRAY))
     assert {e.name: e.inside for e in cabinet.entities if e.label != "hinge"} == {
         "drawer/handle": False,
         "door/rim": False,
@@ -131,7 +123,14 @@ def test_entity_behind_a_closed_door_is_inside(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("name", "label"),
-    [("handle-14", "handle"), ("door_handle", "handle"), ("Knob-3", "knob"), ("panhandler", None), ("door-1", None), ("", None)],
+    [
+        ("handle-14", "handle"),
+        ("door_handle", "handle"),
+        ("Knob-3", "knob"),
+        ("panhandler", None),
+        ("door-1", None),
+        ("", None),
+    ],
 )
 def test_part_names(name: str, label: str | None) -> None:
     assert part_label(name) == label

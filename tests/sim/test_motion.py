@@ -4,22 +4,21 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tests.sim.small_objects import articulation
 
 from quest.errors import ConfigError
-from quest.sim.articulation import MAX_TURN_RAD, Articulation
+from quest.sim.articulation import MAX_TURN_RAD
 from quest.sim.motion import HOLD_FRAMES, joint_profile, minimum_jerk, motion_script
+from tests.sim.small_objects import articulation
 
 seeds = st.integers(0, 2**31 - 1)
 kinds = st.sampled_from(["revolute", "prismatic"])
 limits = st.tuples(st.floats(-3, 0), st.floats(0.1, 3))
-joints = st.lists(st.tuples(kinds, limits), min_size=1, max_size=4).map(
-    lambda drawn: articulation(*((kind, *limit) for kind, limit in drawn))
-)
+joints = st.lists(st.tuples(kinds, limits), min_size=1, max_size=4)
 
 
 @given(joints, seeds, st.integers(20, 60), st.data())
-def test_script(thing: Articulation, seed: int, frames: int, data: st.DataObject) -> None:
+def test_script(drawn: list, seed: int, frames: int, data: st.DataObject) -> None:
+    thing = articulation(*((kind, *limit) for kind, limit in drawn))
     order = tuple(data.draw(st.permutations(range(len(thing.joints)))))
     moved = order[: data.draw(st.integers(1, len(order)))]
     script = motion_script(thing, moved, np.random.default_rng(seed), frames_per_joint=frames)

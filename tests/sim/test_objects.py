@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, write_cabinet, write_object
 
 from quest.errors import ObjectError
 from quest.sim.articulation import MAX_TURN_RAD
 from quest.sim.objects import find_objects, load_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, write_cabinet, write_object
 
 
 def test_cabinet(tmp_path: Path) -> None:

@@ -4,13 +4,13 @@ import shlex
 from pathlib import Path
 
 import pytest
-from tests.sim.small_objects import write_cabinet
 
 from quest.cli import main as program
 from quest.cli.generate import Generate
 from quest.errors import ConfigError, ObjectError
 from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
 from quest.sim.procedural import CATEGORIES
+from tests.sim.small_objects import write_cabinet
 
 
 def test_all_objects_come_once_before_any_comes_again() -> None:

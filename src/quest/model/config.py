@@ -55,6 +55,10 @@ class NetworkConfig:
             raise ConfigError(
                 f"network: expected cells of half a patch ({self.encoder.patch_size // 2} px), got {self.cell_px}"
             )
+        if self.encoder.image_size % self.encoder.patch_size or self.encoder.width % self.encoder.heads:
+            raise ConfigError(
+                f"network: expected an image of whole patches and a width that is a multiple of heads, got {self.encoder}"
+            )
         if min(self.window, self.slots, self.decoder_layers) < 1:
             raise ConfigError("network: window, slots and decoder_layers must be at least 1")
 

@@ -96,7 +96,7 @@ class Observation:
 
     Attributes:
         tokens: one per patch, with position codes.
-        fine: one per cell of the heatmap (empty without a heatmap).
+        fine: one per cell of the heatmap (no channels without a heatmap).
         cell_point: lifted point of each cell in the reference frame, NaN where depth is missing.
     """
 
@@ -191,7 +191,7 @@ class Observer(nn.Module):
             flat = layer(flat)
         flat = self.norm(flat)
         if detail is None:
-            return Observation(flat.unflatten(0, (b, t)), flat.new_zeros(b, t, 0, 0), cell_point)
+            return Observation(flat.unflatten(0, (b, t)), flat.new_zeros(b, t, side * side, 0), cell_point)
         up = self.up(flat).reshape(b * t, grid, grid, 2, 2, -1).transpose(2, 3).reshape(b, t, side * side, -1)
         fine = detail + up + self.fine_position
         if self.fine_points is not None:

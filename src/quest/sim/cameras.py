@@ -32,7 +32,7 @@ def sample_cameras(
     """Cameras in the front hemisphere (+x) that see all ``points``, about 18 degrees apart or more.
 
     Args:
-        points: world points that must stay inside the image; the object in all its joint states.
+        points: world points that must stay inside the image: the object on the origin, in all its joint states.
         count: how many cameras.
         rng: what they are drawn from.
         width: image width, pixels.

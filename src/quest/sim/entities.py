@@ -198,7 +198,7 @@ class _Surfaces:
         body = self._articulation.parts[parts[0]].body
         area = np.array([max(self._world[i].area, 1e-12) for i in parts])
         counts = np.maximum(20, np.ceil(2 * _SAMPLES * area / area.sum())).astype(int)
-        points = np.concatenate([_sample(self._world[i], n)[0] for i, n in zip(parts, counts, strict=True)])
+        points = np.concatenate([_sample(self._world[i], int(n))[0] for i, n in zip(parts, counts, strict=True)])
         goal = apply(self._poses[body], target)
         # Rays are cast for the samples nearest to the target only: they decide.
         points = points[np.argsort(np.linalg.norm(points - goal, axis=1), kind="stable")[:_SAMPLES]]

@@ -119,7 +119,7 @@ def pose_matrix(xyz: Float[np.ndarray, "3"], rpy: Float[np.ndarray, "3"]) -> Flo
 
 def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
     if text is None:
-        return np.array(default)
+        return np.array(default, dtype=np.float64)
     values = np.array([float(v) for v in text.split()])
     if values.shape != (len(default),) or not np.isfinite(values).all():
         raise ValueError(f"expected {len(default)} finite numbers, got {text!r}")

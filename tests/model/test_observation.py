@@ -1,0 +1,119 @@
+"""Depth of cells, the reference frame, and what a frame shows."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+
+from quest.geometry import invert, project, transform
+from quest.model.config import NetworkConfig
+from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
+from quest.types import Camera
+
+
+def test_cell_depth_against_a_plain_loop():
+    torch.manual_seed(0)
+    depth_m = 0.5 + torch.rand(3, 16, 32)
+    depth_m[torch.rand(depth_m.shape) < torch.tensor([0.0, 0.5, 0.88])[:, None, None]] = 0
+    depth_m[0, :8, :8] = 0
+    depth_m[1, 8, 8] = math.nan
+    got = cell_depth(depth_m, 8)
+    for b in range(3):
+        for row in range(2):
+            for column in range(4):
+                cell = depth_m[b, row * 8 : row * 8 + 8, column * 8 : column * 8 + 8].flatten().tolist()
+                valid = sorted(d for d in cell if d > 0)
+                expected = valid[int((len(valid) - 1) * 0.25)] if len(valid) >= 8 else 0.0
+                assert got[b, row, column] == pytest.approx(expected)
+
+
+def test_a_thin_part_keeps_its_own_depth():
+    depth_m = torch.full((1, 8, 8), 2.0)
+    depth_m[0, :, 3:6] = 1.0
+    assert cell_depth(depth_m, 8).item() == 1.0
+
+
+def test_reference_is_centred_on_the_median():
+    depth = torch.tensor([[[1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]])
+    center, scale = reference_of(depth, torch.tensor([[100.0, 100.0, 32.0, 32.0]]), 64)
+    assert center.tolist() == [[0.0, 0.0, 2.0]]
+    assert scale.tolist() == pytest.approx([0.5 * 64 * 2.0 / 100])
+
+
+def test_reference_without_depth():
+    depth = torch.stack([torch.zeros(4, 4), torch.full((4, 4), 3.0)])
+    center, scale = reference_of(depth, torch.tensor([[100.0, 100.0, 32.0, 32.0]] * 2), 64)
+    assert center.tolist() == [[0.0, 0.0, 1.0], [0.0, 0.0, 3.0]]
+    assert scale.tolist() == pytest.approx([1.0, 0.96])
+
+
+def test_to_reference_is_undone_by_projection():
+    frames = make_frames(batch=2, frames=3)
+    uv = 64 * torch.rand(2, 3, 5, 2)
+    depth = frames.depth_at(uv)
+    point = frames.to_reference(uv, depth)
+    assert (point.isnan().any(-1) == (depth == 0)).all()
+    metric = point * frames.scale[:, None, None, None] + frames.center[:, None, None]
+    cam = transform(invert(frames.ref_from_cam)[:, :, None], metric)
+    back = project(cam, Camera(*frames.intrinsics[0].tolist(), 64, 64))
+    seen = depth > 0
+    assert seen.any()
+    torch.testing.assert_close(back[seen], uv[seen], rtol=1e-4, atol=1e-3)
+
+
+def test_depth_under_pixels():
+    frames = make_frames(batch=1, frames=1)
+    frames.depth_m[0, 0, 10:13, 20:23] = torch.tensor([[3.0, 3, 3], [3, 0, 2], [3, 3, 3]])
+    uv = torch.tensor([[[[21.5, 11.5], [20.0, 10.99], [64.0, 3.0], [-0.1, 3.0], [math.nan, 3.0]]]])
+    assert frames.depth_at(uv)[0, 0].tolist() == [0.0, 3.0, 0.0, 0.0, 0.0]
+    assert frames.near_depth_at(uv[:, :, :1]).item() == 2.0
+    frames.depth_m[:] = 0
+    assert (frames.near_depth_at(uv) == 0).all()
+
+
+def test_cells_are_counted_row_by_row():
+    centres = cell_centres(DEFAULT)
+    assert centres.shape == (64, 2)
+    assert centres[0].tolist() == [4.0, 4.0]
+    assert centres[9].tolist() == [12.0, 12.0]
+    assert centres[7].tolist() == [60.0, 4.0]
+
+
+def one(frames: FrameBatch, b: int) -> FrameBatch:
+    return FrameBatch(**{name: getattr(frames, name)[b : b + 1] for name in FrameBatch.__dataclass_fields__})
+
+
+@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
+def test_neither_batch_nor_time_mix(config: NetworkConfig):
+    network, frames = make_network(config), make_frames(config, batch=3)
+    with torch.no_grad():
+        together = network.observe(frames)
+        alone = network.observe(one(frames, 1).during(slice(2, 3)))
+    for name in Observation.__dataclass_fields__:
+        expected = getattr(together, name)[1:2, 2:3]
+        torch.testing.assert_close(getattr(alone, name), expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+
+
+def test_stack_undoes_during():
+    observed = make_network().observe(make_frames())
+    again = Observation.stack([observed.during(slice(t, t + 1)) for t in range(4)])
+    assert (again.tokens == observed.tokens).all()
+    assert (again.fine == observed.fine).all()
+
+
+def test_no_depth_is_no_nan():
+    observed = make_network().observe(make_frames(depth=False))
+    assert observed.cell_point.isnan().all()
+    assert observed.tokens.isfinite().all()
+    assert observed.fine.isfinite().all()
+
+
+def test_depth_is_used_only_where_it_is_asked_for():
+    for points3d, differs in ((True, True), (False, False)):
+        network = make_network(DEFAULT, points3d=points3d)
+        with_depth, without = make_frames(), make_frames(depth=False)
+        same = (network.observe(with_depth).tokens == network.observe(without).tokens).all()
+        assert bool(same) != differs

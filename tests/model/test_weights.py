@@ -1,0 +1,93 @@
+"""Files of trained networks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from tests.tiny import DEFAULT, PAPER, make_network
+
+from quest.errors import WeightsError
+from quest.model.config import NetworkConfig
+from quest.model.weights import FORMAT, load_network, save_network, shipped_weights
+
+
+def saved(folder: Path, config: NetworkConfig = DEFAULT) -> Path:
+    path = folder / "deep" / "net.safetensors"
+    save_network(path, make_network(config), settings='{"jump": 0.1}', about="a test")
+    return path
+
+
+def rewritten(path: Path, *, changes: dict | None = None, drop: str = "", **metadata: str) -> Path:
+    """The same file with other tensors or metadata."""
+    tensors = {k: v for k, v in {**load_file(path), **(changes or {})}.items() if k != drop}
+    about = {"format": FORMAT, "config": DEFAULT.to_json(), "settings": "{}", "about": "", **metadata}
+    save_file(tensors, path, metadata=about)
+    return path
+
+
+@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
+def test_round_trip(tmp_path: Path, config: NetworkConfig):
+    path = saved(tmp_path, config)
+    loaded = load_network(path)
+    assert loaded.network.config == config
+    assert loaded.settings == '{"jump": 0.1}'
+    assert not loaded.network.training
+    assert not list(path.parent.glob("*.partial"))
+    for name, tensor in make_network(config).state_dict().items():
+        expected = tensor.half().float()
+        assert (loaded.network.state_dict()[name] == expected).all(), name
+    save_network(path, loaded.network, settings=loaded.settings, about="again")
+    again = load_network(path).network.state_dict()
+    assert all((again[name] == tensor).all() for name, tensor in loaded.network.state_dict().items())
+
+
+def test_a_missing_file_names_what_ships(tmp_path: Path):
+    for name in ("quest-none", tmp_path / "none.safetensors", tmp_path):
+        with pytest.raises(WeightsError, match="no such weights"):
+            load_network(name)
+
+
+@pytest.mark.parametrize("keep", [0, 4, 100, -1])
+def test_a_torn_file(tmp_path: Path, keep: int):
+    path = saved(tmp_path)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(WeightsError, match="not a whole safetensors file"):
+        load_network(path)
+
+
+def test_a_foreign_file(tmp_path: Path):
+    path = tmp_path / "foreign.safetensors"
+    save_file({"a": torch.zeros(2)}, path)
+    with pytest.raises(WeightsError, match="quest train"):
+        load_network(path)
+    path.write_text("not tensors")
+    with pytest.raises(WeightsError):
+        load_network(path)
+
+
+@pytest.mark.parametrize(
+    "config",
+    ["{", "[]", json.dumps({"encoder": {}, "future": 1}), replace(DEFAULT).to_json().replace('"heads": 2', '"heads": 3')],
+)
+def test_a_configuration_of_another_version(tmp_path: Path, config: str):
+    with pytest.raises(WeightsError, match="version"):
+        load_network(rewritten(saved(tmp_path), config=config))
+
+
+def test_tensors_of_another_shape(tmp_path: Path):
+    wider = replace(DEFAULT, width=64).to_json()
+    with pytest.raises(WeightsError, match="do not fit"):
+        load_network(rewritten(saved(tmp_path), config=wider))
+    with pytest.raises(WeightsError, match=r"norm\.bias"):
+        load_network(rewritten(saved(tmp_path), drop="norm.bias"))
+    with pytest.raises(WeightsError, match="extra"):
+        load_network(rewritten(saved(tmp_path), changes={"extra": torch.zeros(1)}))
+
+
+def test_shipped_names_are_files():
+    assert all(path.is_file() and path.stem == name for name, path in shipped_weights().items())

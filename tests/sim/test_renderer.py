@@ -1,0 +1,67 @@
+"""What SAPIEN draws of a scene that can be computed by hand."""
+
+import numpy as np
+import pytest
+
+from quest.sim.annotate import project_points
+from quest.sim.articulation import apply
+from quest.sim.cameras import PosedCamera
+from quest.sim.objects import SimObject
+from quest.sim.renderer import Picture, Renderer
+from quest.types import Camera
+
+pytestmark = pytest.mark.render
+
+# Two metres before the cabinet, at half its height, looking at it along -x: x right is +y, y down is -z.
+POSED = PosedCamera(
+    Camera(270.0, 240.0, 99.0, 87.0, 192, 168),
+    np.array([[0, 1, 0, 0], [0, 0, -1, 0.4], [-1, 0, 0, 2.0], [0, 0, 0, 1.0]]),
+)
+
+
+def picture(renderer: Renderer, cabinet: SimObject, position: tuple[float, float]) -> Picture:
+    stage = renderer.stage(cabinet, [POSED], lambda scene, bodies: None)
+    stage.pose(cabinet.articulation.poses(np.array(position, dtype=float)))
+    (taken,) = stage.pictures()
+    return taken
+
+
+def test_depth_labels_and_pixels(renderer: Renderer, cabinet: SimObject) -> None:
+    taken = picture(renderer, cabinet, (0, 0))
+    poses = cabinet.articulation.poses(np.zeros(2))
+    owner = {part: 1 + index for index, entity in enumerate(cabinet.entities) for part in entity.parts}
+    for index, part in enumerate(cabinet.articulation.parts):
+        if part.name not in ("handle-8", "door_panel-9"):
+            continue
+        corners = apply(poses[part.body], np.asarray(part.surface.vertices))
+        face = corners[np.isclose(corners[:, 0], corners[:, 0].max())]  # the side that the camera sees
+        uv, depth = project_points(face, POSED)
+        (x0, y0), (x1, y1) = np.round(uv.min(axis=0)).astype(int), np.round(uv.max(axis=0)).astype(int)
+        inner = (slice(y0 + 1, y1 - 1), slice(x0 + 1, x1 - 1))
+        assert taken.body[inner].size > 10
+        assert (taken.body[inner] == 1 + part.body).all()
+        np.testing.assert_allclose(taken.depth_m[inner], depth[0], atol=1e-4)
+        np.testing.assert_array_equal(taken.entity[inner], owner.get(index, 0))
+        if part.name == "handle-8":  # its mask ends where its projection ends
+            y, x = np.nonzero(taken.entity == owner[index])
+            outer = project_points(corners, POSED)[0]
+            assert (np.abs([x.min(), y.min()] - outer.min(axis=0)) <= 1).all()
+            assert (np.abs([x.max() + 1, y.max() + 1] - outer.max(axis=0)) <= 1).all()
+
+
+def test_nothing_is_zero(renderer: Renderer, cabinet: SimObject) -> None:
+    taken = picture(renderer, cabinet, (0, 0))
+    corner = (slice(0, 4), slice(0, 4))
+    assert not taken.depth_m[corner].any()
+    assert not taken.body[corner].any()
+    assert not taken.entity[corner].any()
+    assert taken.rgb.dtype == np.uint8
+
+
+def test_bodies_move(renderer: Renderer, cabinet: SimObject) -> None:
+    closed, opened = picture(renderer, cabinet, (0, 0)), picture(renderer, cabinet, (0.2, 0))
+    handle = closed.entity == 1
+    assert np.median(closed.depth_m[handle]) - np.median(opened.depth_m[opened.entity == 1]) == pytest.approx(
+        0.2, abs=1e-3
+    )
+    assert (opened.entity == 1).sum() > handle.sum()  # nearer is larger

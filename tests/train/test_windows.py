@@ -1,0 +1,141 @@
+"""Windows and their truth."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tests.tiny import DEFAULT, make_network
+from tests.train.prepared import prepare
+
+from quest.errors import ConfigError
+from quest.geometry import invert, project, transform
+from quest.model.network import UNKNOWN_LABEL
+from quest.train.feature_cache import CachedView
+from quest.train.settings import WindowConfig
+from quest.train.windows import WindowSampler
+from quest.types import Camera
+
+WINDOW = DEFAULT.window
+
+
+@pytest.fixture(scope="module")
+def views(tmp_path_factory: pytest.TempPathFactory) -> list[CachedView]:
+    """One view with two entities, one with three, one of an object with NaN pixels."""
+    return prepare(tmp_path_factory.mktemp("prepared"), make_network(), seeds=(0, 1, 2))
+
+
+def sampler(views: list[CachedView], **changes) -> WindowSampler:
+    return WindowSampler(views, DEFAULT, replace(WindowConfig(batch=6), **changes))
+
+
+@pytest.mark.parametrize("disturb", [True, False])
+def test_shapes_and_masks(views: list[CachedView], disturb: bool):
+    frames, truth = sampler(views).draw(np.random.default_rng(0), disturb=disturb)
+    assert frames.features.shape == (6, 1 + WINDOW, 16, 32)
+    assert frames.rgb.shape == (6, 1 + WINDOW, 64, 64, 3)
+    assert truth.uv.shape == (6, 1 + WINDOW, 3, 2)
+    assert (truth.bound <= (truth.visible[:, 0] & truth.exists)).all(), "an anchor must be seen where it is bound"
+    assert truth.bound.any(dim=1).all()
+    assert (truth.exists.sum(dim=1) >= 2).all()
+    assert not truth.exists.all(), "one object has fewer entities than the other"
+    assert not truth.visible.transpose(1, 2)[~truth.exists].any()
+    assert ((truth.anchor_uv >= 0) & (truth.anchor_uv <= 1)).all()
+
+
+def test_truth_is_what_the_frames_show(views: list[CachedView]):
+    """The pixels are the projections of the points, so are the depths where an entity is seen."""
+    frames, truth = sampler(views).draw(np.random.default_rng(1), disturb=False)
+    metric = truth.point * frames.scale[:, None, None, None] + frames.center[:, None, None]
+    cam = transform(invert(frames.ref_from_cam)[:, :, None], metric)
+    for b in range(6):
+        seen = truth.exists[b]
+        uv = project(cam[b][:, seen], Camera(*frames.intrinsics[b].tolist(), 64, 64))
+        torch.testing.assert_close(uv, 64 * truth.uv[b][:, seen], rtol=1e-4, atol=0.02)
+    depth = frames.depth_at(64 * truth.uv)
+    assert ((depth - cam[..., 2]).abs()[truth.visible] < 0.02).all()
+
+
+def test_entities_keep_to_their_axis(views: list[CachedView]):
+    _, truth = sampler(views).draw(np.random.default_rng(2), disturb=False)
+    origin, direction = truth.axis[:, None, :, :3], truth.axis[:, None, :, 3:]
+    torch.testing.assert_close(direction.norm(dim=-1)[truth.exists[:, None]], torch.ones(int(truth.exists.sum())))
+    height = ((truth.point - origin) * direction).sum(-1)
+    radius = (truth.point - origin - height.unsqueeze(-1) * direction).norm(dim=-1)
+    turning = (truth.exists & truth.revolute)[:, None].expand_as(height)
+    sliding = (truth.exists & ~truth.revolute)[:, None].expand_as(height)
+    assert turning.any()
+    assert sliding.any()
+    # Radius is constant for both kinds; height only where an entity turns.
+    assert ((radius - radius[:, :1]).abs()[turning | sliding] < 1e-3).all()
+    assert ((height - height[:, :1]).abs()[turning] < 1e-3).all()
+
+
+def test_unit_is_half_the_diagonal(views: list[CachedView]):
+    frames, truth = sampler(views).draw(np.random.default_rng(3))
+    known = {round(v.half_diagonal_m, 4) for v in views}
+    assert {round(float(m), 4) for m in truth.unit * frames.scale} <= known
+
+
+def test_the_same_seed_draws_the_same_windows(views: list[CachedView]):
+    one, two = (sampler(views).draw(np.random.default_rng(5)) for _ in range(2))
+    other = sampler(views).draw(np.random.default_rng(6))
+    for a, b, c in zip(one, two, other, strict=True):
+        for f in fields(a):
+            torch.testing.assert_close(getattr(a, f.name), getattr(b, f.name), equal_nan=True, rtol=0, atol=0)
+        assert any(not torch.equal(getattr(a, f.name), getattr(c, f.name)) for f in fields(a))
+
+
+def test_windows_are_in_order_with_one_stride(views: list[CachedView]):
+    s, rng = sampler(views), np.random.default_rng(7)
+    strides = set()
+    for _ in range(60):
+        view, (anchor, *window) = s._pick(views[0], rng)
+        assert view.visible[anchor].any()
+        assert all(0 <= t < len(view) for t in window)
+        steps = np.diff(window)
+        inner = steps[(np.array(window[1:]) > 0) & (np.array(window[1:]) < len(view) - 1)]
+        assert len(set(inner)) <= 1 or (steps >= 0).all() or (steps <= 0).all()
+        strides |= set(steps.tolist())
+    assert strides >= {-3, -1, 0, 1, 3}
+
+
+def test_nothing_is_disturbed_when_it_must_not_be(views: list[CachedView]):
+    frames, truth = sampler(views, depth_drop_share=1.0, query_drop_share=1.0).draw(
+        np.random.default_rng(0), disturb=False
+    )
+    assert (frames.depth_m > 0).any()
+    assert (truth.told == UNKNOWN_LABEL).all()
+    assert (truth.bound == (truth.visible[:, 0] & truth.exists)).all()
+    torch.testing.assert_close(truth.anchor_uv[truth.bound], truth.uv[:, 0][truth.bound])
+
+
+def test_disturbances(views: list[CachedView]):
+    rng = np.random.default_rng(0)
+    frames, truth = sampler(views, depth_drop_share=1.0, label_share=1.0).draw(rng)
+    assert (frames.depth_m == 0).all()
+    assert (frames.cell_depth_m == 0).all()
+    assert (frames.scale == 1).all()
+    assert (truth.told == truth.label).all()
+    frames, truth = sampler(views, query_drop_share=1.0, label_share=0.0).draw(rng)
+    assert (truth.told == UNKNOWN_LABEL).all()
+    assert truth.bound.any(dim=1).all(), "one query at least is left"
+
+
+def test_views_in_which_nothing_is_seen(views: list[CachedView]):
+    blind = replace(views[0], visible=np.zeros_like(views[0].visible))
+    assert sampler([blind, views[1]]).objects == [views[1].object_id]
+    with pytest.raises(ConfigError, match="visible"):
+        sampler([blind])
+
+
+def test_behind_the_camera_is_outside(views: list[CachedView], tmp_path: Path):
+    uv = np.array(views[0].uv_px)
+    visible = np.array(views[0].visible)
+    uv[3:, 0], visible[3:, 0] = np.nan, False
+    _, truth = sampler([replace(views[0], uv_px=uv, visible=visible)]).draw(np.random.default_rng(0))
+    assert truth.uv.isnan().any()
+    assert truth.anchor_uv.isfinite().all()
