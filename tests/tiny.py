@@ -27,9 +27,7 @@ DEFAULT = NetworkConfig(
 )
 """The preset ``default``, tiny."""
 
-PAPER = replace(
-    DEFAULT, preset="paper", queries="learned", head="regression", token_layers=0, slots=5, points3d=False
-)
+PAPER = replace(DEFAULT, preset="paper", queries="learned", head="regression", token_layers=0, slots=5, points3d=False)
 """The preset ``paper``, tiny."""
 
 

@@ -40,7 +40,9 @@ def test_the_canvas_has_the_camera_of_its_pixels(size: tuple[int, int]):
     torch.testing.assert_close(lift(canvas, point[:, 2], letterbox.camera), point)
 
 
-@pytest.mark.parametrize(("width", "height"), [(64, 64), (32, 32), (128, 128), (160, 40), (30, 90), (100, 3), (641, 427)])
+@pytest.mark.parametrize(
+    ("width", "height"), [(64, 64), (32, 32), (128, 128), (160, 40), (30, 90), (100, 3), (641, 427)]
+)
 def test_a_dot_lands_where_its_pixel_says(width: int, height: int):
     letterbox = box(width, height)
     image = np.zeros((height, width, 3), np.uint8)

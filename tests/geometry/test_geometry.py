@@ -71,7 +71,9 @@ def test_motions_compose(second: Tensor, first: Tensor, point: Tensor):
 
 @given(motions(), points)
 def test_motions_keep_distances(motion: Tensor, point: Tensor):
-    torch.testing.assert_close(torch.cdist(transform(motion, point), transform(motion, point)), torch.cdist(point, point))
+    torch.testing.assert_close(
+        torch.cdist(transform(motion, point), transform(motion, point)), torch.cdist(point, point)
+    )
 
 
 def test_transform_broadcasts_and_keeps_batches_apart():
@@ -116,3 +118,14 @@ def test_depth_image_lifts_pixel_centres():
                 expected = lift(torch.tensor([x + 0.5, y + 0.5]), depth_m[b, y, x], CAMERA)
                 torch.testing.assert_close(lifted[b, y, x], expected, equal_nan=True)
     assert lifted[0, 1, 2].isnan().all()
+
+
+def test_what_is_missing_does_not_spoil_the_gradient():
+    point = torch.tensor([[0.1, 0.2, 1.0], [0.1, 0.2, -1.0]], requires_grad=True)
+    project(point, CAMERA)[0].sum().backward()
+    uv = torch.tensor([[10.0, 20.0], [30.0, 40.0]], requires_grad=True)
+    lift(uv, torch.tensor([1.0, 0.0]), CAMERA)[0].sum().backward()
+    for tensor in (point, uv):
+        assert tensor.grad is not None
+        assert tensor.grad[0].any()
+        assert (tensor.grad[1] == 0).all()

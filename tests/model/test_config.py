@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from tests.tiny import DEFAULT, PAPER
 
 from quest.errors import ConfigError
 from quest.model.config import PRESETS, NetworkConfig
 from quest.model.encoder import EncoderConfig
+from tests.tiny import DEFAULT, PAPER
 
 
 @pytest.mark.parametrize("config", [*PRESETS.values(), DEFAULT, PAPER], ids=lambda c: f"{c.preset}-{c.width}")
@@ -19,7 +19,18 @@ def test_json_round_trip(config: NetworkConfig):
 
 @pytest.mark.parametrize(
     "text",
-    ["", "{", "[]", "null", "3", '"x"', "{}", '{"encoder": {}, "colour": 1}', '{"encoder": {"colour": 1}}', '{"encoder": 3}'],
+    [
+        "",
+        "{",
+        "[]",
+        "null",
+        "3",
+        '"x"',
+        "{}",
+        '{"encoder": {}, "colour": 1}',
+        '{"encoder": {"colour": 1}}',
+        '{"encoder": 3}',
+    ],
 )
 def test_foreign_json_is_refused(text: str):
     with pytest.raises(ConfigError):

@@ -91,7 +91,7 @@ def test_weights_of_another_patch_size_load():
     encoder.load_initial(state)
     assert encoder.position.shape == (1, 17, 32)
     torch.testing.assert_close(encoder.norm.weight, state["norm.weight"])
-    torch.testing.assert_close(encoder.blocks[0].qkv.weight, state["blocks.0.qkv.weight"])
+    torch.testing.assert_close(encoder.state_dict()["blocks.0.qkv.weight"], state["blocks.0.qkv.weight"])
 
 
 @pytest.mark.parametrize(

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 from torch import Tensor
 
 from quest.errors import ConfigError
 from quest.model.config import PRESETS, NetworkConfig
-from quest.model.decoder import Anchor, Prediction, sample_grid
+from quest.model.decoder import Anchor, HeatmapHead, Prediction, sample_grid
 from quest.model.discovery import find_peaks
 from quest.model.network import UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.types import LABELS
+from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 
@@ -163,9 +163,7 @@ def test_learned_queries_cannot_be_bound():
     network, frames = make_network(PAPER), make_frames(PAPER)
     observed, some = network.observe(frames), torch.zeros(2, 1, 2)
     with pytest.raises(ConfigError, match="paper"):
-        network.bind(
-            observed, some, torch.zeros(2, 1, 3), torch.zeros(2, 1).long(), torch.ones(2, 1, dtype=torch.bool)
-        )
+        network.bind(observed, some, torch.zeros(2, 1, 3), torch.zeros(2, 1).long(), torch.ones(2, 1, dtype=torch.bool))
 
 
 def test_the_answer_lies_around_the_best_cell():
@@ -173,9 +171,9 @@ def test_the_answer_lies_around_the_best_cell():
     got = answers(network, bound(network, frames), frames)
     assert (got["peak"] == got["logits"].argmax(-1)).all()
     peak = torch.stack((got["peak"] % 8 + 0.5, got["peak"] // 8 + 0.5), dim=-1) / 8
-    offset = network.head.offset
-    torch.nn.init.zeros_(offset[-1].weight)
-    torch.nn.init.zeros_(offset[-1].bias)
+    assert isinstance(network.head, HeatmapHead)
+    for parameter in network.head.offset[-1].parameters():
+        torch.nn.init.zeros_(parameter)
     plain = answers(network, bound(network, frames), frames)
     assert ((plain["uv"] - peak).abs() <= 1 / 8 + 1e-6).all()
 

@@ -6,12 +6,12 @@ import math
 
 import pytest
 import torch
-from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 
 from quest.geometry import invert, project, transform
 from quest.model.config import NetworkConfig
 from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
 from quest.types import Camera
+from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 
 
 def test_cell_depth_against_a_plain_loop():
@@ -58,10 +58,18 @@ def test_to_reference_is_undone_by_projection():
     assert (point.isnan().any(-1) == (depth == 0)).all()
     metric = point * frames.scale[:, None, None, None] + frames.center[:, None, None]
     cam = transform(invert(frames.ref_from_cam)[:, :, None], metric)
-    back = project(cam, Camera(*frames.intrinsics[0].tolist(), 64, 64))
+    back = project(cam, Camera(80.0, 80.0, 32.0, 32.0, 64, 64))
     seen = depth > 0
     assert seen.any()
     torch.testing.assert_close(back[seen], uv[seen], rtol=1e-4, atol=1e-3)
+
+
+def test_missing_depth_does_not_spoil_the_gradient():
+    frames = make_frames(batch=1, frames=1)
+    uv = torch.tensor([[[[10.0, 10.0], [20.0, 20.0]]]], requires_grad=True)
+    frames.to_reference(uv, torch.tensor([[[1.0, 0.0]]]))[0, 0, 0].sum().backward()
+    assert uv.grad is not None
+    assert uv.grad.isfinite().all()
 
 
 def test_depth_under_pixels():

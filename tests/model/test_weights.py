@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from tests.tiny import DEFAULT, PAPER, make_network
 
 from quest.errors import WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.weights import FORMAT, load_network, save_network, shipped_weights
+from tests.tiny import DEFAULT, PAPER, make_network
 
 
 def saved(folder: Path, config: NetworkConfig = DEFAULT) -> Path:
@@ -72,7 +72,12 @@ def test_a_foreign_file(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "config",
-    ["{", "[]", json.dumps({"encoder": {}, "future": 1}), replace(DEFAULT).to_json().replace('"heads": 2', '"heads": 3')],
+    [
+        "{",
+        "[]",
+        json.dumps({"encoder": {}, "future": 1}),
+        replace(DEFAULT).to_json().replace('"heads": 2', '"heads": 3'),
+    ],
 )
 def test_a_configuration_of_another_version(tmp_path: Path, config: str):
     with pytest.raises(WeightsError, match="version"):

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from tests.synthetic import make_take
 
 from quest.data.store import TakeStore
 from quest.model.network import QuestNetwork
 from quest.train.feature_cache import CachedView, FeatureCache
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler
+from tests.synthetic import make_take
 
 CPU = torch.device("cpu")
 

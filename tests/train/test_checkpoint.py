@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
-from tests.tiny import DEFAULT, make_network
 
 from quest.errors import WeightsError
 from quest.model.network import QuestNetwork
 from quest.train.checkpoint import Progress, check_same_network, load_checkpoint, save_checkpoint
+from tests.tiny import DEFAULT, make_network
 
 PROGRESS = Progress(7, 0.25, 5, 2, "{}", DEFAULT.to_json())
 

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from tests.tiny import make_network
-from tests.train.prepared import CPU, make_store
 
 from quest.errors import ConfigError
 from quest.train.dataset import Dataset, open_dataset
 from quest.train.settings import WindowConfig
+from tests.tiny import make_network
+from tests.train.prepared import CPU, make_store
 
 TRAIN, VALIDATION, TEST, UNLISTED = 3, 100003, 110003, 999999
 

@@ -71,6 +71,7 @@ def test_coordinate_loss():
     loss = losses.coordinate_loss(uv, target, mask)
     assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
     lives(loss, uv)
+    assert uv.grad is not None
     assert (uv.grad[~mask] == 0).all()
     assert losses.coordinate_loss(target, target, mask) == 0
 
@@ -111,7 +112,7 @@ def test_point_loss():
     point, target, unit, mask = track()
     expected = []
     for b, t, k in mask.nonzero().tolist():
-        error = (point[b, t, k] - target[b, t, k]) / unit[b]
+        error = (point[b, t, k] - target[b, t, k]).detach() / unit[b]
         if error.isfinite().all():
             expected.append(sum(huber(e, 0.05) for e in error.tolist()) / 0.05)
     loss = losses.point_loss(point, target, unit, mask)
@@ -129,7 +130,9 @@ def test_difference_loss(order: int):
             for t in range(order, T):
                 frames = range(t - order, t + 1)
                 error = [((point - target)[b, f, k] / unit[b]).detach() for f in frames]
-                if not all(bool(mask[b, f, k]) and bool(e.isfinite().all()) for f, e in zip(frames, error, strict=True)):
+                if not all(
+                    bool(mask[b, f, k]) and bool(e.isfinite().all()) for f, e in zip(frames, error, strict=True)
+                ):
                     continue
                 d = error[1] - error[0] if order == 1 else error[2] - 2 * error[1] + error[0]
                 expected.append(sum(min(abs(x), 0.5) for x in d.tolist()))
@@ -150,7 +153,8 @@ def test_a_window_too_short_for_differences_has_none():
 def test_confidence_loss():
     logit, target, mask = torch.randn(B, T, K, requires_grad=True), torch.rand(B, T, K) < 0.5, some_mask()
     expected = [
-        -math.log(1 / (1 + math.exp(-float(logit[i]) * (1 if target[i] else -1)))) for i in map(tuple, mask.nonzero().tolist())
+        -math.log(1 / (1 + math.exp(-float(logit[i].detach()) * (1 if target[i] else -1))))
+        for i in map(tuple, mask.nonzero().tolist())
     ]
     loss = losses.confidence_loss(logit, target, mask)
     assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
@@ -231,7 +235,11 @@ def test_manifold_loss_is_zero_on_the_circle_and_on_the_line():
 
 def test_manifold_loss():
     rest, axis, revolute = screws()
-    point, unit, mask = on_their_way(rest, axis, revolute) + 0.05 * torch.randn(B, T, K, 3), torch.tensor([0.5, 2.0]), some_mask()
+    point, unit, mask = (
+        on_their_way(rest, axis, revolute) + 0.05 * torch.randn(B, T, K, 3),
+        torch.tensor([0.5, 2.0]),
+        some_mask(),
+    )
     point[1, 0, 0] = math.nan
     expected = []
     for b, t, k in mask.nonzero().tolist():

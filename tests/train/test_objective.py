@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
-from tests.tiny import DEFAULT, PAPER, make_network
-from tests.train.prepared import make_sampler
 
 from quest.model.config import NetworkConfig
 from quest.model.network import QuestNetwork
@@ -18,6 +16,8 @@ from quest.model.observation import FrameBatch
 from quest.train.objective import LossTerms, is_right, match_slots, roll_out, stage_one
 from quest.train.settings import LossWeights
 from quest.train.windows import WindowSampler, WindowTruth
+from tests.tiny import DEFAULT, PAPER, make_network
+from tests.train.prepared import make_sampler
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 
@@ -25,7 +25,7 @@ BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.prese
 @pytest.fixture(scope="module")
 def samplers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WindowSampler]:
     return {
-        c.preset: make_sampler(tmp_path_factory.mktemp(c.preset), make_network(c)) for c in (DEFAULT, PAPER)
+        c.preset: make_sampler(tmp_path_factory.mktemp(c.preset), make_network(c), batch=3) for c in (DEFAULT, PAPER)
     }
 
 
@@ -39,7 +39,9 @@ def test_every_loss_is_finite_and_the_gradient_reaches_every_part(samplers, conf
     network, frames, truth = draw(samplers, config)
     terms, _ = stage_one(network, frames, truth)
     assert all(getattr(terms, f.name).isfinite() for f in fields(terms))
-    assert all(getattr(terms, name) > 0 for name in ("aff", "point", "vel", "conf", "map"))
+    # Random answers of direct regression need not lie where there is depth.
+    always = ("aff", "conf", "map")
+    assert all(getattr(terms, n) > 0 for n in (always if config is PAPER else (*always, "point", "vel", "geo")))
     assert (terms.heat > 0) == (config.head == "heatmap")
     terms.total(LossWeights()).backward()
     idle = [n for n, p in network.named_parameters() if not n.startswith("encoder.") and p.grad is None]
@@ -132,7 +134,11 @@ def test_is_right_against_a_plain_loop(samplers):
         if point[i, t, q].isnan().any():
             expected = float(px[i, t, q]) < 8
         else:
-            gaps = [float((point[i, t, q] - truth.point[i, t + 1, e]).norm() / truth.unit[i]) for e in range(k) if truth.exists[i, e]]
+            gaps = [
+                float((point[i, t, q] - truth.point[i, t + 1, e]).norm() / truth.unit[i])
+                for e in range(k)
+                if truth.exists[i, e]
+            ]
             expected = min(gaps) == gaps[q] and gaps[q] < 0.1
         assert bool(right[i, t, q]) == expected
     assert (judged == px.isfinite()).all()
@@ -144,23 +150,25 @@ def test_is_right_against_a_plain_loop(samplers):
 def test_a_tiny_set_can_be_learned_by_heart(samplers, config: NetworkConfig):
     network, frames, truth = draw(samplers, config)
     network.train().encoder.requires_grad_(False)
-    optimizer = torch.optim.AdamW(network.trainable(), lr=3e-3)
+    optimizer = torch.optim.AdamW(network.trainable(), lr=5e-3)
     history = []
-    for _ in range(25):
-        terms, roll = stage_one(network, frames, truth)
+    for _ in range(16):
+        terms, _ = stage_one(network, frames, truth)
         loss = terms.total(LossWeights())
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         history.append(float(loss.detach()))
-    assert np.mean(history[-3:]) < 0.6 * history[0]
+    assert np.mean(history[-3:]) < 0.7 * history[0]
 
 
 def test_learned_queries_keep_their_slot_in_the_window(samplers):
     network, frames, truth = draw(samplers, PAPER)
     roll = roll_out(network, frames, truth)
     with torch.no_grad():
-        every = network.decode(network.slots(4), network.observe(frames).during(slice(1, None)), frames.during(slice(1, None)))
+        every = network.decode(
+            network.slots(3), network.observe(frames).during(slice(1, None)), frames.during(slice(1, None))
+        )
     for b, k in truth.bound.nonzero().tolist():
         same = (every.uv[b] - roll.prediction.uv[b, :, k : k + 1]).abs().amax(dim=(0, 2))
         assert int((same < 1e-6).sum()) == 1

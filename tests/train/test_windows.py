@@ -8,8 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tests.tiny import DEFAULT, make_network
-from tests.train.prepared import prepare
 
 from quest.errors import ConfigError
 from quest.geometry import invert, project, transform
@@ -18,6 +16,8 @@ from quest.train.feature_cache import CachedView
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler
 from quest.types import Camera
+from tests.tiny import DEFAULT, make_network
+from tests.train.prepared import prepare
 
 WINDOW = DEFAULT.window
 
@@ -53,7 +53,8 @@ def test_truth_is_what_the_frames_show(views: list[CachedView]):
     cam = transform(invert(frames.ref_from_cam)[:, :, None], metric)
     for b in range(6):
         seen = truth.exists[b]
-        uv = project(cam[b][:, seen], Camera(*frames.intrinsics[b].tolist(), 64, 64))
+        fx, fy, cx, cy = frames.intrinsics[b].tolist()
+        uv = project(cam[b][:, seen], Camera(fx, fy, cx, cy, 64, 64))
         torch.testing.assert_close(uv, 64 * truth.uv[b][:, seen], rtol=1e-4, atol=0.02)
     depth = frames.depth_at(64 * truth.uv)
     assert ((depth - cam[..., 2]).abs()[truth.visible] < 0.02).all()

@@ -110,6 +110,7 @@ class Eval:
 
     def _load_trackers(self) -> list[ClipTracker]:
         from quest.baselines import HoldStill, LucasKanade
+        from quest.evaluation.memory import remember_frames
 
         names = list(dict.fromkeys(self.trackers))
         if "point" in self.protocol and "hold-still" not in names:
@@ -119,7 +120,9 @@ class Eval:
             if name == "quest":
                 import quest
 
-                trackers.append(quest.load(self.weights))
+                tracker = quest.load(self.weights)
+                remember_frames(tracker.network, capacity=1000)  # both protocols see the same frames
+                trackers.append(tracker)
             else:
                 trackers.append(LucasKanade() if name == "lk" else HoldStill())
         return trackers
@@ -159,7 +162,7 @@ class Eval:
     def _run(
         self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], start_s: float
     ) -> Run:
-        from quest.evaluation.provenance import code_commit, combined_hash, file_hash, machine, package_versions
+        from quest.data.provenance import code_commit, combined_hash, file_hash, machine, package_versions
         from quest.evaluation.results import Run
 
         with_quest = "quest" in self.trackers

@@ -63,11 +63,11 @@ class Generate:
         Raises:
             ObjectError: there is no folder of objects to take the named ones from, or not one planned take can be made.
         """
+        from quest.data.provenance import code_commit, package_versions
         from quest.data.store import TakeStore
         from quest.sim.generate import TakeSettings
         from quest.sim.objects import find_objects
         from quest.sim.plan import ObjectShelf, plan_takes
-        from quest.sim.provenance import take_provenance
         from quest.sim.renderer import Renderer
 
         settings = TakeSettings(self.views, self.size, self.every, self.frames_per_joint, self.randomize_materials)
@@ -87,7 +87,12 @@ class Generate:
         if any(spec.source == "partnet" for spec in missing):
             find_objects(self.objects_root)  # told before the renderer warms up
         renderer = Renderer()
-        provenance = take_provenance(renderer=str(renderer.device), command=self.command_line())
+        provenance = {
+            "commit": code_commit(),
+            "versions": package_versions(),
+            "renderer": str(renderer.device),
+            "command": self.command_line(),
+        }
         with ObjectShelf(self.objects_root) as shelf:
             skipped = _Run(store, shelf, renderer, settings, provenance, console).make(missing)
         if skipped == len(takes):

@@ -52,6 +52,8 @@ class TuneWeights:
     """Store with takes of validation objects."""
     level: tuple[int, ...] = (1,)
     """Levels of the takes to use."""
+    objects: tuple[str, ...] = ()
+    """Objects to use; all by default."""
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
@@ -63,7 +65,7 @@ class TuneWeights:
 
         console = Console(highlight=False)
         store = TakeStore(self.takes)
-        takes = select_takes(store.infos(), split=("validation",), levels=self.level)
+        takes = select_takes(store.infos(), split=("validation",), levels=self.level, objects=self.objects)
         tuned = tune(
             load(self.weights), store, takes, report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}")
         )

@@ -124,15 +124,20 @@ def clean_depth(depth_m: Shaped[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
         return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
 
 
-def write_recording(clip: Clip, folder: str | Path, *, rgb: Literal["video", "png"] = "video") -> None:
-    """Write a clip as a recording folder, all or nothing.
-
-    Depth is kept to 0.1 mm where all is below 6.5 m, else to 1 mm. A video is H.264 of high quality, not lossless.
+def write_recording(
+    clip: Clip,
+    folder: str | Path,
+    *,
+    rgb: Literal["video", "png"] = "video",
+    depth_scale_m: float | None = None,
+) -> None:
+    """Write a clip as a recording folder, all or nothing. A video is H.264 of high quality, not lossless.
 
     Args:
         clip: what to write.
         folder: where to; must not exist, or be empty.
         rgb: colours as ``rgb.mp4`` or as lossless images.
+        depth_scale_m: metres per unit of the depth images; by default 0.1 mm where all is below 6.5 m, else 1 mm.
 
     Raises:
         InputError: the folder has something in it.
@@ -150,9 +155,9 @@ def write_recording(clip: Clip, folder: str | Path, *, rgb: Literal["video", "pn
             (partial / "rgb").mkdir()
             for t, image in enumerate(clip.rgb):
                 _write_png(partial / "rgb" / f"{t:06d}.png", image[..., ::-1])
-        scale = 1e-4
+        scale = 1e-3 if depth_scale_m is None else check_depth_scale(depth_scale_m)
         if clip.depth_m is not None:
-            scale = 1e-4 if clip.depth_m.max() < 6.5 else 1e-3
+            scale = 1e-4 if depth_scale_m is None and clip.depth_m.max() < 6.5 else scale
             (partial / "depth").mkdir()
             units = np.rint(clean_depth(clip.depth_m) / np.float32(scale))
             units = np.where(units <= np.iinfo(np.uint16).max, units, 0).astype(np.uint16)

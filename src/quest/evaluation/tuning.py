@@ -6,28 +6,25 @@ PartNet-Mobility and procedural objects alike); the threshold of discovery by it
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
+from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import SplitPart
-from quest.model.network import QuestNetwork
 from quest.track import Tracker, TrackerConfig
 from quest.types import LABELS, Take
 
 GRID: dict[str, tuple[float, ...]] = {
     "move_sigma": (0.04, 0.08, 0.16),
-    "jump": (0.002, 0.02, 0.1),
-    "temperature": (0.7, 1.0, 1.5, 2.5),
-    "lift_tolerance": (0.0, 0.03, 0.06, 0.1),
+    "jump": (0.002, 0.02, 0.2),
+    "temperature": (0.7, 1.0, 2.0),
+    "lift_tolerance": (0.0, 0.03, 0.08),
 }
 """Values that are tried, in this order of settings."""
 
@@ -82,7 +79,7 @@ def tune(
     if wrong or not takes:
         raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
     config, trials = tracker.config, []
-    _remember_features(tracker.network)
+    remember_frames(tracker.network, capacity=10_000)
     bias, f1 = discovery_bias(tracker, store, list(takes))
     config = replace(config, slot_bias=bias)
     for name, values in GRID.items():
@@ -175,16 +172,3 @@ class _Named(Tracker):
     def __init__(self, tracker: Tracker, config: TrackerConfig, name: str) -> None:
         super().__init__(tracker.network, config, device=tracker.device)
         self.name = name
-
-
-def _remember_features(network: QuestNetwork) -> None:
-    """Make the network's encoder remember images, since every trial looks at the same ones."""
-    encode, known = network.encode, {}
-
-    def remembered(rgb: Tensor) -> Tensor:
-        key = hashlib.blake2b(rgb.cpu().numpy().tobytes(), digest_size=16).digest()
-        if key not in known:
-            known[key] = encode(rgb).to(torch.float16)
-        return known[key]
-
-    network.encode = remembered  # type: ignore[method-assign]

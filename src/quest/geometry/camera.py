@@ -17,18 +17,23 @@ from quest.types import Camera
 def project(point_cam: Float[Tensor, "*B 3"], camera: Camera) -> Float[Tensor, "*B 2"]:
     """Pixels of camera-frame points in metres; NaN for points that are not in front of the camera."""
     z = point_cam[..., 2]
-    z = torch.where(z > 1e-6, z, torch.full_like(z, torch.nan))
+    valid = z > 1e-6
+    # NaN comes in last, so that it never reaches the gradient of the points that are in front.
+    z = torch.where(valid, z, torch.ones_like(z))
     x = camera.fx * point_cam[..., 0] / z + camera.cx
     y = camera.fy * point_cam[..., 1] / z + camera.cy
-    return torch.stack((x, y), dim=-1)
+    uv_px = torch.stack((x, y), dim=-1)
+    return torch.where(valid.unsqueeze(-1), uv_px, torch.full_like(uv_px, torch.nan))
 
 
 def lift(uv_px: Float[Tensor, "*B 2"], depth_m: Float[Tensor, "*B"], camera: Camera) -> Float[Tensor, "*B 3"]:
     """Camera-frame points in metres of pixels with depth along +z; NaN where depth is 0 or not finite."""
-    z = torch.where((depth_m > 0) & torch.isfinite(depth_m), depth_m, torch.full_like(depth_m, torch.nan))
+    valid = (depth_m > 0) & torch.isfinite(depth_m)
+    z = torch.where(valid, depth_m, torch.ones_like(depth_m))
     x = (uv_px[..., 0] - camera.cx) / camera.fx * z
     y = (uv_px[..., 1] - camera.cy) / camera.fy * z
-    return torch.stack((x, y, z), dim=-1)
+    point = torch.stack((x, y, z), dim=-1)
+    return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
 
 
 def lift_depth(depth_m: Float[Tensor, "*B H W"], camera: Camera) -> Float[Tensor, "*B H W 3"]:

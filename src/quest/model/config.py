@@ -57,7 +57,7 @@ class NetworkConfig:
             )
         if self.encoder.image_size % self.encoder.patch_size or self.encoder.width % self.encoder.heads:
             raise ConfigError(
-                f"network: expected an image of whole patches and a width that is a multiple of heads, got {self.encoder}"
+                f"network: expected whole patches and a width that is a multiple of heads, got {self.encoder}"
             )
         if min(self.window, self.slots, self.decoder_layers) < 1:
             raise ConfigError("network: window, slots and decoder_layers must be at least 1")

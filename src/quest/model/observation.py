@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from quest.geometry import transform
+from quest.geometry import invert, transform
 from quest.model.config import NetworkConfig
 from quest.model.layers import DetailStem, PointCode, TokenLayer
 
@@ -63,10 +63,21 @@ class FrameBatch:
     ) -> Float[Tensor, "B T Q 3"]:
         """Points of the reference frame under pixels of the input; NaN where depth is 0."""
         fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
-        z = torch.where(depth_m > 0, depth_m, torch.full_like(depth_m, torch.nan))
+        # NaN comes in last: earlier it would turn the gradient of the pixels into NaN, even where nothing asks for it.
+        valid = depth_m > 0
+        z = torch.where(valid, depth_m, torch.ones_like(depth_m))
         point = torch.stack(((uv_px[..., 0] - cx) / fx * z, (uv_px[..., 1] - cy) / fy * z, z), dim=-1)
         point = transform(self.ref_from_cam[:, :, None], point)
-        return (point - self.center[:, None, None]) / self.scale[:, None, None, None]
+        point = (point - self.center[:, None, None]) / self.scale[:, None, None, None]
+        return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
+
+    def from_reference(self, point: Float[Tensor, "B T Q 3"]) -> Float[Tensor, "B T Q 2"]:
+        """Pixels of the input under points of the reference frame; NaN behind the camera."""
+        metric = point * self.scale[:, None, None, None] + self.center[:, None, None]
+        x, y, z = transform(invert(self.ref_from_cam)[:, :, None], metric).unbind(-1)
+        z = torch.where(z > 1e-6, z, torch.full_like(z, torch.nan))
+        fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
+        return torch.stack((fx * x / z + cx, fy * y / z + cy), dim=-1)
 
     def depth_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q"]:
         """Depth of the pixel that each position falls in; 0 where missing or outside."""

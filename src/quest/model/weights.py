@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -28,6 +29,7 @@ class LoadedNetwork:
         network: in evaluation mode, on the CPU.
         settings: settings of the tracker that were chosen with these weights, as JSON text.
         about: where the weights come from.
+        sha256: of the file.
     """
 
     name: str
@@ -35,6 +37,7 @@ class LoadedNetwork:
     network: QuestNetwork
     settings: str
     about: str
+    sha256: str
 
 
 def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str) -> None:
@@ -89,4 +92,7 @@ def load_network(name: str | Path) -> LoadedNetwork:
     except (ConfigError, KeyError) as error:
         raise WeightsError(f"{path}: {error}; the file is of another version of quest") from error
     load_exactly(network, {k: v.to(torch.float32) for k, v in state.items()}, what=f"weights {path}")
-    return LoadedNetwork(str(name), path, network.eval(), metadata.get("settings", "{}"), metadata.get("about", ""))
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    about = metadata.get("about", "")
+    return LoadedNetwork(str(name), path, network.eval(), metadata.get("settings", "{}"), about, sha256)

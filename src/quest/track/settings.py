@@ -18,6 +18,7 @@ class TrackerConfig:
         temperature: divides the scores of the heatmap; above 1 trusts a single frame less.
         lift_tolerance: largest distance between the lifted pixel and the predicted point for the pixel's depth to
             be taken, reference units; beyond it the pixel lies on something before or behind the entity.
+        hold_below: probability of being seen below which an entity is held where it was last seen.
         slot_bias: added to the affordance logit, so that slots worth keeping have a confidence above one half.
         slot_gain: multiplies the affordance logit.
         slot_threshold: probability above which discovery takes a slot.
@@ -29,6 +30,7 @@ class TrackerConfig:
     jump: float = 0.02
     temperature: float = 1.0
     lift_tolerance: float = 0.05
+    hold_below: float = 0.5
     slot_bias: float = 0.0
     slot_gain: float = 1.0
     slot_threshold: float = 0.5

@@ -63,6 +63,7 @@ class _Bound:
     label: str | None
     slot: int | None
     belief: Belief | None = None
+    last_seen: Tensor | None = None
 
 
 class Stream:
@@ -187,7 +188,7 @@ class Stream:
             self._reference, self._reference_has_depth = (pose, center, scale), has_depth
             self._ring.clear()
             for bound in self._bound:
-                bound.belief = None
+                bound.belief = bound.last_seen = None
         ref_pose, center, scale = self._reference
         return FrameBatch(
             features=network.encode(image[None])[:, None].float(),
@@ -273,7 +274,9 @@ class Stream:
             prediction = self._network.decode(self._anchor, self._ring[-1], frames)
             size = self._network.config.encoder.image_size
             for i, query in due:
-                uv = torch.from_numpy(self._letterbox.to_canvas(np.array(query.uv_px)) / size).to(prediction.uv)
+                uv = torch.from_numpy(self._letterbox.to_canvas(np.array(query.uv_px, np.float64)) / size).to(
+                    prediction.uv
+                )
                 slot = int((prediction.uv[0, -1] - uv).norm(dim=-1).argmin())
                 self._bound.append(_Bound(i, query.name or f"point {i}", query.label, slot))
                 self._waiting.remove((i, query))
@@ -288,7 +291,7 @@ class Stream:
             x = self._network.embed(self._anchor, window)[:, -1:]
             newest = window.during(slice(-1, None))
             prediction = self._track_cells(head, x, newest)
-            uv, point = prediction.uv[0, 0], self._lift(prediction, frames)
+            uv, point = self._hold(prediction, self._lift(prediction, frames), frames)
         else:
             prediction = self._network.decode(self._anchor, window.during(slice(-1, None)), frames)
             index = torch.tensor([b.slot for b in self._bound])
@@ -340,6 +343,17 @@ class Stream:
     def _joint_belief(self, rows: list[int]) -> Belief:
         beliefs = [b for b in (self._bound[i].belief for i in rows) if b is not None]
         return Belief(torch.cat([b.probability for b in beliefs]), beliefs[0].cell_point)
+
+    def _hold(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Tensor, Tensor]:
+        """Pixels and points, those of hidden entities where they were last seen."""
+        seen = prediction.visible_logit[0, 0].sigmoid() >= self._config.hold_below
+        for k, bound in enumerate(self._bound):
+            if bool(seen[k]) or bound.last_seen is None:
+                bound.last_seen = point[k]
+        held = torch.stack([b.last_seen for b in self._bound if b.last_seen is not None])
+        uv = frames.from_reference(held[None, None])[0, 0] / self._network.config.encoder.image_size
+        keep = seen | ~torch.isfinite(uv).all(dim=-1)
+        return torch.where(keep.unsqueeze(-1), prediction.uv[0, 0], uv), torch.where(keep.unsqueeze(-1), point, held)
 
     def _lift(self, prediction: Prediction, frames: FrameBatch) -> Tensor:
         """The lifted pixel where it agrees with the predicted point, else the predicted point.

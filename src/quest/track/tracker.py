@@ -28,14 +28,18 @@ class Tracker:
         network: trained network.
         config: settings of tracking.
         device: where the network runs.
+        weights_hash: SHA-256 of the file that the network came from, for result files.
     """
 
     name = "quest"
 
-    def __init__(self, network: QuestNetwork, config: TrackerConfig, *, device: torch.device) -> None:
+    def __init__(
+        self, network: QuestNetwork, config: TrackerConfig, *, device: torch.device, weights_hash: str | None = None
+    ) -> None:
         self.network = network.to(device).eval()
         self.config = config
         self.device = device
+        self.weights_hash = weights_hash
         self._autocast = fast_bfloat16(device)
 
     def stream(self, camera: Camera, queries: Sequence[Query] | None = None) -> Stream:
@@ -85,7 +89,8 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker
         ConfigError: no such device.
     """
     loaded = load_network(name)
-    return Tracker(loaded.network, TrackerConfig.from_json(loaded.settings), device=pick_device(device))
+    config = TrackerConfig.from_json(loaded.settings)
+    return Tracker(loaded.network, config, device=pick_device(device), weights_hash=loaded.sha256)
 
 
 def pick_device(name: str) -> torch.device:

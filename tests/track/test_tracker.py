@@ -1,0 +1,351 @@
+"""The tracker and its stream: what they promise whatever the weights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from quest.errors import ConfigError, InputError, WeightsError
+from quest.model.config import NetworkConfig
+from quest.model.decoder import HeatmapHead
+from quest.model.observation import Observation
+from quest.model.weights import save_network
+from quest.track import StreamState, Tracker, load
+from quest.track.tracker import NO_DEPTH_FLAG, NOTHING_FOUND_FLAG, PARTLY_NO_DEPTH_FLAG, collect, pick_device
+from quest.types import LABELS, Clip, Query, State, Tracks
+from tests.tiny import BAD_INPUT, DEFAULT, PAPER
+from tests.track.clips import EAGER, make_clip, make_tracker, moved_world, without_depth
+
+BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
+POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return make_clip()
+
+
+def assert_same(got: Tracks, expected: Tracks, *, atol: float = 1e-5) -> None:
+    assert got.names == expected.names
+    for name in ("uv_px", "point_world", "confidence"):
+        np.testing.assert_allclose(getattr(got, name), getattr(expected, name), atol=atol, rtol=1e-4, err_msg=name)
+    assert (got.visible == expected.visible).all()
+    assert (got.state == expected.state).all()
+
+
+@BOTH
+def test_answers(config: NetworkConfig, clip: Clip):
+    tracks = make_tracker(config).track(clip, POINTS)
+    assert (tracks.names, tracks.labels) == (("a", "b"), (None, "knob"))
+    assert tracks.uv_px.shape == (6, 2, 2)
+    assert np.isfinite(tracks.uv_px).all()
+    assert ((tracks.confidence > 0) & (tracks.confidence < 1)).all()
+    assert set(tracks.state.flat) <= {s.value for s in State}
+    assert tracks.stamp_s.tolist() == clip.stamp_s.tolist()
+    assert tracks.frame_flags == ()
+
+
+@BOTH
+@pytest.mark.parametrize("queries", [POINTS, None], ids=["points", "discovery"])
+def test_stream_equals_clip(config: NetworkConfig, queries: tuple[Query, ...] | None, clip: Clip):
+    tracker = make_tracker(config)
+    stream, states = tracker.stream(clip.camera, queries), []
+    for t in range(len(clip)):
+        frame = clip.frame(t)
+        states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
+    assert_same(collect(states, queries), tracker.track(clip, queries))
+
+
+@BOTH
+def test_the_future_is_not_used(config: NetworkConfig, clip: Clip):
+    tracker = make_tracker(config)
+    whole, start = tracker.track(clip, POINTS), tracker.track(cut(clip, slice(0, 3)), POINTS)
+    np.testing.assert_allclose(whole.uv_px[:3], start.uv_px, atol=1e-4)
+    np.testing.assert_allclose(whole.point_world[:3], start.point_world, atol=1e-4)
+
+
+def cut(clip: Clip, frames: slice) -> Clip:
+    return Clip(
+        clip.name,
+        clip.camera,
+        clip.rgb[frames],
+        None if clip.depth_m is None else clip.depth_m[frames],
+        clip.stamp_s[frames],
+        clip.cam_from_world[frames],
+    )
+
+
+def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
+    """Whenever they bind: evaluation takes answer k for query k."""
+    asked = (Query.point(3, 20, 30), POINTS[0], Query.semantic("rim"), Query.point(1, 30, 30), POINTS[1])
+    tracks = make_tracker().track(clip, asked)
+    bound = np.all(np.isfinite(tracks.uv_px), axis=-1)
+    first = [3, 0, 0, 1, 0]
+    for k, t in enumerate(first):
+        assert bound[:, k].tolist() == [f >= t for f in range(6)], k
+    assert tracks.names[1] == "a"
+    assert tracks.labels == (None, None, "rim", None, "knob")
+    assert len(set(tracks.names)) == 5
+    alone = make_tracker().track(clip, [POINTS[0]])
+    assert np.abs(alone.uv_px[0, 0] - tracks.uv_px[0, 1]).max() < 64
+
+
+def test_before_a_point_is_asked_there_is_no_answer(clip: Clip):
+    tracks = make_tracker().track(clip, [Query.point(2, 20, 30)])
+    assert np.isnan(tracks.uv_px[:2]).all()
+    assert np.isnan(tracks.point_world[:2]).all()
+    assert (tracks.confidence[:2] == 0).all()
+    assert not tracks.visible[:2].any()
+    assert (tracks.state[:2] == State.LOST).all()
+    assert np.isfinite(tracks.uv_px[2:]).all()
+
+
+def test_a_query_that_binds_counts_its_frame_once(clip: Clip):
+    """At the frame of binding the belief is that frame's heatmap, whoever else is bound."""
+    tracker = make_tracker()
+    stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
+    with torch.inference_mode():
+        stream.step(frame.rgb, frame.depth_m, 0.0, frame.cam_from_world)
+        anchor = stream._anchor
+        assert anchor is not None
+        window = Observation.stack(list(stream._ring))
+        x = tracker.network.embed(anchor, window)[:, -1:]
+        assert isinstance(tracker.network.head, HeatmapHead)
+        logits = tracker.network.head.logits(x, window.during(slice(-1, None)))[0, 0]
+        for k, one in enumerate(stream._bound):
+            assert one.belief is not None
+            torch.testing.assert_close(one.belief.probability[0], logits[k].softmax(-1), rtol=1e-3, atol=1e-6)
+
+
+def test_equal_queries_get_equal_answers(clip: Clip):
+    tracks = make_tracker().track(clip, [POINTS[0], POINTS[0]])
+    np.testing.assert_allclose(tracks.uv_px[:, 0], tracks.uv_px[:, 1], atol=1e-3)
+
+
+def test_permuting_queries_permutes_tracks(clip: Clip):
+    tracker = make_tracker()
+    assert_same(tracker.track(clip, POINTS[::-1]), tracker.track(clip, POINTS).select([1, 0]), atol=1e-3)
+
+
+@BOTH
+def test_discovery(config: NetworkConfig, clip: Clip):
+    tracks = make_tracker(config).track(clip)
+    assert 1 <= len(tracks.names) <= config.slots
+    assert len(set(tracks.names)) == len(tracks.names)
+    assert set(tracks.labels) <= set(LABELS)
+    assert np.isfinite(tracks.uv_px).all()
+
+
+def test_discovery_that_finds_nothing(clip: Clip):
+    tracks = make_tracker(config=replace(EAGER, slot_threshold=1.0)).track(clip)
+    assert tracks.uv_px.shape == (6, 0, 2)
+    assert tracks.frame_flags == (NOTHING_FOUND_FLAG,)
+
+
+def test_no_queries_ask_for_nothing(clip: Clip):
+    tracks = make_tracker().track(clip, [])
+    assert tracks.uv_px.shape == (6, 0, 2)
+    assert tracks.frame_flags == ()
+
+
+def test_prompts(clip: Clip):
+    asked = [Query.semantic("handle", "left"), Query.slot(), Query.semantic("handle")]
+    tracks = make_tracker().track(clip, asked)
+    found = np.all(np.isfinite(tracks.uv_px), axis=(0, 2))
+    assert tracks.names[0] == "left"
+    assert found[1]
+    assert all(tracks.labels[k] == "handle" for k in (0, 2))
+    first = tracks.uv_px[0, found]
+    assert len(np.unique(first.round(2), axis=0)) == found.sum(), "every prompt has its own slot"
+
+
+def test_a_label_that_is_not_there_is_lost_and_flagged(clip: Clip):
+    tracks = make_tracker(config=replace(EAGER, prompt_threshold=1.0)).track(clip, [Query.semantic("knob"), POINTS[0]])
+    assert (tracks.names, tracks.labels) == (("knob", "a"), ("knob", None))
+    assert np.isnan(tracks.uv_px[:, 0]).all()
+    assert (tracks.state[:, 0] == State.LOST).all()
+    assert (tracks.confidence[:, 0] == 0).all()
+    assert np.isfinite(tracks.uv_px[:, 1]).all()
+    assert len(tracks.frame_flags) == 1
+    assert "'knob'" in tracks.frame_flags[0]
+
+
+@BOTH
+def test_a_clip_without_depth(config: NetworkConfig, clip: Clip):
+    for dark in (replace(clip, depth_m=None), without_depth(clip, slice(None))):
+        tracks = make_tracker(config).track(dark, POINTS)
+        assert tracks.frame_flags == (NO_DEPTH_FLAG,)
+        assert np.isnan(tracks.point_world).all()
+        assert np.isfinite(tracks.uv_px).all()
+        assert np.isfinite(tracks.confidence).all()
+
+
+@pytest.mark.parametrize("missing", [slice(0, 2), slice(2, 4), slice(5, 6)])
+def test_depth_missing_in_some_frames(missing: slice, clip: Clip):
+    tracks = make_tracker().track(without_depth(clip, missing), POINTS)
+    assert tracks.frame_flags == (PARTLY_NO_DEPTH_FLAG,)
+    assert np.isfinite(tracks.uv_px).all()
+    assert np.isnan(tracks.point_world[missing]).all()
+    lifted = np.all(np.isfinite(tracks.point_world), axis=-1)
+    assert lifted[[t for t in range(6) if t not in range(6)[missing]]].all()
+
+
+def test_bad_depth_is_missing_depth(clip: Clip):
+    assert clip.depth_m is not None
+    hole, rng = clip.depth_m.copy(), np.random.default_rng(0)
+    hole[rng.random(hole.shape) < 0.2] = 0
+    bad = hole.copy()
+    bad[hole == 0] = rng.choice([np.nan, np.inf, -np.inf, -1.0], int((hole == 0).sum()))
+    tracker = make_tracker()
+    assert_same(tracker.track(replace(clip, depth_m=bad), POINTS), tracker.track(replace(clip, depth_m=hole), POINTS))
+
+
+@pytest.mark.parametrize("size", [(128, 64), (48, 96), (200, 150)])
+def test_answers_are_in_source_pixels(size: tuple[int, int]):
+    """A frame that is already letterboxed gives the same answers, on the canvas."""
+    tracker, clip = make_tracker(), make_clip(frames=3, size=size)
+    assert clip.depth_m is not None
+    stream = tracker.stream(clip.camera, [])
+    box = stream._letterbox
+    square = Clip(
+        "square",
+        box.camera,
+        np.stack([box.rgb(image) for image in clip.rgb]),
+        np.stack([box.depth(image) for image in clip.depth_m]),
+        clip.stamp_s,
+        clip.cam_from_world,
+    )
+    at = np.array([[0.4 * size[0], 0.6 * size[1]]])
+    there = box.to_canvas(at)[0]
+    got = tracker.track(clip, [Query.point(0, *at[0].tolist())])
+    expected = tracker.track(square, [Query.point(0, *there.tolist())])
+    np.testing.assert_allclose(box.to_canvas(got.uv_px), expected.uv_px, atol=1e-2)
+    np.testing.assert_allclose(got.point_world, expected.point_world, atol=1e-3)
+
+
+def test_world_points_follow_the_world(clip: Clip):
+    """In another world frame the pixels stay and the points move along."""
+    angle = 0.7
+    motion = np.eye(4)
+    motion[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    motion[:3, 3] = [3.0, -2.0, 0.5]
+    tracker = make_tracker()
+    here, there = tracker.track(clip, POINTS), tracker.track(moved_world(clip, motion), POINTS)
+    np.testing.assert_allclose(there.uv_px, here.uv_px, atol=1e-3)
+    np.testing.assert_allclose(there.point_world, here.point_world @ motion[:3, :3].T + motion[:3, 3], atol=1e-3)
+
+
+def test_lifted_points_are_where_the_cameras_say(clip: Clip):
+    """What is answered for a pixel with depth is that pixel's world point, in every pose of the camera."""
+    assert clip.depth_m is not None
+    tracker = make_tracker(PAPER)
+    with torch.no_grad():
+        for parameter in tracker.network.head.mlp[-1].parameters():  # type: ignore[union-attr]
+            parameter.mul_(0.3)  # so that random answers stay in the image
+    turn, poses = 0.03, []
+    for t in range(len(clip)):
+        motion = np.eye(4)
+        c, s = np.cos(turn * t), np.sin(turn * t)
+        motion[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
+        motion[0, 3] = 0.02 * t
+        poses.append(motion @ clip.cam_from_world[t])
+    moving = replace(clip, cam_from_world=np.stack(poses))
+    tracks = tracker.track(moving)
+    camera, checked = clip.camera, 0
+    for t, k in np.ndindex(*tracks.confidence.shape):
+        x, y = tracks.uv_px[t, k]
+        if not (0 <= x < camera.width and 0 <= y < camera.height):
+            continue
+        z = moving.depth_m[t, int(y), int(x)]  # type: ignore[index]
+        cam = np.array([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z])
+        back = np.linalg.inv(poses[t]) @ np.append(cam, 1)
+        np.testing.assert_allclose(tracks.point_world[t, k], back[:3], atol=2e-3)
+        checked += 1
+    assert checked > 0
+
+
+def test_memory_is_bounded(clip: Clip):
+    stream, frame = make_tracker().stream(clip.camera, POINTS), clip.frame(0)
+    for t in range(3 * DEFAULT.window):
+        stream.step(frame.rgb, frame.depth_m, float(t))
+        assert len(stream._ring) == DEFAULT.window
+    assert all(observed.tokens.shape[1] == 1 for observed in stream._ring)
+    assert len(stream._bound) == 2
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"rgb": np.zeros((64, 32, 3), np.uint8)}, "32"),
+        ({"rgb": np.zeros((64, 64), np.uint8)}, "uint8"),
+        ({"rgb": np.zeros((64, 64, 3), np.float32)}, "float32"),
+        ({"depth_m": np.zeros((32, 64), np.float32)}, "32"),
+        ({"depth_m": np.zeros((64, 64), np.uint16)}, "units"),
+        ({"cam_from_world": np.eye(3)}, "4 x 4"),
+        ({"cam_from_world": np.full((4, 4), np.nan)}, "finite"),
+    ],
+)
+def test_bad_frames(changes: dict, named: str, clip: Clip, pytestconfig: pytest.Config):
+    frame = {"rgb": clip.rgb[0], "depth_m": clip.depth_m[0], "stamp_s": 0.0, "cam_from_world": None}  # type: ignore[index]
+    stream = make_tracker().stream(clip.camera, POINTS)
+    with pytest.raises(BAD_INPUT) as failed:
+        stream.step(**{**frame, **changes})
+    assert not isinstance(failed.value, InputError) or named in str(failed.value)
+    stream.step(**frame)
+
+
+@pytest.mark.parametrize(
+    ("query", "named"),
+    [
+        (Query.point(0, 65, 3), "65"),
+        (Query.point(0, 3, -1), "-1"),
+        (Query.point(6, 3, 3), "6 frames"),
+    ],
+)
+def test_points_outside_the_clip(query: Query, named: str, clip: Clip):
+    with pytest.raises(InputError, match=named):
+        make_tracker().track(clip, [query])
+
+
+def test_a_stream_refuses_points_outside_the_image(clip: Clip):
+    with pytest.raises(InputError, match="99"):
+        make_tracker().stream(clip.camera, [Query.point(4, 99, 3)])
+
+
+def test_points_on_the_edge_of_the_image(clip: Clip):
+    tracks = make_tracker().track(clip, [Query.point(0, 0, 0), Query.point(0, 64, 64)])
+    assert np.isfinite(tracks.uv_px).all()
+
+
+def test_unbound_queries_can_be_asked_for(clip: Clip):
+    late = Query.point(1, 3, 3)
+    stream, frame = make_tracker().stream(clip.camera, [POINTS[0], late]), clip.frame(0)
+    state = stream.step(frame.rgb, frame.depth_m, 0.0)
+    assert stream.unbound == (late,)
+    assert isinstance(state, StreamState)
+    assert state.query == (0,)
+    assert stream.step(frame.rgb, frame.depth_m, 0.1).query == (0, 1)
+    assert stream.unbound == ()
+
+
+def test_from_a_file(tmp_path: Path, clip: Clip):
+    tracker = make_tracker()
+    path = tmp_path / "net.safetensors"
+    save_network(path, tracker.network, settings=EAGER.to_json(), about="")
+    loaded = load(path, device="cpu")
+    assert loaded.config == EAGER
+    assert isinstance(loaded, Tracker)
+    assert loaded.track(clip, POINTS).uv_px.shape == (6, 2, 2)
+    save_network(path, tracker.network, settings='{"colour": 1}', about="")
+    with pytest.raises(WeightsError, match="settings"):
+        load(path, device="cpu")
+
+
+@pytest.mark.parametrize("name", ["abacus", "cuda:99"])
+def test_devices_that_are_not_there(name: str):
+    with pytest.raises(ConfigError, match="cpu"):
+        pick_device(name)
