@@ -45,7 +45,7 @@ def in_object(link: Link, mesh: Mesh, position: float = 0.0) -> np.ndarray:
     vertices, axis = mesh.vertices, np.asarray(link.axis)
     if link.kind == "prismatic":
         return vertices + np.asarray(link.origin) + position * axis
-    turned = trimesh.transformations.rotation_matrix(position, axis)[:3, :3]
+    turned = np.asarray(trimesh.transformations.rotation_matrix(position, axis))[:3, :3]
     return vertices @ turned.T + np.asarray(link.origin)
 
 

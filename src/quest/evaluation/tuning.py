@@ -21,10 +21,11 @@ from quest.track import Tracker, TrackerConfig
 from quest.types import LABELS, Take
 
 GRID: dict[str, tuple[float, ...]] = {
-    "move_sigma": (0.04, 0.08, 0.16),
-    "jump": (0.002, 0.02, 0.2),
-    "temperature": (0.7, 1.0, 2.0),
+    "move_sigma": (0.06, 0.1, 0.16),
+    "jump": (0.00003, 0.0003, 0.003),
+    "temperature": (1.0, 2.0, 4.0),
     "lift_tolerance": (0.0, 0.03, 0.08),
+    "hold_below": (0.0, 0.3, 0.5),
 }
 """Values that are tried, in this order of settings."""
 

@@ -26,10 +26,10 @@ class TrackerConfig:
         slot_radius_cells: peaks of one label closer than this are one slot.
     """
 
-    move_sigma: float = 0.08
-    jump: float = 0.02
-    temperature: float = 1.0
-    lift_tolerance: float = 0.05
+    move_sigma: float = 0.1
+    jump: float = 0.0003
+    temperature: float = 2.0
+    lift_tolerance: float = 0.08
     hold_below: float = 0.5
     slot_bias: float = 0.0
     slot_gain: float = 1.0
