@@ -27,10 +27,10 @@ class Track:
     """Folder for tracks.parquet and overlay.mp4; default: outputs/CLIP."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
-    point: tuple[str, ...] = ()
-    """Entities by pixel, each as FRAME,X,Y or FRAME,X,Y,NAME."""
-    label: tuple[Literal["handle", "knob", "rim", "front"], ...] = ()
-    """Entities by label: the most confident one of each mention."""
+    point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An entity by pixel, as FRAME,X,Y or FRAME,X,Y,NAME; give it again for each entity."""
+    label: tyro.conf.UseAppendAction[tuple[Literal["handle", "knob", "rim", "front"], ...]] = ()
+    """The most confident entity of a label; give it again for more."""
     view: int = 0
     """Which camera of a take."""
     depth: Path | None = None
