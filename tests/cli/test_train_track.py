@@ -75,7 +75,8 @@ def test_train_resume_track_evaluate(store: Path, encoder: Path, tmp_path: Path,
     video = tmp_path / "tracks"
     take = store / "panels-100003.zarr"
     chosen = ["--weights", str(out / "weights.safetensors"), "--out", str(video), "--device", "cpu"]
-    assert main(["track", str(take), *chosen, "--point", "0,20,30,left", "--point", "2,40,30", "--label", "handle"]) == 0
+    queries = ["--point", "0,20,30,left", "--point", "2,40,30", "--label", "handle"]
+    assert main(["track", str(take), *chosen, *queries]) == 0
     tracks = read_tracks(video / "tracks.parquet")
     assert len(tracks) == FRAMES
     assert tracks.names[0] == "left"

@@ -1,0 +1,23 @@
+"""Follow entities in frames that arrive one by one, as they would from a camera."""
+
+from __future__ import annotations
+
+import quest
+from quest.data.recording import read_recording
+from quest.data.sample import sample_folder
+
+
+def main() -> None:
+    """Discover the handles of the sample clip and print where the first one goes."""
+    clip = read_recording(sample_folder())  # stands in for a camera
+    stream = quest.load("quest-s16").stream(clip.camera)  # no queries: follow what is found in the first frame
+    for t in range(len(clip)):
+        frame = clip.frame(t)
+        state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        if t % 15 == 0 and state.names:
+            x, y, z = state.point_world[0]
+            print(f"{frame.stamp_s:5.2f} s  {state.names[0]}  {x:.3f} {y:.3f} {z:.3f} m  {state.state[0]}")
+
+
+if __name__ == "__main__":
+    main()
