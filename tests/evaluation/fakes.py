@@ -32,6 +32,7 @@ class Oracle:
         self.labels = labels
         self.confidence = confidence
         self.asked: list[Query] = []
+        self.network: object = None
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
         view = next(v for v in self.take.views if v.clip.name == clip.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -107,6 +108,7 @@ def test_command_writes_what_it_prints(
     store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     oracle = Oracle(store.read("panels-100001-1"), name="quest", slots=(0, 1))
+    oracle.network = SimpleNamespace(encode=None, observe=None)
     monkeypatch.setattr(quest, "load", lambda weights: oracle, raising=False)
     monkeypatch.setenv("COLUMNS", "200")
     out = tmp_path / "results.json"

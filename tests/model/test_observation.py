@@ -125,3 +125,12 @@ def test_depth_is_used_only_where_it_is_asked_for():
         with_depth, without = make_frames(), make_frames(depth=False)
         same = (network.observe(with_depth).tokens == network.observe(without).tokens).all()
         assert bool(same) != differs
+
+
+def test_pixels_of_lifted_points_are_the_pixels():
+    frames = make_frames()
+    uv_px = 64 * torch.rand(2, 4, 5, 2, generator=torch.Generator().manual_seed(1))
+    point = frames.to_reference(uv_px, torch.full((2, 4, 5), 1.3))
+    torch.testing.assert_close(frames.from_reference(point), uv_px, rtol=1e-4, atol=1e-3)
+    behind = frames.to_reference(uv_px, torch.full((2, 4, 5), 1.3)) - torch.tensor([0.0, 0.0, 100.0])
+    assert frames.from_reference(behind).isnan().all()

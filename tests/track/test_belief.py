@@ -11,7 +11,7 @@ from quest.track.belief import Belief, update
 from quest.track.settings import TrackerConfig
 
 SIDE = 8
-CONFIG = TrackerConfig(move_sigma=0.15, jump=0.02)
+CONFIG = TrackerConfig(move_sigma=0.15, jump=0.02, temperature=1.5)
 
 
 def grid() -> Tensor:
@@ -55,7 +55,7 @@ def test_probabilities_sum_to_one():
 
 def test_the_first_frame_decides_alone():
     logits = torch.randn(2, SIDE * SIDE)
-    torch.testing.assert_close(step(None, logits).probability, logits.softmax(-1))
+    torch.testing.assert_close(step(None, logits).probability, (logits / CONFIG.temperature).softmax(-1))
 
 
 def test_against_a_plain_loop():
@@ -71,7 +71,7 @@ def test_against_a_plain_loop():
             [(uv[i] - uv[j]).norm() if j == 3 else (before.cell_point[i] - point[j]).norm() for j in range(n)]
         )
         prior += (1 - CONFIG.jump) * before.probability[0, i] * (-0.5 * (gap / CONFIG.move_sigma) ** 2).softmax(-1)
-    expected = (seen * logits[0].log_softmax(-1)).exp() * prior
+    expected = (seen * (logits[0] / CONFIG.temperature).log_softmax(-1)).exp() * prior
     torch.testing.assert_close(after.probability[0], expected / expected.sum(), rtol=1e-3, atol=1e-5)
 
 

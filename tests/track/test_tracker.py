@@ -118,7 +118,16 @@ def test_a_query_that_binds_counts_its_frame_once(clip: Clip):
         logits = tracker.network.head.logits(x, window.during(slice(-1, None)))[0, 0]
         for k, one in enumerate(stream._bound):
             assert one.belief is not None
-            torch.testing.assert_close(one.belief.probability[0], logits[k].softmax(-1), rtol=1e-3, atol=1e-6)
+            expected = (logits[k] / tracker.config.temperature).softmax(-1)
+            torch.testing.assert_close(one.belief.probability[0], expected, rtol=1e-3, atol=1e-6)
+
+
+def test_hidden_entities_are_held_where_they_were_seen(clip: Clip):
+    """With a threshold that nothing reaches, every entity stays at the point where it was bound."""
+    tracks = make_tracker(config=replace(EAGER, hold_below=1.0)).track(clip, POINTS)
+    np.testing.assert_allclose(tracks.point_world[-1], tracks.point_world[0], atol=1e-5)
+    free = make_tracker(config=replace(EAGER, hold_below=0.0)).track(clip, POINTS)
+    np.testing.assert_allclose(tracks.point_world[0], free.point_world[0], atol=1e-5)
 
 
 def test_equal_queries_get_equal_answers(clip: Clip):

@@ -1,0 +1,78 @@
+"""Settings are chosen on validation objects only, and remembering frames changes no answer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.evaluation import tuning
+from quest.evaluation.memory import remember_frames
+from quest.evaluation.tuning import Trial, discovery_bias, tune
+from quest.types import Query
+from tests.synthetic import make_take
+from tests.track.clips import make_tracker
+
+NAME = "panels-100001"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> TakeStore:
+    store = TakeStore(tmp_path_factory.mktemp("takes"))
+    store.write(make_take(frames=10, views=1, entities=2, size=(64, 64), seed=1, name=NAME))
+    return store
+
+
+def test_the_best_value_of_every_setting_is_kept(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(tuning, "GRID", {"jump": (0.001, 0.5), "hold_below": (0.0, 1.0)})
+    told: list[Trial] = []
+    tuned = tune(make_tracker(), store, {NAME: "validation"}, report=told.append)
+    assert list(tuned.trials) == told
+    assert [(t.name, t.value) for t in told] == [
+        ("jump", 0.001),
+        ("jump", 0.5),
+        ("hold_below", 0.0),
+        ("hold_below", 1.0),
+    ]
+    assert tuned.config.jump == min(told[:2], key=lambda t: t.ape).value
+    assert tuned.config.hold_below == min(told[2:], key=lambda t: t.ape).value
+    assert np.isfinite([t.ape for t in told]).all()
+
+
+def test_other_objects_than_validation_are_refused(store: TakeStore):
+    with pytest.raises(ConfigError, match="validation"):
+        tune(make_tracker(), store, {NAME: "test"}, report=lambda trial: None)
+    with pytest.raises(ConfigError, match="none"):
+        tune(make_tracker(), store, {}, report=lambda trial: None)
+
+
+def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
+    """Three candidates, of which the first and the last are entities: keeping all gives F1 = 4 / 5."""
+    take = store.read(NAME)
+    entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
+    labels = [take.info.entities[e].label for e in entities]
+    uv = take.views[0].uv_px[0, entities]
+    assert len(entities) == 2
+    places = np.stack([uv[0], np.array([-500.0, -500.0]), uv[1]])
+    monkeypatch.setattr(
+        tuning, "_slots", lambda tracker, take, view: (places, [labels[0], labels[0], labels[1]], [2.0, 1.0, -1.0])
+    )
+    bias, f1 = discovery_bias(make_tracker(), store, [NAME])
+    assert f1 == pytest.approx(4 / 5)
+    assert bias == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("capacity", [3, 100])
+def test_remembering_changes_nothing(store: TakeStore, tmp_path: Path, capacity: int):
+    clip = store.read_clip(NAME, 0)
+    queries = [Query.point(0, 20.0, 30.0)]
+    plain = make_tracker().track(clip, queries)
+    tracker = make_tracker()
+    remember_frames(tracker.network, capacity=capacity)
+    for _ in range(2):
+        again = tracker.track(clip, queries)
+        np.testing.assert_allclose(again.uv_px, plain.uv_px, atol=1e-4)
+        np.testing.assert_allclose(again.point_world, plain.point_world, atol=1e-5)
