@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -20,6 +19,7 @@ from quest.evaluation.selection import part_of, select_takes
 from quest.types import Take, TakeInfo
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take
+from tests.tiny import make_network
 
 
 def _take(seed: int, *, level: int = 1) -> Take:
@@ -108,7 +108,7 @@ def test_command_writes_what_it_prints(
     store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     oracle = Oracle(store.read("panels-100001-1"), name="quest", slots=(0, 1))
-    oracle.network = SimpleNamespace(encode=None, observe=None)
+    oracle.network = make_network()
     monkeypatch.setattr(quest, "load", lambda weights: oracle, raising=False)
     monkeypatch.setenv("COLUMNS", "200")
     out = tmp_path / "results.json"
