@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from quest.data.letterbox import Letterbox
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.memory import remember_frames
@@ -104,9 +105,9 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
     for name in names:
         take = store.read(name, frames=slice(0, 1))
         for view in range(len(take.views)):
-            found = _slots(tracker, take, view)
-            hit, count = _match(take, view, *found, size=tracker.network.config.encoder.image_size)
-            logits += found[2]
+            uv, labels, scores = _slots(tracker, take, view)
+            hit, count = _match(take, view, uv, labels, size=tracker.network.config.encoder.image_size)
+            logits += scores
             hits += hit
             present += count
     order = np.argsort(-np.array(logits))
@@ -125,21 +126,14 @@ def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[st
     return peaks.uv.cpu().numpy() * size, [LABELS[int(n)] for n in peaks.label], peaks.logit.tolist()
 
 
-def _match(
-    take: Take, view: int, uv: np.ndarray, labels: list[str], logits: list[float], *, size: int
-) -> tuple[list[bool], int]:
-    truth, camera = take.views[view], take.views[view].clip.camera
-    scale = size / max(camera.width, camera.height)
-    pad = (size - scale * np.array([camera.width, camera.height])) / 2
+def _match(take: Take, view: int, uv: np.ndarray, labels: list[str], *, size: int) -> tuple[list[bool], int]:
+    truth = take.views[view]
+    canvas = Letterbox(truth.clip.camera, size).to_canvas(truth.uv_px[0])
     entities = [e for e in take.tracked if truth.visible[0, e]]
     free = set(entities)
     hits = []
-    for place, label, _ in zip(uv, labels, logits, strict=True):
-        gap = {
-            e: float(np.linalg.norm(truth.uv_px[0, e] * scale + pad - place))
-            for e in free
-            if take.info.entities[e].label == label
-        }
+    for place, label in zip(uv, labels, strict=True):
+        gap = {e: float(np.linalg.norm(canvas[e] - place)) for e in free if take.info.entities[e].label == label}
         nearest = min(gap, key=lambda e: gap[e], default=None)
         hit = nearest is not None and gap[nearest] < _SLOT_RADIUS_PX
         hits.append(hit)
