@@ -68,7 +68,7 @@ def test_batch_elements_are_independent(config: NetworkConfig):
     network, frames = make_network(config), make_frames(config, batch=3)
     anchor = bound(network, frames)
     alone = FrameBatch(**{name: getattr(frames, name)[1:2] for name in FrameBatch.__dataclass_fields__})
-    got = answers(network, Anchor(anchor.content[1:2], anchor.valid[1:2]), alone)
+    got = answers(network, Anchor(anchor.content[1:2], anchor.template[1:2], anchor.valid[1:2]), alone)
     assert_same(got, {name: value[1:2] for name, value in answers(network, anchor, frames).items()})
 
 
@@ -77,7 +77,7 @@ def test_permuting_queries_permutes_answers(config: NetworkConfig):
     network, frames = make_network(config), make_frames(config)
     anchor = bound(network, frames)
     order = torch.randperm(anchor.valid.shape[1], generator=torch.Generator().manual_seed(3))
-    got = answers(network, Anchor(anchor.content[:, order], anchor.valid[:, order]), frames)
+    got = answers(network, Anchor(anchor.content[:, order], anchor.template[:, order], anchor.valid[:, order]), frames)
     assert_same(got, {name: value[:, :, order] for name, value in answers(network, anchor, frames).items()})
 
 
@@ -109,11 +109,9 @@ def test_padding_queries_influence_nobody():
     network, frames = make_network(), make_frames()
     anchor = bound(network, frames)
     expected = answers(network, anchor, frames)
-    padded = Anchor(
-        torch.cat((anchor.content, 10 * torch.randn(2, 4, DEFAULT.width)), dim=1),
-        torch.cat((anchor.valid, torch.zeros(2, 4, dtype=torch.bool)), dim=1),
-    )
-    got = answers(network, padded, frames)
+    size = anchor.template.shape[2:]
+    more = Anchor(10 * torch.randn(2, 4, DEFAULT.width), torch.randn(2, 4, *size), torch.zeros(2, 4, dtype=torch.bool))
+    got = answers(network, anchor.join(more), frames)
     assert_same({name: value[:, :, :3] for name, value in got.items()}, expected)
     assert all(v.isfinite().all() for n, v in got.items() if n != "point")
 
@@ -121,7 +119,8 @@ def test_padding_queries_influence_nobody():
 def test_nothing_but_padding_is_no_nan():
     network, frames = make_network(), make_frames()
     anchor = bound(network, frames)
-    assert answers(network, Anchor(anchor.content, torch.zeros_like(anchor.valid)), frames)["uv"].isfinite().all()
+    padding = replace(anchor, valid=torch.zeros_like(anchor.valid))
+    assert answers(network, padding, frames)["uv"].isfinite().all()
 
 
 @BOTH
@@ -167,15 +166,34 @@ def test_learned_queries_cannot_be_bound():
 
 
 def test_the_answer_lies_around_the_best_cell():
+    """The second look starts at the mean of the 3 x 3 cells and sees four close cells to every side."""
     network, frames = make_network(), make_frames()
     got = answers(network, bound(network, frames), frames)
     assert (got["peak"] == got["logits"].argmax(-1)).all()
     peak = torch.stack((got["peak"] % 8 + 0.5, got["peak"] // 8 + 0.5), dim=-1) / 8
     assert isinstance(network.head, HeatmapHead)
-    for parameter in network.head.offset[-1].parameters():
+    for parameter in network.head.look.out.parameters():
         torch.nn.init.zeros_(parameter)
     plain = answers(network, bound(network, frames), frames)
-    assert ((plain["uv"] - peak).abs() <= 1 / 8 + 1e-6).all()
+    assert ((plain["uv"] - peak).abs() <= (1 + 4.5 / 2) / 8 + 1e-6).all()
+
+
+def test_the_second_look_compares_with_the_anchor():
+    network, frames = make_network(), make_frames()
+    anchor = bound(network, frames)
+    other = replace(anchor, template=anchor.template.flip(0))
+    before, after = answers(network, anchor, frames), answers(network, other, frames)
+    assert (before["peak"] == after["peak"]).all()
+    assert not torch.allclose(before["uv"], after["uv"], atol=1e-5)
+
+
+def test_joints_have_unit_axes_and_bounded_spreads():
+    network, frames = make_network(), make_frames()
+    belief = network.joint(answers(network, bound(network, frames), frames)["embedding"])
+    for axis in (belief.slide_axis, belief.turn_axis):
+        torch.testing.assert_close(axis.norm(dim=-1), torch.ones(2, 4, 3))
+    assert belief.log_spread.shape == belief.foot.shape == (2, 4, 3, 3)
+    assert belief.log_spread.abs().max() <= 4
 
 
 def test_bilinear_samples_against_a_plain_loop():
@@ -206,7 +224,7 @@ def test_slots_are_peaks_best_first_and_apart():
     # Coordinates are clamped to the image after the comparison.
     inside = ((peaks.uv > 0) & (peaks.uv < 1)).all(-1)
     assert (gap[inside][:, inside] >= 1.5 * 8 - 1e-3).all()
-    logits, _ = network.affordance(observed)
+    logits, _ = network.affordance(observed.fine)
     assert peaks.logit[0] == logits.max()
 
 

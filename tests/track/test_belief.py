@@ -33,8 +33,17 @@ def peaked(*cells: int, height: float = 8.0) -> Tensor:
     return logits
 
 
-def step(belief: Belief | None, logits: Tensor, *, seen: float = 1.0, point: Tensor | None = None) -> Belief:
-    return update(belief, logits, torch.full((len(logits),), seen), plane() if point is None else point, grid(), CONFIG)
+def step(
+    belief: Belief | None,
+    logits: Tensor,
+    *,
+    seen: float = 1.0,
+    point: Tensor | None = None,
+    favour: Tensor | None = None,
+) -> Belief:
+    where = plane() if point is None else point
+    favour = torch.zeros_like(logits) if favour is None else favour
+    return update(belief, logits, torch.full((len(logits),), seen), where, grid(), favour, CONFIG)
 
 
 def best(belief: Belief) -> list[int]:
@@ -142,3 +151,13 @@ def test_settings_round_trip():
 def test_foreign_settings_are_refused(text: str):
     with pytest.raises(WeightsError):
         TrackerConfig.from_json(text)
+
+
+def test_what_else_is_known_decides_between_equals():
+    """Two cells look the same; the joint reaches only one of them."""
+    favour = torch.full((1, SIDE * SIDE), -4.0)
+    favour[0, 9] = 0.0
+    logits = torch.zeros(1, SIDE * SIDE)
+    logits[0, [9, 54]] = 8.0
+    belief = step(step(None, logits), logits, favour=favour)
+    assert best(belief) == [9]

@@ -124,9 +124,9 @@ def test_a_query_that_binds_counts_its_frame_once(clip: Clip):
 
 def test_hidden_entities_are_held_where_they_were_seen(clip: Clip):
     """With a threshold that nothing reaches, every entity stays at the point where it was bound."""
-    tracks = make_tracker(config=replace(EAGER, hold_below=1.0)).track(clip, POINTS)
+    tracks = make_tracker(config=replace(EAGER, hold_below=1.0, ground=False)).track(clip, POINTS)
     np.testing.assert_allclose(tracks.point_world[-1], tracks.point_world[0], atol=1e-5)
-    free = make_tracker(config=replace(EAGER, hold_below=0.0)).track(clip, POINTS)
+    free = make_tracker(config=replace(EAGER, hold_below=0.0, ground=False)).track(clip, POINTS)
     np.testing.assert_allclose(tracks.point_world[0], free.point_world[0], atol=1e-5)
 
 
@@ -358,3 +358,21 @@ def test_from_a_file(tmp_path: Path, clip: Clip):
 def test_devices_that_are_not_there(name: str):
     with pytest.raises(ConfigError, match="cpu"):
         pick_device(name)
+
+
+def test_an_answer_that_leaps_onto_what_came_is_not_seen(clip: Clip, monkeypatch: pytest.MonkeyPatch):
+    """A board comes before a still entity; the network, which would follow it, is not believed."""
+    assert clip.depth_m is not None
+    board = clip.depth_m.copy()
+    board[3:] = 0.4 * clip.depth_m[clip.depth_m > 0].min()
+    tracker = make_tracker()
+    assert isinstance(tracker.network.head, HeatmapHead)
+    final = tracker.network.head.judge[-1]
+    assert isinstance(final, torch.nn.Linear)
+    torch.nn.init.constant_(final.bias, 5.0)  # sure that everything is seen
+    monkeypatch.setattr("quest.track.stream._AFTER_ALL", 1.0)
+    believed = tracker.track(replace(clip, depth_m=board), POINTS)
+    monkeypatch.undo()
+    tracks = tracker.track(replace(clip, depth_m=board), POINTS)
+    assert believed.visible[3:].any()
+    assert not tracks.visible[3:].any()

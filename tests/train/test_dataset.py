@@ -33,7 +33,8 @@ def opened(tmp_path: Path, seeds: Sequence[int], validation: Sequence[int] = ())
 
 
 def objects(dataset: Dataset) -> tuple[list[str], list[str]]:
-    return dataset.training.objects, dataset.validation.objects
+    training, validation = (sorted({v.object_id for v in s.views}) for s in (dataset.training, dataset.validation))
+    return training, validation
 
 
 def test_one_store_is_divided_by_the_split(tmp_path: Path):

@@ -29,7 +29,7 @@ SHORT = TrainingConfig(
     steps=4, warmup_steps=2, learning_rate=1e-3, validate_every=2, validation_batches=1, precision="32-true"
 )
 
-GOLDEN_LOSSES = (12.5635, 11.7033, 12.3153, 13.1064)
+GOLDEN_LOSSES = (18.76897, 19.05974, 14.38138, 14.94760)
 """Of four steps of SHORT from make_network(): a change here is a change of the losses, the sampler or the network."""
 
 

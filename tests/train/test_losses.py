@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from quest.model.joint_head import JointBelief
 from quest.train import losses
 
 B, T, K, C = 2, 4, 3, 8
@@ -300,3 +302,45 @@ def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
     seen = torch.tensor([[True]])
     assert losses.affordance_loss(perfect, offset, uv, label, seen, cells=C) == pytest.approx(0, abs=1e-4)
     assert losses.affordance_loss(quiet, offset, uv, label, seen, cells=C) > 1
+
+
+def joints() -> tuple[JointBelief, Tensor, Tensor, Tensor, Tensor]:
+    """A belief, true points and axes, kinds and a mask."""
+    unit = torch.nn.functional.normalize
+    belief = JointBelief(
+        torch.randn(B, T, K),
+        unit(torch.randn(B, T, K, 3), dim=-1),
+        unit(torch.randn(B, T, K, 3), dim=-1),
+        torch.randn(B, T, K, 3),
+        torch.randn(B, T, K, 3),
+    )
+    axis = torch.cat((torch.randn(B, K, 3), unit(torch.randn(B, K, 3), dim=-1)), dim=-1)
+    return belief, torch.randn(B, T, K, 3), axis, torch.rand(B, K) < 0.5, some_mask()
+
+
+def test_joint_loss_against_a_plain_loop():
+    belief, point, axis, revolute, mask = joints()
+    expected = []
+    for b, t, k in mask.nonzero().tolist():
+        origin, direction = axis[b, k, :3], axis[b, k, 3:]
+        logit, spread = belief.revolute_logit[b, t, k], belief.log_spread[b, t, k]
+        value = math.log1p(math.exp(-logit if revolute[b, k] else logit))
+        used = belief.turn_axis if revolute[b, k] else belief.slide_axis
+        sine = math.sqrt(max(0.0, 1 - float(used[b, t, k] @ direction) ** 2))
+        log = float(spread[1] if revolute[b, k] else spread[0])
+        value += sine * math.exp(-log) + 2 * log
+        if revolute[b, k]:
+            foot = origin + ((point[b, t, k] - origin) @ direction) * direction
+            gap = float((belief.foot[b, t, k] - (foot - point[b, t, k])).norm())
+            value += gap * math.exp(-float(spread[2])) + 3 * float(spread[2])
+        expected.append(value)
+    assert float(losses.joint_loss(belief, point, axis, revolute, mask)) == pytest.approx(mean(expected), rel=1e-3)
+
+
+def test_joint_loss_does_not_know_the_sign_of_an_axis():
+    belief, point, axis, revolute, mask = joints()
+    flipped = replace(belief, slide_axis=-belief.slide_axis, turn_axis=-belief.turn_axis)
+    point[~mask] = math.nan
+    torch.testing.assert_close(
+        losses.joint_loss(belief, point, axis, revolute, mask), losses.joint_loss(flipped, point, axis, revolute, mask)
+    )

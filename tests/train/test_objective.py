@@ -177,5 +177,5 @@ def test_learned_queries_keep_their_slot_in_the_window(samplers):
 def test_prepared_views_keep_their_files(tmp_path: Path):
     """Windows read memory maps: nothing of a view is copied before it is drawn."""
     sampler = make_sampler(tmp_path, make_network(), seeds=(0,))
-    view = sampler.by_object["panels-0"][0]
+    view = next(v for v in sampler.views if v.object_id == "panels-0")
     assert isinstance(view.features, np.memmap)

@@ -128,7 +128,7 @@ def test_disturbances(views: list[CachedView]):
 
 def test_views_in_which_nothing_is_seen(views: list[CachedView]):
     blind = replace(views[0], visible=np.zeros_like(views[0].visible))
-    assert sampler([blind, views[1]]).objects == [views[1].object_id]
+    assert sampler([blind, views[1]]).views == [views[1]]
     with pytest.raises(ConfigError, match="visible"):
         sampler([blind])
 

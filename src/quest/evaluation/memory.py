@@ -15,7 +15,7 @@ def remember_frames(network: QuestNetwork, *, capacity: int) -> None:
 
     Args:
         network: changed in place.
-        capacity: frames to remember, 0.9 MB each; the oldest is forgotten first.
+        capacity: frames to remember, 1.6 MB each; the oldest is forgotten first.
     """
     encode, observe = network.encode, network.observe
     features: dict[bytes, Tensor] = {}

@@ -22,13 +22,12 @@ from quest.track import Tracker, TrackerConfig
 from quest.types import LABELS, Take
 
 GRID: dict[str, tuple[float, ...]] = {
-    "move_sigma": (0.06, 0.1, 0.16),
-    "jump": (0.00003, 0.0003, 0.003),
-    "temperature": (1.0, 2.0, 4.0),
-    "lift_tolerance": (0.0, 0.03, 0.08),
-    "hold_below": (0.0, 0.3, 0.5),
+    "hold_below": (0.3, 0.5),
+    "off_joint": (-2.0, -1.0),
+    "joint_sigma": (0.06, 0.1),
+    "point_sigma": (0.04, 0.06),
 }
-"""Values that are tried, in this order of settings."""
+"""Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
 _SLOT_RADIUS_PX = 16.0
 
@@ -84,9 +83,12 @@ def tune(
     remember_frames(tracker.network, capacity=10_000)
     bias, f1 = discovery_bias(tracker, store, list(takes))
     config = replace(config, slot_bias=bias)
+    known: dict[TrackerConfig, float] = {}
     for name, values in GRID.items():
-        scores = _scores(tracker, [replace(config, **{name: v}) for v in values], store, takes)
-        tried = [Trial(name, v, s) for v, s in zip(values, scores, strict=True)]
+        configs = [replace(config, **{name: v}) for v in values]
+        new = [c for c in configs if c not in known]
+        known |= zip(new, _scores(tracker, new, store, takes) if new else (), strict=True)
+        tried = [Trial(name, v, known[c]) for v, c in zip(values, configs, strict=True)]
         for trial in tried:
             report(trial)
         trials += tried

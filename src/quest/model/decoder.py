@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from quest.model.config import NetworkConfig
 from quest.model.layers import Attention, FeedForward, PointCode
-from quest.model.observation import Observation, Observer, cell_centres
+from quest.model.observation import Observation, Observer, cell_centres, gather_cells
+from quest.model.second_look import SecondLook
 from quest.types import LABELS
 
 
@@ -21,11 +22,21 @@ class Anchor:
 
     Attributes:
         content: embedding of the entity at the frame where it was bound.
+        template: what the close cells around it looked like there (none for learned queries).
         valid: False for padding queries, which nothing attends to.
     """
 
     content: Float[Tensor, "B K D"]
+    template: Float[Tensor, "B K M F"]
     valid: Bool[Tensor, "B K"]
+
+    def join(self, other: Anchor) -> Anchor:
+        """These queries and more."""
+        return Anchor(
+            torch.cat((self.content, other.content), dim=1),
+            torch.cat((self.template, other.template), dim=1),
+            torch.cat((self.valid, other.valid), dim=1),
+        )
 
 
 @dataclass(frozen=True)
@@ -52,7 +63,7 @@ class Prediction:
 
 
 class Binder(nn.Module):
-    """Makes an :class:`Anchor` from a pixel: its features, its 3D point, a label, and what surrounds it."""
+    """Makes an anchor's content from a pixel: its features, its 3D point, a label, and what surrounds it."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -71,16 +82,14 @@ class Binder(nn.Module):
         uv: Float[Tensor, "B K 2"],
         point: Float[Tensor, "B K 3"],
         label: Int[Tensor, "B K"],
-        valid: Bool[Tensor, "B K"],
-    ) -> Anchor:
-        """Bind queries at one frame.
+    ) -> Float[Tensor, "B K D"]:
+        """Content of the anchors of queries that are bound at one frame.
 
         Args:
             observed: that frame (T = 1).
             uv: where, in [0, 1]^2 of the input.
             point: lifted position in the reference frame, NaN if unknown.
             label: index into LABELS, or ``len(LABELS)`` if unknown.
-            valid: False for padding.
         """
         tokens = observed.tokens[:, 0]
         coarse = sample_grid(tokens, uv, self.config.encoder.grid)
@@ -91,7 +100,7 @@ class Binder(nn.Module):
         for attention, mlp in zip(self.context, self.mlp, strict=True):
             x = x + attention(x, tokens)
             x = x + mlp(x)
-        return Anchor(x, valid)
+        return x
 
 
 class DecoderLayer(nn.Module):
@@ -125,15 +134,14 @@ class DecoderLayer(nn.Module):
 
 
 class HeatmapHead(nn.Module):
-    """A score per cell, then a sub-cell offset and a 3D offset from the cells around the best one."""
+    """A score per cell, then a second look around the best one."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.config = config
         f = Observer.fine_width
         self.key = nn.Linear(config.width, f)
-        self.offset_query = nn.Linear(config.width, f)
-        self.offset = nn.Sequential(nn.Linear(2 * f, f), nn.GELU(), nn.Linear(f, 5))
+        self.look = SecondLook(config)
         self.judge = nn.Sequential(nn.Linear(config.width + f + 2, f), nn.GELU(), nn.Linear(f, 2))
 
     def logits(self, x: Float[Tensor, "B T K D"], observed: Observation) -> Float[Tensor, "B T K C"]:
@@ -143,50 +151,57 @@ class HeatmapHead(nn.Module):
     def refine(
         self,
         x: Float[Tensor, "B T K D"],
-        logits: Float[Tensor, "B T K C"],
+        anchor: Anchor,
+        scores: Float[Tensor, "B T K C"],
         observed: Observation,
         peak: Int[Tensor, "B T K"],
     ) -> tuple[Float[Tensor, "B T K 2"], Float[Tensor, "B T K 3"]]:
-        """Coordinates in [0, 1]^2 and reference point from the 3 x 3 cells around a peak."""
-        side, cell = self.config.cells, self.config.cell_px
+        """Coordinates in [0, 1]^2 and reference point, by a second look at the mean of 3 x 3 cells around a peak."""
+        side = self.config.cells
         step = torch.tensor([-1, 0, 1], device=peak.device)
         row = (peak.div(side, rounding_mode="floor")[..., None, None] + step[:, None]).clamp(0, side - 1)
         column = ((peak % side)[..., None, None] + step[None, :]).clamp(0, side - 1)
         index = (row * side + column).flatten(-2)
-        fine = _gather_cells(observed.fine, index)
-        query = self.offset_query(x).unsqueeze(-2).expand_as(fine)
-        offset = self.offset(torch.cat((query, fine), dim=-1)).float()
-        weight = logits.gather(-1, index).softmax(dim=-1).unsqueeze(-1)
+        weight = scores.detach().gather(-1, index).softmax(dim=-1).unsqueeze(-1)
         centre = cell_centres(self.config, device=peak.device)[index]
-        uv = (weight * (centre + cell * offset[..., :2])).sum(-2) / self.config.encoder.image_size
-        point = _gather_cells(observed.cell_point, index)
-        lifted = torch.isfinite(point).all(dim=-1, keepdim=True)
-        weight = weight * lifted
-        total = weight.sum(-2)
-        mean = (weight * (point.nan_to_num() + offset[..., 2:])).sum(-2) / total.clamp(min=1e-6)
-        return uv, torch.where(total > 1e-6, mean, torch.full_like(mean, torch.nan))
+        uv = (weight * centre).sum(-2) / self.config.encoder.image_size
+        return self.look(x, anchor.template, anchor.valid, observed, uv)
 
     def forward(
-        self, x: Float[Tensor, "B T K D"], observed: Observation, scores: Float[Tensor, "B T K C"] | None = None
+        self,
+        x: Float[Tensor, "B T K D"],
+        anchor: Anchor,
+        observed: Observation,
+        scores: Float[Tensor, "B T K C"] | None = None,
     ) -> Prediction:
         """Everything at the best cell.
 
         Args:
             x: the queries after the decoder.
+            anchor: what they are bound to.
             observed: the frames.
             scores: what decides on the best cell and weighs its neighbours; the logits if None.
         """
         logits = self.logits(x, observed)
         scores = logits if scores is None else scores
         peak = scores.argmax(dim=-1)
-        uv, point = self.refine(x, scores, observed, peak)
+        uv, point = self.refine(x, anchor, scores, observed, peak)
+        visible, right = self.confidences(x, logits, observed, peak).unbind(-1)
+        return Prediction(x, logits, peak, uv, point, visible, right)
+
+    def confidences(
+        self,
+        x: Float[Tensor, "B T K D"],
+        logits: Float[Tensor, "B T K C"],
+        observed: Observation,
+        peak: Int[Tensor, "B T K"],
+    ) -> Float[Tensor, "B T K 2"]:
+        """Logits of "seen" and "identity right" at a peak; they learn from the answer, the answer never from them."""
         log_p = logits.log_softmax(dim=-1)
         entropy = -(log_p.exp() * log_p).sum(-1, keepdim=True)
         at_peak = log_p.gather(-1, peak.unsqueeze(-1))
-        fine = _gather_cells(observed.fine, peak.unsqueeze(-1)).squeeze(-2)
-        # The confidences learn from the answer, the answer never from them.
-        judged = self.judge(torch.cat((x, fine, at_peak, entropy), dim=-1).detach()).float()
-        return Prediction(x, logits, peak, uv, point, judged[..., 0], judged[..., 1])
+        fine = gather_cells(observed.fine, peak.unsqueeze(-1)).squeeze(-2)
+        return self.judge(torch.cat((x, fine, at_peak, entropy), dim=-1).detach()).float()
 
 
 class RegressionHead(nn.Module):
@@ -220,9 +235,9 @@ class AffordanceHead(nn.Module):
         assert isinstance(final, nn.Linear)
         nn.init.constant_(final.bias[: len(LABELS)], -4.0)
 
-    def forward(self, observed: Observation) -> tuple[Float[Tensor, "B T C L"], Float[Tensor, "B T C 2"]]:
+    def forward(self, fine: Float[Tensor, "B T C F"]) -> tuple[Float[Tensor, "B T C L"], Float[Tensor, "B T C 2"]]:
         """Label logits, and the offset from the cell's centre in cells."""
-        out = self.mlp(observed.fine).float()
+        out = self.mlp(fine).float()
         return out[..., : len(LABELS)], out[..., len(LABELS) :]
 
 
@@ -232,9 +247,3 @@ def sample_grid(cells: Float[Tensor, "B N D"], uv: Float[Tensor, "B K 2"], side:
     place = (2 * uv - 1).unsqueeze(1).to(grid.dtype)
     sampled = F.grid_sample(grid, place, mode="bilinear", padding_mode="border", align_corners=False)
     return sampled.squeeze(2).transpose(1, 2)
-
-
-def _gather_cells(cells: Float[Tensor, "B T C D"], index: Int[Tensor, "B T K M"]) -> Float[Tensor, "B T K M D"]:
-    b, t, k, m = index.shape
-    flat = index.reshape(b, t, k * m, 1).expand(-1, -1, -1, cells.shape[-1])
-    return cells.gather(2, flat).reshape(b, t, k, m, -1)

@@ -35,7 +35,7 @@ def find_peaks(network: QuestNetwork, observed: Observation, *, radius_cells: fl
     A peak is the best of its 3 x 3 cells and label; of peaks of any label closer than ``radius_cells`` the best stays.
     """
     side, cell = network.config.cells, network.config.cell_px
-    logits, offset = network.affordance(observed)
+    logits, offset = network.affordance(observed.fine)
     scores = logits[0, 0].T.reshape(len(LABELS), side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
     flat = torch.where(is_peak, scores, -torch.inf).flatten()

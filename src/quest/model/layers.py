@@ -107,19 +107,21 @@ class DetailStem(nn.Module):
     Input channels: 3 colours, 3 coordinates in the reference frame, 1 whether depth is there.
     """
 
-    def __init__(self, fine_width: int, token_width: int) -> None:
+    def __init__(self, close_width: int, fine_width: int, token_width: int) -> None:
         super().__init__()
-        self.patchify = nn.Conv2d(7, 48, 4, 4)
-        self.norm1 = nn.GroupNorm(8, 48)
-        self.down = nn.Conv2d(48, fine_width, 3, 2, 1)
+        self.patchify = nn.Conv2d(7, close_width, 4, 4)
+        self.norm1 = nn.GroupNorm(8, close_width)
+        self.down = nn.Conv2d(close_width, fine_width, 3, 2, 1)
         self.norm2 = nn.GroupNorm(8, fine_width)
         self.mix = nn.Conv2d(fine_width, fine_width, 3, 1, 1)
         self.norm3 = nn.GroupNorm(8, fine_width)
         self.to_token = nn.Conv2d(fine_width, token_width, 2, 2)
 
-    def forward(self, image: Float[Tensor, "B 7 H W"]) -> tuple[Float[Tensor, "B F Hf Wf"], Float[Tensor, "B D Hp Wp"]]:
-        """Features at one eighth and one sixteenth of the resolution."""
-        x = F.gelu(self.norm1(self.patchify(image)))
-        x = F.gelu(self.norm2(self.down(x)))
+    def forward(
+        self, image: Float[Tensor, "B 7 H W"]
+    ) -> tuple[Float[Tensor, "B G Hc Wc"], Float[Tensor, "B F Hf Wf"], Float[Tensor, "B D Hp Wp"]]:
+        """Features at one fourth, one eighth and one sixteenth of the resolution."""
+        close = F.gelu(self.norm1(self.patchify(image)))
+        x = F.gelu(self.norm2(self.down(close)))
         x = x + F.gelu(self.norm3(self.mix(x)))
-        return x, self.to_token(x)
+        return close, x, self.to_token(x)

@@ -12,6 +12,7 @@ from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
 from quest.model.decoder import AffordanceHead, Anchor, Binder, DecoderLayer, HeatmapHead, Prediction, RegressionHead
 from quest.model.encoder import Encoder
+from quest.model.joint_head import JointHead
 from quest.model.observation import FrameBatch, Observation, Observer
 from quest.types import LABELS
 
@@ -36,6 +37,7 @@ class QuestNetwork(nn.Module):
         if config.queries == "anchored":
             self.head: HeatmapHead | RegressionHead = HeatmapHead(config)
             self.binder = Binder(config)
+            self.joint = JointHead(config.width)
             self.affordance = AffordanceHead()
         else:
             self.head = RegressionHead(config)
@@ -63,14 +65,16 @@ class QuestNetwork(nn.Module):
         Raises:
             ConfigError: the network's queries are learned slots, which cannot be bound to a pixel.
         """
-        if self.config.queries != "anchored":
+        if not isinstance(self.head, HeatmapHead):
             raise ConfigError(f"preset {self.config.preset!r}: learned queries cannot be bound to a pixel")
-        return self.binder(observed, uv, point, label, valid)
+        content = self.binder(observed, uv, point, label)
+        return Anchor(content, self.head.look.template(observed, uv), valid)
 
     def slots(self, batch: int) -> Anchor:
         """The learned queries, for networks that have them."""
         content = self.learned.expand(batch, -1, -1)
-        return Anchor(content, torch.ones(content.shape[:2], dtype=torch.bool, device=content.device))
+        valid = torch.ones(content.shape[:2], dtype=torch.bool, device=content.device)
+        return Anchor(content, content.new_zeros(*content.shape[:2], 0, 0), valid)
 
     def embed(self, anchor: Anchor, observed: Observation) -> Float[Tensor, "B T K D"]:
         """The queries after they looked at every frame of the window, oldest first."""
@@ -82,9 +86,10 @@ class QuestNetwork(nn.Module):
 
     def decode(self, anchor: Anchor, observed: Observation, frames: FrameBatch) -> Prediction:
         """Answers for every frame of the window; the last is the causal answer for the newest frame."""
-        prediction = self.head(self.embed(anchor, observed), observed)
-        if self.config.head == "heatmap":
-            return prediction
+        x = self.embed(anchor, observed)
+        if isinstance(self.head, HeatmapHead):
+            return self.head(x, anchor, observed)
+        prediction = self.head(x, observed)
         uv_px = prediction.uv * self.config.encoder.image_size
         return replace(prediction, point=frames.to_reference(uv_px, frames.depth_at(uv_px)))
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from quest.geometry import invert, transform
@@ -67,14 +67,19 @@ class FrameBatch:
         valid = depth_m > 0
         z = torch.where(valid, depth_m, torch.ones_like(depth_m))
         point = torch.stack(((uv_px[..., 0] - cx) / fx * z, (uv_px[..., 1] - cy) / fy * z, z), dim=-1)
-        point = transform(self.ref_from_cam[:, :, None], point)
+        # One matrix per frame times many points: far faster than a product per point.
+        point = point @ self.ref_from_cam[..., :3, :3].mT + self.ref_from_cam[..., None, :3, 3]
         point = (point - self.center[:, None, None]) / self.scale[:, None, None, None]
         return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
 
+    def to_camera(self, point: Float[Tensor, "B T Q 3"]) -> Float[Tensor, "B T Q 3"]:
+        """Points of the reference frame in each frame's camera, metres."""
+        metric = point * self.scale[:, None, None, None] + self.center[:, None, None]
+        return transform(invert(self.ref_from_cam)[:, :, None], metric)
+
     def from_reference(self, point: Float[Tensor, "B T Q 3"]) -> Float[Tensor, "B T Q 2"]:
         """Pixels of the input under points of the reference frame; NaN behind the camera."""
-        metric = point * self.scale[:, None, None, None] + self.center[:, None, None]
-        x, y, z = transform(invert(self.ref_from_cam)[:, :, None], metric).unbind(-1)
+        x, y, z = self.to_camera(point).unbind(-1)
         z = torch.where(z > 1e-6, z, torch.full_like(z, torch.nan))
         fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
         return torch.stack((fx * x / z + cx, fy * y / z + cy), dim=-1)
@@ -109,24 +114,37 @@ class Observation:
         tokens: one per patch, with position codes.
         fine: one per cell of the heatmap (no channels without a heatmap).
         cell_point: lifted point of each cell in the reference frame, NaN where depth is missing.
+        close: one per close cell, half as wide as the heatmap's (no channels without a heatmap).
+        close_point: lifted point of each close cell, NaN where depth is missing.
     """
 
     tokens: Float[Tensor, "B T N D"]
     fine: Float[Tensor, "B T C F"]
     cell_point: Float[Tensor, "B T C 3"]
+    close: Float[Tensor, "B T M G"]
+    close_point: Float[Tensor, "B T M 3"]
 
     def during(self, frames: slice) -> Observation:
         """Some of the frames."""
-        return Observation(self.tokens[:, frames], self.fine[:, frames], self.cell_point[:, frames])
+        return Observation(**{f.name: getattr(self, f.name)[:, frames] for f in fields(self)})
+
+    def of(self, batch: slice) -> Observation:
+        """Some of the batch."""
+        return Observation(**{f.name: getattr(self, f.name)[batch] for f in fields(self)})
 
     @staticmethod
     def stack(frames: list[Observation]) -> Observation:
         """Join observations along time."""
         return Observation(
-            torch.cat([f.tokens for f in frames], dim=1),
-            torch.cat([f.fine for f in frames], dim=1),
-            torch.cat([f.cell_point for f in frames], dim=1),
+            **{f.name: torch.cat([getattr(o, f.name) for o in frames], dim=1) for f in fields(Observation)}
         )
+
+
+def gather_cells(cells: Float[Tensor, "B T C D"], index: Int[Tensor, "B T K M"]) -> Float[Tensor, "B T K M D"]:
+    """Cells by their index."""
+    b, t, k, m = index.shape
+    flat = index.reshape(b, t, k * m, 1).expand(-1, -1, -1, cells.shape[-1])
+    return cells.gather(2, flat).reshape(b, t, k, m, -1)
 
 
 def cell_depth(depth_m: Float[Tensor, "B H W"], cell_px: int) -> Float[Tensor, "B Hc Wc"]:
@@ -161,6 +179,7 @@ class Observer(nn.Module):
     """Turns a :class:`FrameBatch` into an :class:`Observation`."""
 
     fine_width = 128
+    close_width = 48
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -173,7 +192,7 @@ class Observer(nn.Module):
         self.points = PointCode(d) if config.points3d else None
         if config.head == "heatmap":
             f = self.fine_width
-            self.stem = DetailStem(f, d)
+            self.stem = DetailStem(self.close_width, f, d)
             self.up = nn.Linear(d, 4 * f)
             self.fine_points = PointCode(f) if config.points3d else None
             self.fine_position = nn.Parameter(0.02 * torch.randn(config.cells**2, f))
@@ -187,10 +206,14 @@ class Observer(nn.Module):
         tokens = self.project(frames.features) + self.position
         cell_point = self._cell_points(frames)
         detail = None
+        close = close_point = tokens.new_zeros(b, t, 0, 3)
         if config.head == "heatmap":
-            fine_map, token_map = self.stem(self._detail_image(frames).flatten(0, 1))
-            tokens = tokens + token_map.flatten(2).transpose(1, 2).unflatten(0, (b, t))
-            detail = fine_map.flatten(2).transpose(1, 2).unflatten(0, (b, t))
+            image = self._detail_image(frames)
+            close, detail, token_detail = (
+                m.flatten(2).transpose(1, 2).unflatten(0, (b, t)) for m in self.stem(image.flatten(0, 1))
+            )
+            tokens = tokens + token_detail
+            close_point = self._close_points(frames)
         if self.points is not None:
             # The nearest of a patch's four cells: the one that a thin part would fill.
             quads = cell_point.reshape(b, t, grid, 2, grid, 2, 3).transpose(3, 4).flatten(4, 5)
@@ -202,13 +225,24 @@ class Observer(nn.Module):
             flat = layer(flat)
         flat = self.norm(flat)
         if detail is None:
-            return Observation(flat.unflatten(0, (b, t)), flat.new_zeros(b, t, side * side, 0), cell_point)
+            fine = flat.new_zeros(b, t, side * side, 0)
+            return Observation(flat.unflatten(0, (b, t)), fine, cell_point, close, close_point)
         up = self.up(flat).reshape(b * t, grid, grid, 2, 2, -1).transpose(2, 3).reshape(b, t, side * side, -1)
         fine = detail + up + self.fine_position
         if self.fine_points is not None:
             fine = fine + self.fine_points(cell_point)
         fine = self.fine_norm(fine + self.fine_mlp(fine))
-        return Observation(flat.unflatten(0, (b, t)), fine, cell_point)
+        return Observation(flat.unflatten(0, (b, t)), fine, cell_point, close, close_point)
+
+    def _close_points(self, frames: FrameBatch) -> Float[Tensor, "B T M 3"]:
+        """Lifted points of the close cells, each by its nearest pixel."""
+        b, t = frames.depth_m.shape[:2]
+        side = self.config.cell_px // 2
+        depth = frames.depth_m.flatten(0, 1).unsqueeze(1)
+        near = -F.max_pool2d(torch.where(depth > 0, -depth, -torch.inf), side)
+        near = torch.where(torch.isfinite(near), near, 0.0).reshape(b, t, -1)
+        centre = grid_centres(2 * self.config.cells, side, device=depth.device).expand(b, t, -1, -1)
+        return frames.to_reference(centre, near)
 
     def _cell_points(self, frames: FrameBatch) -> Float[Tensor, "B T C 3"]:
         b, t = frames.features.shape[:2]
@@ -222,8 +256,8 @@ class Observer(nn.Module):
         b, t, h, w = frames.depth_m.shape
         y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
         uv = torch.stack((x, y), dim=-1).to(frames.depth_m).reshape(1, 1, h * w, 2).expand(b, t, -1, -1)
-        point = frames.to_reference(uv, frames.depth_m.flatten(2))
-        valid = torch.isfinite(point[..., :1])
+        depth = frames.depth_m.flatten(2)
+        point, valid = frames.to_reference(uv, depth), (depth > 0).unsqueeze(-1)
         point = torch.where(valid, point, torch.zeros_like(point)).clamp(-4, 4)
         geometry = torch.cat((point, valid.to(point.dtype)), dim=-1).transpose(2, 3).reshape(b, t, 4, h, w)
         return torch.cat((rgb, geometry), dim=2)
@@ -231,6 +265,11 @@ class Observer(nn.Module):
 
 def cell_centres(config: NetworkConfig, *, device: torch.device | None = None) -> Float[Tensor, "C 2"]:
     """Centre pixel of every cell of the heatmap, row by row."""
-    side = (torch.arange(config.cells, device=device) + 0.5) * config.cell_px
+    return grid_centres(config.cells, config.cell_px, device=device)
+
+
+def grid_centres(cells: int, cell_px: int, *, device: torch.device | None = None) -> Float[Tensor, "C 2"]:
+    """Centre pixel of every cell of a square grid, row by row."""
+    side = (torch.arange(cells, device=device) + 0.5) * cell_px
     y, x = torch.meshgrid(side, side, indexing="ij")
     return torch.stack((x, y), dim=-1).reshape(-1, 2)

@@ -37,6 +37,7 @@ def update(
     seen: Float[Tensor, " K"],
     cell_point: Float[Tensor, "C 3"],
     cell_uv: Float[Tensor, "C 2"],
+    favour: Float[Tensor, "K C"],
     config: TrackerConfig,
 ) -> Belief:
     """One step of the recursion.
@@ -47,6 +48,7 @@ def update(
         seen: probability that each entity is seen, by which the frame's scores are trusted.
         cell_point: the newest frame's lifted cells.
         cell_uv: the cells' centres in [-1, 1]^2, which stand in where depth is missing.
+        favour: log weights of the cells by what else is known, the joint.
         config: how far things move.
     """
     likelihood = (logits / config.temperature).log_softmax(dim=-1)
@@ -55,7 +57,7 @@ def update(
     move = _move(belief.cell_point, cell_point, cell_uv, config.move_sigma)
     prior = (1 - config.jump) * (belief.probability @ move) + config.jump / likelihood.shape[-1]
     # A hidden entity's scores say little about where it is.
-    posterior = (seen.clamp(0.1, 1.0).unsqueeze(-1) * likelihood + prior.log()).softmax(dim=-1)
+    posterior = (seen.clamp(0.1, 1.0).unsqueeze(-1) * likelihood + favour + prior.log()).softmax(dim=-1)
     return Belief(posterior, cell_point)
 
 

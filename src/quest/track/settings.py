@@ -19,6 +19,13 @@ class TrackerConfig:
         lift_tolerance: largest distance between the lifted pixel and the predicted point for the pixel's depth to
             be taken, reference units; beyond it the pixel lies on something before or behind the entity.
         hold_below: probability of being seen below which an entity is held where it was last seen.
+        ground: whether queries are grounded in the motion of their joint.
+        point_sigma: standard deviation of a seen point per coordinate, reference units.
+        joint_sigma: how far from its joint's curve a cell of the entity may lie, reference units.
+        off_joint: log weight of cells that the joint does not reach, which lets a wrong joint recover.
+        along_sigma: how far a hidden entity moves along its joint between frames, reference units (twice that in
+            radians).
+        hidden_trust: how much the heatmap says of a hidden entity's place along its joint.
         slot_bias: added to the affordance logit, so that slots worth keeping have a confidence above one half.
         slot_gain: multiplies the affordance logit.
         slot_threshold: probability above which discovery takes a slot.
@@ -30,7 +37,13 @@ class TrackerConfig:
     jump: float = 0.0003
     temperature: float = 2.0
     lift_tolerance: float = 0.08
-    hold_below: float = 0.5
+    hold_below: float = 0.3
+    ground: bool = True
+    point_sigma: float = 0.04
+    joint_sigma: float = 0.1
+    off_joint: float = -2.0
+    along_sigma: float = 0.03
+    hidden_trust: float = 0.5
     slot_bias: float = 0.0
     slot_gain: float = 1.0
     slot_threshold: float = 0.5

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, UInt8
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from quest.data.letterbox import Letterbox
@@ -19,39 +19,16 @@ from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
 from quest.track.belief import Belief, update
+from quest.track.evidence import Evidence
+from quest.track.grounded import Ground, joint_rows
+from quest.track.lifting import lift_near
 from quest.track.settings import TrackerConfig
+from quest.track.state import StreamState
 from quest.types import LABELS, Camera, Frame, Query, State
 
 _LOST_BELOW = 0.3
-
-
-@dataclass(frozen=True)
-class StreamState:
-    """Answers for one frame; K grows when queries bind.
-
-    Attributes:
-        names: name per query.
-        labels: label per query, or None.
-        uv_px: pixel in the source frame.
-        point_world: world point in metres, NaN where it cannot be lifted.
-        confidence: probability that the identity is right.
-        visible: whether the entity is seen.
-        state: :class:`~quest.types.State` per query.
-        stamp_s: the frame's time.
-        has_depth: whether the frame brought any depth.
-        query: which of the queries, in the order in which they were asked, each row answers; discovered slots count up.
-    """
-
-    names: tuple[str, ...]
-    labels: tuple[str | None, ...]
-    uv_px: Float32[np.ndarray, "K 2"]
-    point_world: Float32[np.ndarray, "K 3"]
-    confidence: Float32[np.ndarray, " K"]
-    visible: Bool[np.ndarray, " K"]
-    state: tuple[State, ...]
-    stamp_s: float
-    has_depth: bool
-    query: tuple[int, ...]
+_LEAP = 0.12
+_AFTER_ALL = 0.2
 
 
 @dataclass
@@ -62,6 +39,7 @@ class _Bound:
     name: str
     label: str | None
     slot: int | None
+    ground: Ground
     belief: Belief | None = None
     last_seen: Tensor | None = None
 
@@ -189,6 +167,7 @@ class Stream:
             self._ring.clear()
             for bound in self._bound:
                 bound.belief = bound.last_seen = None
+                bound.ground = Ground(self._config)
         ref_pose, center, scale = self._reference
         return FrameBatch(
             features=network.encode(image[None])[:, None].float(),
@@ -215,8 +194,11 @@ class Stream:
             label = torch.tensor([LABELS.index(q.label) if q.label else UNKNOWN_LABEL for _, q in due])
             self._join(observed, frames, uv, label)
             for i, query in due:
-                self._bound.append(_Bound(i, query.name or f"point {i}", query.label, None))
+                self._bound.append(self._start(i, query.name or f"point {i}", query.label))
                 self._waiting.remove((i, query))
+
+    def _start(self, query: int, name: str, label: str | None, slot: int | None = None) -> _Bound:
+        return _Bound(query, name, label, slot, Ground(self._config))
 
     def _due(self) -> list[tuple[int, Query]]:
         return [(i, q) for i, q in self._waiting if q.kind == "point" and q.frame == self._t]
@@ -229,13 +211,13 @@ class Stream:
         bound: list[_Bound] = []
         if self._discover_all:
             good = [i for i, e in enumerate(existence) if e > config.slot_threshold]
-            bound = [_Bound(n, f"{found[i]} {n}", found[i], i) for n, i in enumerate(good)]
+            bound = [self._start(n, f"{found[i]} {n}", found[i], i) for n, i in enumerate(good)]
         for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
             used = {b.slot for b in bound}
             fits = [i for i, label in enumerate(found) if i not in used and query.label in (None, label)]
             if fits and existence[fits[0]] > config.prompt_threshold:
                 slot = fits[0]
-                bound.append(_Bound(n, query.name or f"{found[slot]} {n}", found[slot], slot))
+                bound.append(self._start(n, query.name or f"{found[slot]} {n}", found[slot], slot))
                 self._waiting.remove((n, query))
         if bound:
             index = torch.tensor([b.slot for b in bound])
@@ -249,10 +231,7 @@ class Stream:
         point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
         valid = torch.ones(label.shape, dtype=torch.bool, device=self._device)
         anchor = self._network.bind(observed, uv, point, label, valid)
-        if self._anchor is not None:
-            content = torch.cat((self._anchor.content, anchor.content), dim=1)
-            anchor = Anchor(content, torch.cat((self._anchor.valid, anchor.valid), dim=1))
-        self._anchor = anchor
+        self._anchor = anchor if self._anchor is None else self._anchor.join(anchor)
 
     def _bind_learned(self, frames: FrameBatch) -> None:
         """Learned queries are there from the start; a point is answered by the slot nearest to it when it is asked."""
@@ -261,13 +240,13 @@ class Stream:
         if self._t == 0:
             label = self._network.learned_label(self._anchor.content)[0].argmax(dim=-1)
             if self._discover_all:
-                self._bound = [_Bound(i, f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
+                self._bound = [self._start(i, f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
             for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
                 used = {b.slot for b in self._bound}
                 fits = [i for i, k in enumerate(label) if i not in used and query.label in (None, LABELS[int(k)])]
                 if fits:
                     slot = fits[0]
-                    self._bound.append(_Bound(n, query.name or f"slot {slot}", LABELS[int(label[slot])], slot))
+                    self._bound.append(self._start(n, query.name or f"slot {slot}", LABELS[int(label[slot])], slot))
                     self._waiting.remove((n, query))
         due = self._due()
         if due:
@@ -278,7 +257,7 @@ class Stream:
                     prediction.uv
                 )
                 slot = int((prediction.uv[0, -1] - uv).norm(dim=-1).argmin())
-                self._bound.append(_Bound(i, query.name or f"point {i}", query.label, slot))
+                self._bound.append(self._start(i, query.name or f"point {i}", query.label, slot))
                 self._waiting.remove((i, query))
 
     def _answer(self, frames: FrameBatch, stamp_s: float, has_depth: bool) -> StreamState:
@@ -291,7 +270,10 @@ class Stream:
             x = self._network.embed(self._anchor, window)[:, -1:]
             newest = window.during(slice(-1, None))
             prediction = self._track_cells(head, x, newest)
-            uv, point = self._hold(prediction, self._lift(prediction, frames), frames)
+            place = self._ground if self._config.ground else self._hold
+            prediction, uv, point = place(
+                prediction, lift_near(prediction, frames, self._config.lift_tolerance), frames
+            )
         else:
             prediction = self._network.decode(self._anchor, window.during(slice(-1, None)), frames)
             index = torch.tensor([b.slot for b in self._bound])
@@ -320,12 +302,16 @@ class Stream:
 
     def _track_cells(self, head: HeatmapHead, x: Tensor, newest: Observation) -> Prediction:
         """Fuse the newest heatmap with the belief and answer at the best cell."""
-        free = head(x, newest)
-        logits, seen = free.logits, free.visible_logit[0, 0].sigmoid()
+        assert self._anchor is not None
+        logits = head.logits(x, newest)
+        seen = head.confidences(x, logits, newest, logits.argmax(dim=-1))[0, 0, :, 0].sigmoid()
         cell_point = newest.cell_point[0, 0].float()
         size = self._network.config.encoder.image_size
         cell_uv = 2 * cell_centres(self._network.config, device=logits.device) / size - 1
-        posterior = torch.empty_like(logits[0, 0])
+        posterior, favour = torch.empty_like(logits[0, 0]), torch.zeros_like(logits[0, 0])
+        if self._config.ground:
+            place = cell_point.cpu().numpy()
+            favour = torch.from_numpy(np.stack([b.ground.favour(place) for b in self._bound])).to(logits)
         # Queries that have just bound have no belief yet; those of all others live on the previous frame's cells.
         fresh_rows = [i for i, b in enumerate(self._bound) if b.belief is None]
         known_rows = [i for i, b in enumerate(self._bound) if b.belief is not None]
@@ -333,18 +319,18 @@ class Stream:
             if not rows:
                 continue
             before = None if fresh else self._joint_belief(rows)
-            after = update(before, logits[0, 0, rows], seen[rows], cell_point, cell_uv, self._config)
+            after = update(before, logits[0, 0, rows], seen[rows], cell_point, cell_uv, favour[rows], self._config)
             posterior[rows] = after.probability
             for row, probability in zip(rows, after.probability, strict=True):
                 self._bound[row].belief = Belief(probability[None], cell_point)
         fused = posterior.clamp(min=1e-12).log()[None, None]
-        return head(x, newest, fused)
+        return head(x, self._anchor, newest, fused)
 
     def _joint_belief(self, rows: list[int]) -> Belief:
         beliefs = [b for b in (self._bound[i].belief for i in rows) if b is not None]
         return Belief(torch.cat([b.probability for b in beliefs]), beliefs[0].cell_point)
 
-    def _hold(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Tensor, Tensor]:
+    def _hold(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Prediction, Tensor, Tensor]:
         """Pixels and points, those of hidden entities where they were last seen."""
         seen = prediction.visible_logit[0, 0].sigmoid() >= self._config.hold_below
         for k, bound in enumerate(self._bound):
@@ -353,29 +339,39 @@ class Stream:
         held = torch.stack([b.last_seen for b in self._bound if b.last_seen is not None])
         uv = frames.from_reference(held[None, None])[0, 0] / self._network.config.encoder.image_size
         keep = seen | ~torch.isfinite(uv).all(dim=-1)
-        return torch.where(keep.unsqueeze(-1), prediction.uv[0, 0], uv), torch.where(keep.unsqueeze(-1), point, held)
+        uv = torch.where(keep.unsqueeze(-1), prediction.uv[0, 0], uv)
+        return prediction, uv, torch.where(keep.unsqueeze(-1), point, held)
 
-    def _lift(self, prediction: Prediction, frames: FrameBatch) -> Tensor:
-        """The lifted pixel where it agrees with the predicted point, else the predicted point.
+    def _ground(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Prediction, Tensor, Tensor]:
+        """Pixels and points, drawn towards their joints; those of hidden entities by their joints alone.
 
-        At a depth edge the pixel may lie on what is before or behind the entity; of the pixels around it the one
-        nearest to the predicted depth is taken.
+        Where something came before the place of an entity that stood still and the answer leapt, it leapt onto what
+        came: the entity is behind it, and the prediction's visibility is taken back.
         """
-        size, predicted = self._network.config.encoder.image_size, prediction.point[0, 0].float()
-        uv_px = prediction.uv * size
-        step = torch.arange(-2.0, 3.0, device=uv_px.device)
-        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(1, 1, 1, 25, 2)
-        k = uv_px.shape[2]
-        pixels = (uv_px.unsqueeze(-2) + around).reshape(1, 1, k * 25, 2)
-        depth = frames.depth_at(pixels)
-        # Depth is taken from a neighbour, the ray from the pixel itself.
-        rays = uv_px.unsqueeze(-2).expand(1, 1, k, 25, 2).reshape(1, 1, k * 25, 2)
-        lifted = frames.to_reference(rays, depth).reshape(k, 25, 3)
-        gap = (lifted - predicted[:, None]).norm(dim=-1).nan_to_num(torch.inf)
-        best = gap.argmin(dim=-1)
-        chosen = lifted[torch.arange(k), best]
-        agrees = gap[torch.arange(k), best] < self._config.lift_tolerance
-        return torch.where(agrees.unsqueeze(-1), chosen, predicted)
+        joints = joint_rows(self._network.joint(prediction.embedding))
+        seen, right = prediction.visible_logit[0, 0].sigmoid(), prediction.right_logit[0, 0].sigmoid()
+        log_p = prediction.logits[0, 0].log_softmax(dim=-1)
+        placed = point.clone()
+        for k, bound in enumerate(self._bound):
+            own = point[k].cpu().double().numpy()
+            evidence = Evidence(frames, log_p[k], self._network.config)
+            before = None if bound.last_seen is None else bound.last_seen.cpu().double().numpy()
+            if before is not None and bound.ground.still and evidence.covers(before):
+                leapt = not np.linalg.norm(own - before) < _LEAP
+                seen[k] = seen[k].clamp(max=_AFTER_ALL) if leapt else seen[k]
+            if before is None or seen[k] >= self._config.hold_below:
+                if not np.isfinite(own).all():
+                    continue
+                if right[k] >= _LOST_BELOW:
+                    bound.ground.see(own, joints[k])
+                own = bound.ground.settle(own)
+            else:
+                own = bound.ground.hide(before, own, float(seen[k]), evidence.score, evidence.room)
+            placed[k] = torch.from_numpy(own).to(placed)
+            bound.last_seen = placed[k]
+        uv = frames.from_reference(placed[None, None])[0, 0] / self._network.config.encoder.image_size
+        uv = torch.where(torch.isfinite(uv).all(dim=-1, keepdim=True), uv, prediction.uv[0, 0])
+        return replace(prediction, visible_logit=seen.logit()[None, None]), uv, placed
 
     def _to_world(self, point: Tensor, has_depth: bool) -> Float32[np.ndarray, "K 3"]:
         assert self._reference is not None

@@ -12,7 +12,8 @@ from quest.errors import ConfigError, InputError
 from quest.model.network import QuestNetwork
 from quest.model.weights import load_network
 from quest.track.settings import TrackerConfig
-from quest.track.stream import Stream, StreamState
+from quest.track.state import StreamState
+from quest.track.stream import Stream
 from quest.types import Camera, Clip, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"

@@ -32,17 +32,16 @@ _DEPTH_UNIT_M = 1e-4
 
 @dataclass(frozen=True)
 class CachedView:
-    """One view of a take as the network takes it; arrays are memory maps.
+    """One view of a take as the network takes it.
+
+    What is large is opened as a memory map at every access, so that a view costs no open file: a day's rendering has
+    more views than a process may have files.
 
     Attributes:
-        name: take and view.
+        folder: where its arrays are.
         object_id: the object in it.
         camera: intrinsics of the letterboxed input.
         half_diagonal_m: metres per normalised unit.
-        features: tokens of the encoder.
-        rgb: letterboxed colours.
-        depth: letterboxed depth in units of 0.1 mm, 0 where missing.
-        cell_depth_m: near depth of each cell.
         cam_from_world: pose of each frame.
         uv_px: true pixel of the letterboxed input, per tracked entity.
         visible: whether the entity is seen.
@@ -52,14 +51,10 @@ class CachedView:
         axis_world: origin and direction of the joint's axis at rest.
     """
 
-    name: str
+    folder: Path
     object_id: str
     camera: Camera
     half_diagonal_m: float
-    features: Float16[np.ndarray, "T N E"]
-    rgb: UInt8[np.ndarray, "T S S 3"]
-    depth: UInt16[np.ndarray, "T S S"]
-    cell_depth_m: Float32[np.ndarray, "T C C"]
     cam_from_world: Float32[np.ndarray, "T 4 4"]
     uv_px: Float32[np.ndarray, "T K 2"]
     visible: Bool[np.ndarray, "T K"]
@@ -69,12 +64,39 @@ class CachedView:
     axis_world: Float32[np.ndarray, "K 6"]
 
     def __len__(self) -> int:
-        return len(self.rgb)
+        return len(self.visible)
+
+    @property
+    def name(self) -> str:
+        """Take and view."""
+        return self.folder.name
+
+    @property
+    def features(self) -> Float16[np.ndarray, "T N E"]:
+        """Tokens of the encoder."""
+        return self._map("features")
+
+    @property
+    def rgb(self) -> UInt8[np.ndarray, "T S S 3"]:
+        """Letterboxed colours."""
+        return self._map("rgb")
+
+    @property
+    def depth(self) -> UInt16[np.ndarray, "T S S"]:
+        """Letterboxed depth in units of 0.1 mm, 0 where missing."""
+        return self._map("depth")
+
+    @property
+    def cell_depth_m(self) -> Float32[np.ndarray, "T C C"]:
+        """Near depth of each cell."""
+        return self._map("cell_depth_m")
+
+    def _map(self, name: str) -> np.ndarray:
+        return np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
 
 
-_ARRAYS = tuple(
-    f for f in CachedView.__dataclass_fields__ if f not in {"name", "object_id", "camera", "half_diagonal_m"}
-)
+_MAPPED = ("features", "rgb", "depth", "cell_depth_m")
+_READ = ("cam_from_world", "uv_px", "visible", "point_world", "label", "revolute", "axis_world")
 
 
 class FeatureCache:
@@ -172,7 +194,7 @@ class FeatureCache:
         for stale in (partial, entry):
             shutil.rmtree(stale, ignore_errors=True)
         partial.mkdir()
-        for name in _ARRAYS:
+        for name in _MAPPED + _READ:
             np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
         (partial / "meta.json").write_text(json.dumps(meta))
         partial.rename(entry)
@@ -180,9 +202,9 @@ class FeatureCache:
 
     def _open(self, entry: Path) -> CachedView:
         meta = json.loads((entry / "meta.json").read_text())
-        arrays = {name: np.load(entry / f"{name}.npy", mmap_mode="r", allow_pickle=False) for name in _ARRAYS}
+        arrays = {name: np.load(entry / f"{name}.npy", allow_pickle=False) for name in _READ}
         return CachedView(
-            name=entry.name,
+            folder=entry,
             object_id=meta["object_id"],
             camera=Camera(**meta["camera"]),
             half_diagonal_m=meta["half_diagonal_m"],

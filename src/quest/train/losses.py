@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from quest.model.joint_head import JointBelief
 from quest.types import LABELS
 
 
@@ -21,11 +22,11 @@ def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Ten
 
 
 def coordinate_loss(
-    uv: Float[Tensor, "*B 2"], target: Float[Tensor, "*B 2"], mask: Bool[Tensor, "*B"]
+    uv: Float[Tensor, "*B 2"], target: Float[Tensor, "*B 2"], weight: Float[Tensor, "*B"] | Bool[Tensor, "*B"]
 ) -> Float[Tensor, ""]:
     """L_aff: Huber loss of coordinates in [0, 1]^2, quadratic below 0.01."""
-    target = torch.where(mask.unsqueeze(-1), target, uv.detach())
-    return masked_mean(F.huber_loss(uv, target, reduction="none", delta=0.01).sum(-1) / 0.01, mask)
+    target = torch.where((weight > 0).unsqueeze(-1), target, uv.detach())
+    return masked_mean(F.huber_loss(uv, target, reduction="none", delta=0.01).sum(-1) / 0.01, weight)
 
 
 def heatmap_loss(
@@ -53,12 +54,14 @@ def point_loss(
     point: Float[Tensor, "B T K 3"],
     target: Float[Tensor, "B T K 3"],
     unit: Float[Tensor, " B"],
-    mask: Bool[Tensor, "B T K"],
+    weight: Float[Tensor, "B T K"] | Bool[Tensor, "B T K"],
 ) -> Float[Tensor, ""]:
     """Huber loss of the 3D distance in normalised units, linear above 0.05."""
-    mask = mask & torch.isfinite(point).all(-1) & torch.isfinite(target).all(-1)
-    error = torch.where(mask.unsqueeze(-1), point - target, torch.zeros_like(point)) / unit[:, None, None, None]
-    return masked_mean(F.huber_loss(error, torch.zeros_like(error), reduction="none", delta=0.05).sum(-1) / 0.05, mask)
+    weight = weight * (torch.isfinite(point).all(-1) & torch.isfinite(target).all(-1))
+    error = torch.where((weight > 0).unsqueeze(-1), point - target, torch.zeros_like(point))
+    error = error / unit[:, None, None, None]
+    loss = F.huber_loss(error, torch.zeros_like(error), reduction="none", delta=0.05).sum(-1) / 0.05
+    return masked_mean(loss, weight)
 
 
 def difference_loss(
@@ -139,6 +142,45 @@ def manifold_loss(
     line = (offset - along * direction).square().sum(-1).clamp(min=1e-8).sqrt()
     distance = torch.where(revolute[:, None], circle, line) / unit[:, None, None]
     return masked_mean(distance.clamp(max=0.5), mask)
+
+
+def joint_loss(
+    belief: JointBelief,
+    point: Float[Tensor, "B T K 3"],
+    axis: Float[Tensor, "B K 6"],
+    revolute: Bool[Tensor, "B K"],
+    mask: Bool[Tensor, "B T K"],
+) -> Float[Tensor, ""]:
+    """Negative log likelihood of an entity's joint: its kind, and the direction and place of its axis.
+
+    Errors are Laplace-like with a spread that the network predicts; a direction has two degrees of freedom, a place
+    three. Axes have no sign.
+
+    Args:
+        belief: what the network believes.
+        point: true positions in the reference frame.
+        axis: true origin and unit direction of the joint.
+        revolute: whether the joint turns.
+        mask: which beliefs count.
+    """
+    revolute = revolute[:, None].expand_as(mask)
+    origin, direction = axis[:, None, :, :3], axis[:, None, :, 3:]
+    kind = F.binary_cross_entropy_with_logits(belief.revolute_logit, revolute.float(), reduction="none")
+
+    def likelihood(error: Tensor, log_spread: Tensor, freedom: int) -> Tensor:
+        return error * (-log_spread).exp() + freedom * log_spread
+
+    def sine(predicted: Tensor) -> Tensor:
+        return torch.linalg.cross(predicted, direction.expand_as(predicted)).square().sum(-1).clamp(min=1e-8).sqrt()
+
+    slide_spread, turn_spread, foot_spread = belief.log_spread.unbind(-1)
+    slide = likelihood(sine(belief.slide_axis), slide_spread, 2)
+    known = torch.where(mask.unsqueeze(-1), point, origin)
+    offset = known - origin
+    foot = (offset * direction).sum(-1, keepdim=True) * direction - offset
+    gap = (belief.foot - foot).square().sum(-1).clamp(min=1e-8).sqrt()
+    turn = likelihood(sine(belief.turn_axis), turn_spread, 2) + likelihood(gap, foot_spread, 3)
+    return masked_mean(kind + torch.where(revolute, turn, slide), mask & torch.isfinite(known).all(-1))
 
 
 def affordance_loss(

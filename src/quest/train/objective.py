@@ -19,6 +19,7 @@ from quest.train.settings import LossWeights
 from quest.train.windows import WindowTruth
 
 _OCCLUDED_WEIGHT = 0.3
+_MOVED_WEIGHT = 3.0
 _RIGHT_DISTANCE = 0.1
 _CONFIDENT_PX = 8.0
 
@@ -37,6 +38,7 @@ class LossTerms:
     feat: Tensor
     geo: Tensor
     map: Tensor
+    joint: Tensor
 
     def total(self, weights: LossWeights) -> Tensor:
         """Weighted sum."""
@@ -57,6 +59,7 @@ class Rollout:
         mask: which answers count at all.
         observed: the window's observation.
         anchor_observed: the anchor frame's observation.
+        anchor: what the queries are bound to.
         content: the query that answers for each entity, before the decoder.
     """
 
@@ -68,6 +71,7 @@ class Rollout:
     mask: Bool[Tensor, "B T K"]
     observed: Observation
     anchor_observed: Observation
+    anchor: Anchor
     content: Float[Tensor, "B K D"]
 
 
@@ -80,7 +84,7 @@ def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> R
     if network.config.queries == "anchored":
         anchor = bind_at(network, frames, first, truth.anchor_uv, truth.told, truth.bound)
         prediction = network.decode(anchor, window, rest)
-        taught = _teach(network, prediction, window, uv)
+        taught = _teach(network, anchor, prediction, window, uv)
         mask = truth.bound[:, None].expand_as(visible)
         content = anchor.content
     else:
@@ -93,7 +97,7 @@ def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> R
         content = anchor.content.gather(1, slot.unsqueeze(-1).expand(-1, -1, anchor.content.shape[-1]))
         mask = matched[:, None].expand_as(visible)
     inside = ((uv >= 0) & (uv <= 1)).all(-1)
-    return Rollout(prediction, taught, uv, point, visible, mask & inside, window, first, content)
+    return Rollout(prediction, taught, uv, point, visible, mask & inside, window, first, anchor, content)
 
 
 def bind_at(
@@ -131,32 +135,43 @@ def stage_one(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> 
     roll = roll_out(network, frames, truth)
     free, taught, mask = roll.prediction, roll.taught, roll.mask
     seen = mask & roll.visible
-    weight = mask * torch.where(roll.visible, 1.0, _OCCLUDED_WEIGHT)
+    # An entity that moved is what a tracker is asked about; most of them stand still in most windows.
+    importance = torch.where(has_moved(truth), _MOVED_WEIGHT, 1.0)
+    weight = mask * importance * torch.where(roll.visible, 1.0, _OCCLUDED_WEIGHT)
     zero = free.uv.sum() * 0
     px = (free.uv - roll.truth_uv).norm(dim=-1) * network.config.encoder.image_size
-    heat = affordance = zero
+    heat = affordance = joint = zero
     if network.config.head == "heatmap":
         heat = losses.heatmap_loss(free.logits, roll.truth_uv, weight, cells=network.config.cells)
         conf = losses.confidence_loss(free.visible_logit, roll.visible, mask)
         right, judged = is_right(free.point.detach(), truth, px.detach())
         conf = conf + losses.confidence_loss(free.right_logit, right, mask & judged)
         affordance = _affordance(network, roll, truth)
+        belief = network.joint(free.embedding)
+        joint = losses.joint_loss(belief, roll.truth_point, truth.axis, truth.revolute, mask)
     else:
         conf = losses.confidence_loss(free.right_logit, roll.visible & (px.detach() < _CONFIDENT_PX), mask)
         affordance = losses.label_loss(network.learned_label(roll.content), truth.label, mask[:, 0])
     terms = LossTerms(
-        aff=losses.coordinate_loss(taught.uv, roll.truth_uv, seen),
+        aff=losses.coordinate_loss(taught.uv, roll.truth_uv, seen * importance),
         heat=heat,
-        point=losses.point_loss(taught.point, roll.truth_point, truth.unit, mask),
+        point=losses.point_loss(taught.point, roll.truth_point, truth.unit, mask * importance),
         vel=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=1),
         acc=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=2),
         conf=conf,
-        bound=losses.bound_loss(free.uv, mask),
+        bound=losses.bound_loss(taught.uv, mask),
         feat=losses.feature_loss(free.embedding, truth.bound) if free.embedding.shape[1] > 1 else zero,
         geo=losses.manifold_loss(taught.point, truth.point[:, 0], truth.axis, truth.revolute, truth.unit, seen),
         map=affordance,
+        joint=joint,
     )
     return terms, roll
+
+
+def has_moved(truth: WindowTruth) -> Bool[Tensor, "B T K"]:
+    """Whether an entity has left its place at the anchor frame by more than 0.1 normalised units."""
+    moved = (truth.point[:, 1:] - truth.point[:, :1]).norm(dim=-1) / truth.unit[:, None, None]
+    return moved > _RIGHT_DISTANCE
 
 
 def is_right(
@@ -181,7 +196,7 @@ def is_right(
 def _affordance(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> Tensor:
     # The anchor frame and the newest one: the frames between differ little from them.
     fine = torch.cat((roll.anchor_observed.fine, roll.observed.fine[:, -1:]), dim=1)
-    logits, offset = network.affordance(Observation(fine, fine, fine[..., :3]))
+    logits, offset = network.affordance(fine)
     uv = truth.uv[:, [0, -1]].flatten(0, 1)
     visible = (truth.visible & truth.exists[:, None])[:, [0, -1]].flatten(0, 1)
     label = truth.label.repeat_interleave(2, dim=0)
@@ -190,7 +205,9 @@ def _affordance(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> Ten
     )
 
 
-def _teach(network: QuestNetwork, prediction: Prediction, observed: Observation, uv: Tensor) -> Prediction:
+def _teach(
+    network: QuestNetwork, anchor: Anchor, prediction: Prediction, observed: Observation, uv: Tensor
+) -> Prediction:
     head, side = network.head, network.config.cells
     if not isinstance(head, HeatmapHead):
         raise ConfigError("only a heatmap can be refined around a cell")
@@ -198,7 +215,7 @@ def _teach(network: QuestNetwork, prediction: Prediction, observed: Observation,
     row, column = prediction.peak.div(side, rounding_mode="floor"), prediction.peak % side
     near = ((row - place[..., 1]).abs() <= 1) & ((column - place[..., 0]).abs() <= 1)
     cell = torch.where(near, prediction.peak, place[..., 1] * side + place[..., 0])
-    taught_uv, point = head.refine(prediction.embedding, prediction.logits, observed, cell)
+    taught_uv, point = head.refine(prediction.embedding, anchor, prediction.logits, observed, cell)
     return replace(prediction, peak=cell, uv=taught_uv, point=point)
 
 

@@ -82,6 +82,7 @@ class LossWeights:
         feat: change of a query's embedding between neighbouring frames.
         geo: distance of the point to its entity's own screw motion.
         map: focal loss and offset of the dense affordance map.
+        joint: likelihood of the joint that the entity hangs on.
     """
 
     aff: float = 20.0
@@ -94,3 +95,4 @@ class LossWeights:
     feat: float = 0.02
     geo: float = 0.2
     map: float = 1.0
+    joint: float = 0.1

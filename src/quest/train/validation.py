@@ -76,8 +76,7 @@ def _discovery(network: QuestNetwork, observed: Observation, truth: WindowTruth)
     """Slots that hit an entity of their label, slots, and visible entities at the anchor frames."""
     counts = np.zeros(3)
     for b in range(len(truth.unit)):
-        one = Observation(observed.tokens[b : b + 1], observed.fine[b : b + 1], observed.cell_point[b : b + 1])
-        peaks = find_peaks(network, one, radius_cells=1.5)
+        peaks = find_peaks(network, observed.of(slice(b, b + 1)), radius_cells=1.5)
         keep = peaks.logit > _PEAK_LOGIT
         present = truth.visible[b, 0] & truth.exists[b]
         gap = torch.cdist(truth.uv[b, 0, present], peaks.uv[keep]) * network.config.encoder.image_size

@@ -59,7 +59,7 @@ class WindowSampler:
     """Draws batches of windows from prepared views.
 
     Args:
-        views: prepared views; objects are drawn evenly, then their views.
+        views: prepared views, drawn evenly: an object counts as often as it was filmed.
         network: network that the windows are for.
         config: how windows are drawn.
 
@@ -70,20 +70,15 @@ class WindowSampler:
     def __init__(self, views: list[CachedView], network: NetworkConfig, config: WindowConfig) -> None:
         self.network = network
         self.config = config
-        self.by_object: dict[str, list[CachedView]] = {}
-        for view in views:
-            if view.visible.any():
-                self.by_object.setdefault(view.object_id, []).append(view)
-        self.objects = sorted(self.by_object)
-        if not self.objects:
+        self.views = [view for view in views if view.visible.any()]
+        if not self.views:
             raise ConfigError(f"training: no entity is visible in any of {len(views)} views; use other takes")
 
     def draw(self, rng: np.random.Generator, *, disturb: bool = True) -> tuple[FrameBatch, WindowTruth]:
         """One batch; ``disturb`` turns on everything that is random beyond the choice of frames."""
         picks = []
         for _ in range(self.config.batch):
-            views = self.by_object[self.objects[rng.integers(len(self.objects))]]
-            picks.append(self._pick(views[rng.integers(len(views))], rng))
+            picks.append(self._pick(self.views[rng.integers(len(self.views))], rng))
         frames = self._frames(picks, rng, disturb=disturb)
         return frames, self._truth(picks, frames, rng, disturb=disturb)
 

@@ -1,0 +1,108 @@
+"""A joint with one degree of freedom and the curve on which it moves a point.
+
+Reference: Sturm et al., A Probabilistic Framework for Learning Kinematic Models of Articulated Objects, JAIR 2011,
+section 4, for the three models.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from jaxtyping import Float
+
+
+class JointKind(StrEnum):
+    """How a joint moves."""
+
+    STATIC = "static"
+    PRISMATIC = "prismatic"
+    REVOLUTE = "revolute"
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint fitted to the track of one point, in the track's frame and unit of length.
+
+    Attributes:
+        kind: how it moves.
+        axis: unit direction of sliding, or of the axis of turning (right-handed); positive away from the first points.
+        origin: point of the axis of turning nearest to ``rest``; equal to ``rest`` for other kinds.
+        rest: the curve at q = 0.
+        lower: smallest q seen, units of length or radians.
+        upper: largest q seen.
+        covariance: of small changes, in the basis of :func:`perpendicular`. Prismatic: tilt of the axis (2, radians)
+            and shift across it (2). Revolute: tilt about ``origin`` (2), shift of the axis across itself (2), radius,
+            height along the axis. Static: shift (3).
+        sigma: standard deviation of a point per coordinate that was used.
+        n: points fitted.
+    """
+
+    kind: JointKind
+    axis: Float[np.ndarray, "3"]
+    origin: Float[np.ndarray, "3"]
+    rest: Float[np.ndarray, "3"]
+    lower: float
+    upper: float
+    covariance: Float[np.ndarray, "P P"]
+    sigma: float
+    n: int
+
+    def at(self, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
+        """Points of the curve."""
+        if self.kind is JointKind.STATIC:
+            return np.repeat(self.rest[None], len(q), axis=0)
+        if self.kind is JointKind.PRISMATIC:
+            return self.rest + q[:, None] * self.axis
+        arm = self.rest - self.origin
+        return self.origin + np.cos(q)[:, None] * arm + np.sin(q)[:, None] * np.cross(self.axis, arm)
+
+    def locate(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
+        """Coordinate q of the nearest point of the curve; within [-pi, pi] for turning, 0 for a static point."""
+        if self.kind is JointKind.STATIC:
+            return np.zeros(len(points))
+        if self.kind is JointKind.PRISMATIC:
+            return (points - self.rest) @ self.axis
+        arm = self.rest - self.origin
+        offset = points - self.origin
+        return np.arctan2(offset @ np.cross(self.axis, arm), offset @ arm)
+
+    def spread(self, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+        """Standard deviation of the curve per direction across itself, by the covariance to first order."""
+        moves, tangent = self._moves(q), self._tangent(q)
+        across = moves - tangent[:, :, None] * (tangent[:, None] @ moves)
+        variance = np.einsum("nip,pq,niq->n", across, self.covariance, across)
+        freedom = 3 if self.kind is JointKind.STATIC else 2
+        return np.sqrt(np.maximum(variance, 0) / freedom)
+
+    def _tangent(self, q: np.ndarray) -> np.ndarray:
+        if self.kind is JointKind.STATIC:
+            return np.zeros((len(q), 3))
+        if self.kind is JointKind.PRISMATIC:
+            return np.repeat(self.axis[None], len(q), axis=0)
+        turned = np.cross(self.axis, self.at(q) - self.origin)
+        return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
+
+    def _moves(self, q: np.ndarray) -> np.ndarray:
+        """Change of the curve's points with the parameters of the covariance, N x 3 x P."""
+        if self.kind is JointKind.STATIC:
+            return np.repeat(np.eye(3)[None], len(q), axis=0)
+        basis = perpendicular(self.axis)
+        shift = np.repeat(basis[None], len(q), axis=0)
+        if self.kind is JointKind.PRISMATIC:
+            return np.concatenate((q[:, None, None] * basis, shift), axis=2)
+        arm = self.at(q) - self.origin
+        # The axis moves towards each basis vector: a rotation about axis x basis vector.
+        tilt = np.stack([np.cross(np.cross(self.axis, basis[:, i]), arm) for i in range(2)], axis=2)
+        radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-12)
+        height = np.repeat(self.axis[None, :, None], len(q), axis=0)
+        return np.concatenate((tilt, shift, radial[:, :, None], height), axis=2)
+
+
+def perpendicular(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
+    """Two unit vectors across an axis and each other, the same for the same axis."""
+    other = np.eye(3)[int(np.abs(axis).argmin())]
+    first = np.cross(axis, other)
+    first = first / np.linalg.norm(first)
+    return np.stack((first, np.cross(axis, first)), axis=1)

@@ -1,0 +1,44 @@
+"""What is believed of a joint before its motion has been seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.errors import InputError
+
+
+@dataclass(frozen=True)
+class JointPrior:
+    """Independent beliefs on a joint's kind, its axis as either kind, and where the axis of turning is.
+
+    Attributes:
+        revolute_probability: that it turns rather than slides.
+        prismatic_axis: unit direction of sliding, of either sign.
+        prismatic_axis_sigma_rad: standard deviation of that direction about each of two perpendicular axes.
+        revolute_axis: unit direction of the axis of turning, of either sign.
+        revolute_axis_sigma_rad: the same of this direction.
+        origin: point of the axis of turning.
+        origin_sigma: its standard deviation per coordinate.
+
+    Raises:
+        InputError: a probability outside (0, 1), a spread that is not positive, or a number that is not finite.
+    """
+
+    revolute_probability: float
+    prismatic_axis: Float[np.ndarray, "3"]
+    prismatic_axis_sigma_rad: float
+    revolute_axis: Float[np.ndarray, "3"]
+    revolute_axis_sigma_rad: float
+    origin: Float[np.ndarray, "3"]
+    origin_sigma: float
+
+    def __post_init__(self) -> None:
+        spreads = (self.prismatic_axis_sigma_rad, self.revolute_axis_sigma_rad, self.origin_sigma)
+        places = np.concatenate((self.prismatic_axis, self.revolute_axis, self.origin))
+        if not np.isfinite(places).all() or not all(np.isfinite(s) and s > 0 for s in spreads):
+            raise InputError(f"joint prior: expected finite axes and positive spreads, got {self}")
+        if not 0 < self.revolute_probability < 1:
+            raise InputError(f"joint prior: expected a probability within (0, 1), got {self.revolute_probability}")
