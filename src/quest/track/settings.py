@@ -40,7 +40,7 @@ class TrackerConfig:
     hold_below: float = 0.3
     ground: bool = True
     point_sigma: float = 0.04
-    joint_sigma: float = 0.1
+    joint_sigma: float = 0.06
     off_joint: float = -2.0
     along_sigma: float = 0.03
     hidden_trust: float = 0.5
