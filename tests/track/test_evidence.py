@@ -36,6 +36,7 @@ def test_room_is_what_is_seen_behind_a_place(depth_m: float, room_m: float):
     frame, scale = evidence()
     assert frame.room(place(depth_m)[None])[0] == pytest.approx(room_m / scale, abs=1e-4)
     assert frame.covers(place(depth_m)) == (room_m < -0.1)
+    assert frame.free(place(depth_m)[None])[0] == (room_m > 0.1)
 
 
 def test_nothing_is_known_where_nothing_is_seen():
@@ -44,6 +45,7 @@ def test_nothing_is_known_where_nothing_is_seen():
     assert np.isnan(frame.room(outside)).all()
     assert np.isnan(frame.score(outside)).all()
     assert not frame.covers(outside[0])
+    assert not frame.free(outside).any()
 
 
 def test_score_is_that_of_the_cell():

@@ -36,8 +36,12 @@ def nothing(points: np.ndarray) -> np.ndarray:
     return np.full(len(points), np.nan)
 
 
-def hide(ground: Ground, before: np.ndarray, *, point=(np.nan,) * 3, seen=0.0, evidence=nothing, room=nothing):
-    return ground.hide(before, np.array(point), seen, evidence, room)
+def nowhere(points: np.ndarray) -> np.ndarray:
+    return np.zeros(len(points), bool)
+
+
+def hide(ground: Ground, before: np.ndarray, *, point=(np.nan,) * 3, seen=0.0, evidence=nothing, free=nowhere):
+    return ground.hide(before, np.array(point), seen, evidence, free)
 
 
 def test_before_anything_moves_the_belief_favours_its_curve():
@@ -83,7 +87,7 @@ def test_a_hidden_query_is_not_where_one_looks_through():
     """Everything up to 1.5 rad is seen to be empty, so the door must have gone on."""
     ground, place = opened(), on_door(1.2)
     for _ in range(30):
-        place = hide(ground, place, room=lambda p: np.where(np.arctan2(p[:, 1], p[:, 0]) < 1.5, 1.0, 0.0))
+        place = hide(ground, place, free=lambda p: np.arctan2(p[:, 1], p[:, 0]) < 1.5)
     assert np.arctan2(place[1], place[0]) > 1.45
 
 

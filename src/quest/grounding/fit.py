@@ -180,8 +180,7 @@ def _revolute(points: np.ndarray, sigma: np.ndarray, prior: JointPrior | None) -
         x, cost, covariance = _solve(model, start)
         if best is None or cost < best[0]:
             best = (cost, _unit(start_axis + basis @ x[:2]), start_origin + basis @ x[2:4], x, covariance, basis)
-    if best is None:
-        return None
+    assert best is not None
     _, axis, place, x, covariance, basis = best
     return _circle_candidate(points, sigma, prior, (axis, place, x[4], x[5]), _rebased(covariance, basis, axis))
 
@@ -220,10 +219,7 @@ def _circle(
     extent = max(float(np.linalg.norm(points - points[0], axis=1).max()), 1e-9)
 
     def model(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        raw = axis + basis @ x[:2]
-        length = float(np.linalg.norm(raw))
-        now = raw / length
-        by_slope = (basis - np.outer(now, now @ basis)) / length
+        now, by_slope = _tilted(axis, basis, x[:2])
         offset = points - origin - basis @ x[2:4]
         height = offset @ now
         outward = offset - height[:, None] * now
@@ -250,14 +246,19 @@ def _circle(
     return model
 
 
+def _tilted(axis: np.ndarray, basis: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unit axis that slopes make of an axis, with its derivatives by them."""
+    raw = axis + basis @ slopes
+    length = float(np.linalg.norm(raw))
+    now = raw / length
+    return now, (basis - np.outer(now, now @ basis)) / length
+
+
 def _tilt(
     axis: np.ndarray, basis: np.ndarray, slopes: np.ndarray, expected: np.ndarray, sigma_rad: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sine of the angle to an expected axis, as a vector, with its derivatives by the slopes."""
-    raw = axis + basis @ slopes
-    length = float(np.linalg.norm(raw))
-    now = raw / length
-    by_slope = (basis - np.outer(now, now @ basis)) / length
+    now, by_slope = _tilted(axis, basis, slopes)
     return np.cross(now, expected) / sigma_rad, np.cross(by_slope.T, expected).T / sigma_rad
 
 
@@ -277,7 +278,7 @@ def _circle_candidate(
     origin = place + height * axis
     offset = points[0] - origin
     outward = offset - (offset @ axis) * axis
-    rest = origin + max(radius, 1e-6) * _unit(outward)
+    rest = origin + radius * _unit(outward)
     # Tilt about the height of the circle instead of the point where the fit began.
     change = np.eye(6)
     change[2:4, :2] = height * np.eye(2)

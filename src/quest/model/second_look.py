@@ -1,4 +1,4 @@
-"""A second look around the best cell, at four times the resolution, beside what surrounded the query when it was bound.
+"""A second look around the best cell, at twice the resolution, beside what surrounded the query when it was bound.
 
 Reference: Cho et al., Local All-Pair Correspondence for Point Tracking, ECCV 2024 (section 3.2), for comparing two
 neighbourhoods with each other instead of one feature with a neighbourhood.

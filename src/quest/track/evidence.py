@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from quest.model.config import NetworkConfig
 from quest.model.decoder import sample_grid
 from quest.model.observation import FrameBatch
 
-_COVERED = 0.06
+_TOLERANCE = 0.06
 
 
 class Evidence:
@@ -38,7 +38,11 @@ class Evidence:
 
     def covers(self, point: Float[np.ndarray, "3"]) -> bool:
         """Whether something is seen well before a point."""
-        return bool(self.room(point[None])[0] < -_COVERED)
+        return bool(self.room(point[None])[0] < -_TOLERANCE)
+
+    def free(self, point: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
+        """Whether one looks through points: what is seen lies well behind them."""
+        return self.room(point) > _TOLERANCE
 
     def room(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
         """How far what is seen lies behind points along +z, reference units; NaN where nothing is known."""

@@ -18,7 +18,6 @@ from quest.track.settings import TrackerConfig
 _SAMPLES = 97
 _SLIDE_REACH = 1.2
 _TURN_REACH_RAD = 2.4
-_BEHIND_TOLERANCE = 0.06
 _LOG_FREE_SPACE = -4.0
 _UNTOLD = -6.0
 
@@ -115,7 +114,6 @@ class Ground:
         self._config = config
         self._expectation = _Expectation()
         self._estimator = JointEstimator(config.point_sigma)
-        self._rest: np.ndarray | None = None
         self._curves: tuple[Curve, ...] = ()
         self._along: np.ndarray | None = None
 
@@ -131,11 +129,10 @@ class Ground:
 
     def see(self, point: Float[np.ndarray, "3"], row: BeliefRow) -> None:
         """Learn from a frame in which the query is seen and trusted."""
-        self._rest = point if self._rest is None else self._rest
         self._expectation.add(row, point)
-        self._estimator.prior = self._expectation.prior()
+        self._estimator.prior = prior = self._expectation.prior()
         self._estimator.add(point)
-        self._curves = self._make_curves()
+        self._curves = self._make_curves(prior)
         self._along = None
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
@@ -154,7 +151,7 @@ class Ground:
 
     def settle(self, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """A point that is seen, drawn towards the joint as far as the joint is known better than the point."""
-        if not self._curves or not np.isfinite(point).all():
+        if not self._curves:
             return point
         curve = max(self._curves, key=lambda c: c.log_weight)
         q = curve.joint.locate(point[None])
@@ -171,7 +168,7 @@ class Ground:
         point: Float[np.ndarray, "3"],
         seen: float,
         evidence: Callable[[np.ndarray], np.ndarray],
-        room: Callable[[np.ndarray], np.ndarray],
+        free: Callable[[np.ndarray], np.ndarray],
     ) -> Float[np.ndarray, "3"]:
         """Where a query is that is probably hidden: the mean along its joint.
 
@@ -180,7 +177,7 @@ class Ground:
             point: where it would be if it were seen after all; NaN if unknown.
             seen: probability of that.
             evidence: log score of the frame for points (M x 3), NaN outside the image.
-            room: how far the seen surface lies behind points along their rays; NaN unknown.
+            free: whether one looks through points.
         """
         if not self._curves:
             return before
@@ -192,7 +189,7 @@ class Ground:
         prior = self._along @ _rows_normalised(-0.5 * np.square((curve.q[:, None] - curve.q[None]) / sigma))
         score = self._config.hidden_trust * np.nan_to_num(evidence(curve.point), nan=_UNTOLD)
         # Where one looks through the place, the query would be seen.
-        score = score + np.where(room(curve.point) > _BEHIND_TOLERANCE, _LOG_FREE_SPACE, 0.0)
+        score = score + np.where(free(curve.point), _LOG_FREE_SPACE, 0.0)
         likelihood = (1 - seen) * _normalised(score)
         if np.isfinite(point).all():
             gap = np.linalg.norm(curve.point - point, axis=1) / np.hypot(curve.spread, 2 * self._config.point_sigma)
@@ -201,25 +198,23 @@ class Ground:
         self._along = posterior / posterior.sum()
         return curve.joint.at(np.array([self._along @ curve.q]))[0]
 
-    def _make_curves(self) -> tuple[Curve, ...]:
+    def _make_curves(self, prior: JointPrior) -> tuple[Curve, ...]:
         joint = self._estimator.joint
-        if joint is not None and joint.kind is not JointKind.STATIC:
+        assert joint is not None  # a point was added
+        if joint.kind is not JointKind.STATIC:
             return (_curve(joint, 0.0),)
-        assert self._rest is not None
-        prior = self._expectation.prior()
         weights = {JointKind.REVOLUTE: prior.revolute_probability, JointKind.PRISMATIC: 1 - prior.revolute_probability}
-        rest = self._rest if joint is None else joint.rest
         return tuple(
-            _curve(joint_from_prior(prior, rest, kind=k, rest_sigma=self._config.point_sigma), float(np.log(w)))
+            _curve(joint_from_prior(prior, joint.rest, kind=k, rest_sigma=self._config.point_sigma), float(np.log(w)))
             for k, w in weights.items()
         )
 
 
 def _curve(joint: Joint, log_weight: float) -> Curve:
-    reach = _TURN_REACH_RAD if joint.kind is JointKind.REVOLUTE else _SLIDE_REACH
-    q = np.linspace(min(joint.lower, 0.0) - reach, max(joint.upper, 0.0) + reach, _SAMPLES)
     if joint.kind is JointKind.REVOLUTE:
-        q = np.linspace(-reach, reach, _SAMPLES)
+        q = np.linspace(-_TURN_REACH_RAD, _TURN_REACH_RAD, _SAMPLES)
+    else:
+        q = np.linspace(min(joint.lower, 0.0) - _SLIDE_REACH, max(joint.upper, 0.0) + _SLIDE_REACH, _SAMPLES)
     return Curve(log_weight, joint, q, joint.at(q), joint.spread(q))
 
 

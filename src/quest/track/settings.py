@@ -18,7 +18,7 @@ class TrackerConfig:
         temperature: divides the scores of the heatmap; above 1 trusts a single frame less.
         lift_tolerance: largest distance between the lifted pixel and the predicted point for the pixel's depth to
             be taken, reference units; beyond it the pixel lies on something before or behind the entity.
-        hold_below: probability of being seen below which an entity is held where it was last seen.
+        hold_below: probability of being seen below which an entity is taken to be hidden.
         ground: whether queries are grounded in the motion of their joint.
         point_sigma: standard deviation of a seen point per coordinate, reference units.
         joint_sigma: how far from its joint's curve a cell of the entity may lie, reference units.
@@ -51,8 +51,9 @@ class TrackerConfig:
     slot_radius_cells: float = 1.5
 
     def __post_init__(self) -> None:
-        if self.move_sigma <= 0 or self.temperature <= 0 or not 0 < self.jump < 1 or self.lift_tolerance < 0:
-            raise ConfigError(f"tracker: expected positive move_sigma and temperature and 0 < jump < 1, got {self}")
+        widths = (self.move_sigma, self.point_sigma, self.joint_sigma, self.along_sigma, self.temperature)
+        if min(widths) <= 0 or not 0 < self.jump < 1 or self.lift_tolerance < 0:
+            raise ConfigError(f"tracker: expected positive sigmas and temperature and 0 < jump < 1, got {self}")
 
     def to_json(self) -> str:
         """One line, stored with the weights."""

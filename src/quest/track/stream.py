@@ -366,7 +366,7 @@ class Stream:
                     bound.ground.see(own, joints[k])
                 own = bound.ground.settle(own)
             else:
-                own = bound.ground.hide(before, own, float(seen[k]), evidence.score, evidence.room)
+                own = bound.ground.hide(before, own, float(seen[k]), evidence.score, evidence.free)
             placed[k] = torch.from_numpy(own).to(placed)
             bound.last_seen = placed[k]
         uv = frames.from_reference(placed[None, None])[0, 0] / self._network.config.encoder.image_size
