@@ -185,6 +185,25 @@ class Query:
 
 
 @dataclass(frozen=True)
+class Joints:
+    """The joints that explain K tracks, in the world.
+
+    Attributes:
+        kind: ``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen.
+        axis: unit direction of sliding, or of the axis of turning; NaN where there is none.
+        origin: metres: a point of the axis of turning, or of the path of sliding; NaN where unknown.
+    """
+
+    kind: tuple[str, ...]
+    axis: Float32[np.ndarray, "K 3"]
+    origin: Float32[np.ndarray, "K 3"]
+
+    def select(self, queries: np.ndarray) -> Joints:
+        """The joints of some queries only."""
+        return Joints(tuple(self.kind[i] for i in queries), self.axis[queries], self.origin[queries])
+
+
+@dataclass(frozen=True)
 class Tracks:
     """Answers to K queries over T frames.
 
@@ -198,6 +217,10 @@ class Tracks:
         state: :class:`State` value per frame and query.
         stamp_s: times in seconds.
         frame_flags: degradations that apply to whole frames or the whole clip, in words.
+        lost_p: calibrated probability that the identity is lost, NaN where it is not known; None for trackers that do
+            not watch themselves.
+        alarm: whether an alarm is open; None likewise.
+        joints: what explains the tracks at the end; None for trackers that do not ground them.
     """
 
     names: tuple[str, ...]
@@ -209,6 +232,9 @@ class Tracks:
     state: np.ndarray
     stamp_s: Float[np.ndarray, " T"]
     frame_flags: tuple[str, ...] = ()
+    lost_p: Float32[np.ndarray, "T K"] | None = None
+    alarm: Bool[np.ndarray, "T K"] | None = None
+    joints: Joints | None = None
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -225,6 +251,9 @@ class Tracks:
             confidence=self.confidence[:, index],
             visible=self.visible[:, index],
             state=self.state[:, index],
+            lost_p=None if self.lost_p is None else self.lost_p[:, index],
+            alarm=None if self.alarm is None else self.alarm[:, index],
+            joints=None if self.joints is None else self.joints.select(index),
         )
 
 
@@ -279,6 +308,7 @@ class TakeInfo:
         joints: moving joints.
         moved_joints: the joints that move in this take, in order, as indices into ``joints``.
         provenance: commit, versions of the packages that made the data, renderer, command.
+        suite: which of the simulator's suites it belongs to; ``standard`` is none.
     """
 
     name: str
@@ -293,6 +323,7 @@ class TakeInfo:
     joints: tuple[Joint, ...]
     moved_joints: tuple[int, ...]
     provenance: dict[str, Any] = field(default_factory=dict)
+    suite: str = "standard"
 
 
 @dataclass(frozen=True)

@@ -18,10 +18,11 @@ from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError
 from quest.geometry import lift_depth, project, transform
 from quest.sim.annotate import VISIBLE_WITHIN
-from quest.sim.generate import TakeSettings, choose_joints, generate_take
+from quest.sim.generate import generate_take
 from quest.sim.motion import FRAMES_PER_S, HOLD_FRAMES
 from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Renderer
+from quest.sim.staging import TakeSettings, choose_joints
 from quest.types import Take, View
 from tests.sim.small_objects import CARCASS, DOOR, DRAWER, TRAY, write_cabinet, write_object
 

@@ -1,6 +1,7 @@
 """Which takes a run makes, where objects come from, and the command that says so."""
 
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from quest.cli.generate import Generate
 from quest.errors import ConfigError, ObjectError
 from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
 from quest.sim.procedural import CATEGORIES
+from quest.sim.suites import SUITES
 from tests.sim.small_objects import write_cabinet
 
 
@@ -18,6 +20,19 @@ def test_all_objects_come_once_before_any_comes_again() -> None:
     assert [t.name for t in takes] == [
         "1-L1-s000005", "2-L1-s000005", "1-L3-s000005", "2-L3-s000005",
         "1-L1-s000006", "2-L1-s000006", "1-L3-s000006", "2-L3-s000006",
+    ]  # fmt: skip
+
+
+def test_takes_of_a_suite_have_names_of_their_own() -> None:
+    alone = replace(SUITES["occlusion"], hidden=60)
+    planned = [
+        take.name
+        for suite in (None, alone, replace(alone, look_alike=True), SUITES["occlusion"], SUITES["lockers"])
+        for take in plan_takes([("partnet", "1")], levels=(1,), takes_per_object=1, suite=suite)
+    ]
+    assert planned == [
+        "1-L1-s000000", "1-L1-occlusion60-s000000", "1-L1-occlusion60alike-s000000", "1-L1-occlusion-s000000",
+        "1-L1-lockers30-s000000",
     ]  # fmt: skip
 
 
@@ -35,6 +50,7 @@ def test_procedural_objects_are_named_by_category_and_seed() -> None:
     assert [object_id.rpartition("-")[2] for _, object_id in named] == [str(seed) for seed in range(100, 120)]
     assert {object_id.rpartition("-")[0] for _, object_id in named} <= set(CATEGORIES)
     assert named == procedural_objects(20, 100)
+    assert procedural_objects(2, 5, "chest") == [("procedural", "chest-5"), ("procedural", "chest-6")]
 
 
 def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
@@ -62,6 +78,8 @@ def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
         "--out a --objects partnet:1,2 procedural:chest-12 --level 1 2 --every 5",
         "--out 'with space' --split train --no-partnet --procedural 3 --seeds 4..9 --no-randomize-materials",
         "--out a --split validation --objects-root there --takes-per-object 2 --seed 7 --views 1 --size 64",
+        "--out a --suite occlusion --hidden 60 --look-alike --objects partnet:1",
+        "--out a --suite lockers --procedural 4 --level 2",
     ],
 )
 def test_recorded_command_makes_the_same_run(words: str) -> None:
@@ -84,6 +102,15 @@ def test_recorded_command_makes_the_same_run(words: str) -> None:
         ({"seeds": "5..1"}, "A..B"),
         ({"seeds": "few"}, "A..B"),
         ({"procedural": 5, "seeds": "1..3"}, "do not fit"),
+        ({"objects": ("partnet:1",), "hidden": 60}, "--suite"),
+        ({"objects": ("partnet:1",), "look_alike": True}, "--suite"),
+        ({"objects": ("partnet:1",), "suite": "occlusion", "hidden": 9}, "10 to 120"),
+        ({"objects": ("partnet:1",), "suite": "occlusion", "hidden": 121}, "10 to 120"),
+        ({"objects": ("partnet:1",), "suite": "occlusion", "views": 3}, "1 view"),
+        ({"objects": ("partnet:1",), "suite": "occlusion", "frames_per_joint": 30}, "--frames-per-joint"),
+        ({"procedural": 1, "suite": "lockers", "look_alike": True}, "--look-alike"),
+        ({"objects": ("procedural:chest-1",), "suite": "lockers"}, "procedural:locker_bank-SEED, got chest-1"),
+        ({"split": "validation", "suite": "lockers"}, "no objects"),
     ],
 )
 def test_settings_that_cannot_be(tmp_path: Path, words: dict, named: str) -> None:

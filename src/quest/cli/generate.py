@@ -17,9 +17,10 @@ from quest.errors import ConfigError, ObjectError
 
 if TYPE_CHECKING:
     from quest.data.store import TakeStore
-    from quest.sim.generate import TakeSettings
     from quest.sim.plan import ObjectShelf, TakeSpec
     from quest.sim.renderer import Renderer
+    from quest.sim.staging import TakeSettings
+    from quest.sim.suites import Suite
 
 
 @dataclass(frozen=True)
@@ -40,16 +41,22 @@ class Generate:
     """Whether --split brings PartNet-Mobility objects; --no-partnet for procedural ones only."""
     objects_root: Path | None = None
     """Folder of PartNet-Mobility folders; default: the environment variable QUEST_OBJECTS."""
-    level: tuple[int, ...] = (1,)
-    """How many joints move one after the other: one level or several."""
+    suite: Literal["occlusion", "lockers"] | None = None
+    """Takes that are hard in one way: something hides a moving entity, also before banks of sixteen like doors."""
+    hidden: int | None = None
+    """Frames for which a suite's entities are hidden, 10 to 120; default: drawn, and 30 before lockers."""
+    look_alike: bool = False
+    """Suite occlusion: entities of the same label stay in view; without it, none is ever in view."""
+    level: tuple[int, ...] = ()
+    """How many joints move one after the other: one level or several; default: 1, before lockers 4."""
     takes_per_object: int = 1
     """Takes of every object and level."""
     seed: int = 0
     """Seed of the first take of each object; the others count up."""
     every: int = 1
     """Keep every n-th frame of the motion script (1 to 8)."""
-    views: int = 3
-    """Cameras per take."""
+    views: int | None = None
+    """Cameras per take; default: 3, in suites 1."""
     size: int = 224
     """Width and height of the images, pixels."""
     frames_per_joint: int = 60
@@ -65,17 +72,24 @@ class Generate:
         """
         from quest.data.provenance import code_commit, package_versions
         from quest.data.store import TakeStore
-        from quest.sim.generate import TakeSettings
         from quest.sim.objects import find_objects
         from quest.sim.plan import ObjectShelf, plan_takes
         from quest.sim.renderer import Renderer
+        from quest.sim.staging import TakeSettings
 
-        settings = TakeSettings(self.views, self.size, self.every, self.frames_per_joint, self.randomize_materials)
-        if self.takes_per_object < 1 or not self.level or min(self.level) < 1:
+        suite = self._suite()
+        views = self.views if self.views is not None else 3 if suite is None else 1
+        settings = TakeSettings(views, self.size, self.every, self.frames_per_joint, self.randomize_materials)
+        levels = self.level or (1 if suite is None else suite.level,)
+        if self.takes_per_object < 1 or min(levels) < 1:
             raise ConfigError("generate: expected --takes-per-object and --level of at least 1")
         store = TakeStore(self.out)
         takes = plan_takes(
-            self._chosen(), levels=self.level, takes_per_object=self.takes_per_object, first_seed=self.seed
+            self._chosen(suite),
+            levels=levels,
+            takes_per_object=self.takes_per_object,
+            first_seed=self.seed,
+            suite=suite,
         )
         console = Console(stderr=True, highlight=False)
         missing = [spec for spec in takes if spec.name not in store]
@@ -112,23 +126,50 @@ class Generate:
                 words += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
         return shlex.join(words)
 
-    def _chosen(self) -> list[tuple[str, str]]:
+    def _suite(self) -> Suite | None:
+        """The suite that the arguments name, or None."""
+        from quest.sim.suites import SUITES
+
+        if self.suite is None:
+            if self.hidden is not None or self.look_alike:
+                raise ConfigError("generate: --hidden and --look-alike belong to --suite, and none is given")
+            return None
+        preset = SUITES[self.suite]
+        if self.look_alike and preset.look_alike:
+            raise ConfigError(f"generate: suite {self.suite} always has look-alikes; leave --look-alike away")
+        if self.frames_per_joint != Generate.frames_per_joint:
+            raise ConfigError(f"generate: suite {self.suite} has a script of its own; leave --frames-per-joint away")
+        if self.views not in (None, 1):
+            raise ConfigError(
+                f"generate: suite {self.suite} expects 1 view, for an occluder hides from one camera; leave --views"
+            )
+        hidden = preset.hidden if self.hidden is None else self.hidden
+        return dataclasses.replace(preset, hidden=hidden, look_alike=preset.look_alike or self.look_alike)
+
+    def _chosen(self, suite: Suite | None) -> list[tuple[str, str]]:
         """Source and id of every object that the arguments name."""
         from quest.data.split import object_split
         from quest.sim.plan import parse_object, procedural_objects
 
         chosen = [pair for text in self.objects for pair in parse_object(text)]
         split = object_split()
-        if self.split is not None and self.partnet:
+        category = None if suite is None else suite.category
+        if self.split is not None and self.partnet and category is None:
             chosen += [("partnet", object_id) for object_id in split.partnet_mobility[self.split]]
         if self.procedural or self.seeds:
             first, last = _seed_range(self.seeds) if self.seeds else split.procedural_seeds[self.split or "train"]
             count = self.procedural or last - first + 1
             if count > last - first + 1:
                 raise ConfigError(f"generate: {count} procedural objects do not fit into seeds {first}..{last}")
-            chosen += procedural_objects(count, first)
+            chosen += procedural_objects(count, first, category)
         if not chosen:
             raise ConfigError("generate: no objects; pass --objects, --split or --procedural")
+        other = [name for _, name in chosen if category is not None and name.rpartition("-")[0] != category]
+        if other:
+            raise ConfigError(
+                f"generate: suite {self.suite} expects objects procedural:{category}-SEED, got {', '.join(other)}; "
+                "name others, or pass --procedural N"
+            )
         return chosen
 
 
@@ -186,6 +227,7 @@ class _Run:
                 spec.seed,
                 renderer=self.renderer,
                 settings=self.settings,
+                suite=spec.suite,
                 provenance=self.provenance,
             )
         except ObjectError as error:

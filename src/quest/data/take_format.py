@@ -192,6 +192,8 @@ class TakeHash:
     def __init__(self, info: TakeInfo, cameras: tuple[Camera, ...]) -> None:
         described = asdict(info)
         described.pop("provenance")
+        if info.suite == "standard":
+            described.pop("suite")  # takes that were written before there were suites keep their digest
         described["cameras"] = [asdict(camera) for camera in cameras]
         self._digest = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
 

@@ -72,13 +72,13 @@ def motion_script(
     for k, j in enumerate(moved_joints):
         start = HOLD_FRAMES if k == 0 else k * frames_per_joint
         end = (k + 1) * frames_per_joint
-        opened = joint_profile(end - start, rng) * _opening(articulation, j, rng)
+        opened = joint_profile(end - start, rng) * sample_opening(articulation, j, rng)
         position[start:end, j] += opened
         position[end:, j] += opened[-1]
     return position
 
 
-def _opening(articulation: Articulation, joint: int, rng: np.random.Generator) -> float:
+def sample_opening(articulation: Articulation, joint: int, rng: np.random.Generator) -> float:
     """Signed travel to the limit that is farther away; to either one if both are about as far (a bucket's handle)."""
     below, above = articulation.joints[joint].travel()
     draw = rng.random()

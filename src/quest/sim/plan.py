@@ -11,6 +11,7 @@ from quest.errors import ObjectError
 from quest.sim.generate import take_name
 from quest.sim.objects import SimObject, find_objects, load_object
 from quest.sim.procedural import CATEGORIES, category_for_seed, make_object
+from quest.sim.suites import Suite
 
 
 @dataclass(frozen=True)
@@ -22,21 +23,28 @@ class TakeSpec:
         object_id: folder name, or ``category-seed``.
         level: how many joints move.
         seed: of the take.
+        suite: what makes it difficult; None for an ordinary take.
     """
 
     source: str
     object_id: str
     level: int
     seed: int
+    suite: Suite | None = None
 
     @property
     def name(self) -> str:
         """Name of the take in its store."""
-        return take_name(self.object_id, self.level, self.seed)
+        return take_name(self.object_id, self.level, self.seed, self.suite)
 
 
 def plan_takes(
-    objects: Iterable[tuple[str, str]], *, levels: Sequence[int], takes_per_object: int, first_seed: int = 0
+    objects: Iterable[tuple[str, str]],
+    *,
+    levels: Sequence[int],
+    takes_per_object: int,
+    first_seed: int = 0,
+    suite: Suite | None = None,
 ) -> list[TakeSpec]:
     """Takes of every object at every level, all objects once before any comes again.
 
@@ -45,10 +53,11 @@ def plan_takes(
         levels: levels to make.
         takes_per_object: takes per object and level.
         first_seed: seed of the first take of each object; the others count up.
+        suite: what makes the takes difficult; None for ordinary ones.
     """
     chosen = list(objects)
     return [
-        TakeSpec(source, object_id, level, first_seed + n)
+        TakeSpec(source, object_id, level, first_seed + n, suite)
         for n in range(takes_per_object)
         for level in levels
         for source, object_id in chosen
@@ -72,9 +81,10 @@ def parse_object(text: str) -> list[tuple[str, str]]:
     return [(source, name) for name in names]
 
 
-def procedural_objects(count: int, first_seed: int) -> list[tuple[str, str]]:
-    """``count`` procedural objects, one per object seed, in the usual mix of categories."""
-    return [("procedural", f"{category_for_seed(seed)}-{seed}") for seed in range(first_seed, first_seed + count)]
+def procedural_objects(count: int, first_seed: int, category: str | None = None) -> list[tuple[str, str]]:
+    """``count`` procedural objects, one per object seed, of a category or in the usual mix of categories."""
+    seeds = range(first_seed, first_seed + count)
+    return [("procedural", f"{category or category_for_seed(seed)}-{seed}") for seed in seeds]
 
 
 class ObjectShelf:

@@ -71,6 +71,15 @@ def _lockers(rng: np.random.Generator) -> ObjectModel:
     return _grid(rng, width, height, depth, [[swing] * rows for _ in range(columns)], equal=True, always_handles=True)
 
 
+def _locker_bank(rng: np.random.Generator) -> ObjectModel:
+    """Sixteen identical doors with identical handles, four by four."""
+    swing: CellKind = "door_left" if rng.random() < 0.5 else "door_right"
+    width, height = 4 * float(rng.uniform(0.28, 0.42)), 4 * float(rng.uniform(0.3, 0.45))
+    depth = float(rng.uniform(0.35, 0.5))
+    columns: list[list[CellKind]] = [[swing] * 4 for _ in range(4)]
+    return _grid(rng, width, height, depth, columns, equal=True, always_handles=True, bare=False)
+
+
 def _wardrobe(rng: np.random.Generator) -> ObjectModel:
     pairs = int(rng.integers(1, 3))
     drawers = int(rng.integers(0, 3))
@@ -187,8 +196,9 @@ def _grid(
     *,
     equal: bool = False,
     always_handles: bool = False,
+    bare: bool = True,
 ) -> ObjectModel:
-    """A cabinet of columns of cells (each bottom to top) with a base and a top."""
+    """A cabinet of columns of cells (each bottom to top) with a base and a top; fronts may go bare if ``bare``."""
     base_kind = str(rng.choice(["none", "plinth", "legs"], p=[0.3, 0.4, 0.3]))
     base = 0.0 if base_kind == "none" else float(rng.uniform(0.05, 0.14))
     board = float(rng.uniform(0.015, 0.022))
@@ -203,6 +213,8 @@ def _grid(
             shares = shared
         cells += _column(kinds, float(x_edges[index]), float(x_edges[index + 1]), base, base + height, shares)
     style = sample_front_style(rng, _handles(rng, always=always_handles))
+    if not bare:
+        style = replace(style, bare_share=0.0)
     body = list(carcass(cells, depth_m=depth, board_m=board))
     body += _base(base_kind, base - board / 2, width, depth)
     if rng.random() < 0.5:
@@ -234,6 +246,7 @@ FURNITURE: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     "night_stand": _night_stand,
     "cabinet": _cabinet,
     "lockers": _lockers,
+    "locker_bank": _locker_bank,
     "wardrobe": _wardrobe,
     "sideboard": _sideboard,
     "desk": _desk,

@@ -1,0 +1,201 @@
+"""A thing that comes between a camera and what it hides, stays a while and goes away again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial import ConvexHull, QhullError
+
+from quest.sim.articulation import apply
+from quest.sim.cameras import PosedCamera
+from quest.sim.surfaces import Surface, make_material, sample_surface
+
+_FORMS = {"board": 0.35, "box": 0.3, "column": 0.2, "disc": 0.15}
+_TILT_DEG = 18.0
+_NEAREST = (0.55, 0.92)
+"""Where its farthest point lies between the camera and the nearest point of the object, shares of the depth."""
+_LARGEST = 0.45
+"""It hides at most this share of the image."""
+_GROWTH = 1.05
+_CORNERS = 32
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A box or a cylinder before a camera.
+
+    Attributes:
+        kind: ``box``, or ``cylinder`` with its axis along x.
+        half_m: half extents along x, y, z; a cylinder's last two are its radius.
+        cam_from_shape: its pose.
+    """
+
+    kind: Literal["box", "cylinder"]
+    half_m: Float[np.ndarray, "3"]
+    cam_from_shape: Float[np.ndarray, "4 4"]
+
+    @property
+    def vertices(self) -> Float[np.ndarray, "N 3"]:
+        """Its corners in the camera's frame; a cylinder's are those of a prism that it holds."""
+        if self.kind == "box":
+            corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3).astype(float)
+        else:
+            angle = np.linspace(0, 2 * np.pi, _CORNERS, endpoint=False)
+            ring = np.stack((np.ones(_CORNERS), np.cos(angle), np.sin(angle)), axis=-1)
+            corners = np.concatenate((ring, ring * [-1, 1, 1]))
+        return apply(self.cam_from_shape, corners * self.half_m)
+
+    @property
+    def outline(self) -> ConvexHull:
+        """What it covers of the plane at depth 1 before the camera."""
+        vertices = self.vertices
+        return ConvexHull(vertices[:, :2] / vertices[:, 2:])
+
+    def hides(self, slopes: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+        """Which rays from the camera, given by x / z and y / z, it meets."""
+        sides = self.outline.equations
+        return np.all(slopes @ sides[:, :2].T + sides[:, 2] <= 1e-9, axis=1)
+
+
+@dataclass(frozen=True)
+class Occluder:
+    """A shape with a material that moves.
+
+    Attributes:
+        shape: what it is, at the place where it hides something.
+        surface: its material.
+        world_from_shape: its pose at every frame of the script.
+    """
+
+    shape: Shape
+    surface: Surface
+    world_from_shape: Float[np.ndarray, "T 4 4"]
+
+
+def fit_shape(
+    slopes: Float[np.ndarray, "N 2"], posed: PosedCamera, nearest_m: float, rng: np.random.Generator
+) -> Shape | None:
+    """A random shape that hides all given rays and stands nearer to the camera than ``nearest_m``.
+
+    Args:
+        slopes: x / z and y / z of the rays.
+        posed: the camera.
+        nearest_m: depth of what it must not touch.
+        rng: what it is drawn from.
+
+    Returns:
+        The shape, or None if it would hide too much of the image.
+    """
+    form = str(rng.choice(list(_FORMS), p=list(_FORMS.values())))
+    roll, thick = float(rng.normal(0, np.deg2rad(12))), float(rng.uniform(0.02, 0.1))
+    tilt = np.deg2rad(rng.uniform(-_TILT_DEG, _TILT_DEG, 2))
+    room, place = float(rng.uniform(1.02, 1.12)), float(rng.uniform(*_NEAREST))
+    if form in ("box", "column"):
+        thick = float(rng.uniform(0.3, 0.9))
+    turned = slopes @ _turn(2, roll)[:2, :2]
+    low, high = turned.min(axis=0), turned.max(axis=0)
+    a, b = (high - low) / 2
+    rotation = _turn(2, roll) @ _turn(0, float(tilt[0])) @ _turn(1, float(tilt[1]))
+    if form == "column":  # along its longer side
+        kind, half, rotation = ("cylinder", [a, b, b], rotation) if a > b else ("cylinder", [b, a, a], rotation @ _UP)
+    elif form == "disc":
+        kind, half, rotation = "cylinder", [thick * max(a, b), max(a, b), max(a, b)], rotation @ _TOWARDS
+    else:
+        kind, half = "box", [a, b, thick * min(a, b)]
+    pose = np.eye(4)
+    pose[:3, :3] = rotation
+    pose[:2, 3], pose[2, 3] = _turn(2, roll)[:2, :2] @ ((low + high) / 2), 1.0
+    camera = posed.camera
+    image = camera.width / camera.fx * camera.height / camera.fy
+    shape = Shape("box" if kind == "box" else "cylinder", room * np.array(half), pose)
+    # The sides of what is thick or tilted do not all look at the camera: grow until everything is hidden.
+    while not _fits(shape, slopes):
+        shape = Shape(shape.kind, shape.half_m * _GROWTH, pose)
+        if shape.vertices[:, 2].min() < 0.2 or shape.outline.volume > _LARGEST * image:
+            return None
+    if shape.outline.volume > _LARGEST * image:
+        return None
+    # Shrunk towards the camera's centre it hides just the same.
+    scale = place * nearest_m / shape.vertices[:, 2].max()
+    pose = pose.copy()
+    pose[:3, 3] *= scale
+    return Shape(shape.kind, shape.half_m * scale, pose)
+
+
+def _fits(shape: Shape, slopes: Float[np.ndarray, "N 2"]) -> bool:
+    try:
+        return bool(shape.hides(slopes).all())
+    except QhullError:
+        return False
+
+
+def slide_in(
+    shape: Shape, posed: PosedCamera, away: Float[np.ndarray, " T"], rng: np.random.Generator
+) -> Float[np.ndarray, "T 4 4"]:
+    """Poses in the world of a shape that comes from beyond an edge of the image, parallel to the image.
+
+    Args:
+        shape: where it hides something.
+        posed: the camera.
+        away: how far it is at every frame: 0 in place, 1 gone: far below the ground, where it casts no shadow.
+        rng: what the edge is drawn from.
+    """
+    camera, vertices = posed.camera, shape.vertices
+    axis, side = int(rng.choice(2, p=(0.7, 0.3))), int(rng.integers(2))
+    centre, focal, length = ((camera.cx, camera.fx, camera.width), (camera.cy, camera.fy, camera.height))[axis]
+    edge = ((0 if side == 0 else length) - centre) / focal
+    beyond = edge + (-0.02 if side == 0 else 0.02)
+    shifts = beyond * vertices[:, 2] - vertices[:, axis]
+    shift = np.zeros(3)
+    shift[axis] = min(shifts.min(), 0.0) if side == 0 else max(shifts.max(), 0.0)
+    poses = np.tile(shape.cam_from_shape, (len(away), 1, 1))
+    poses[:, :3, 3] += away[:, None] * shift
+    poses = np.linalg.inv(posed.cam_from_world) @ poses
+    poses[away >= 1, 2, 3] -= 100 * vertices[:, 2].max()
+    return poses
+
+
+def sample_occluder_surface(rng: np.random.Generator) -> Surface:
+    """Draw its material."""
+    return sample_surface(rng, textured=0.6)
+
+
+def add_occluder(scene: Any, occluder: Occluder) -> Any:
+    """Put an occluder into a ``sapien.Scene``; returns the entity, which :func:`place_occluder` moves."""
+    import sapien
+
+    shape, material = occluder.shape, make_material(occluder.surface)
+    half = shape.half_m.astype(np.float32).tolist()
+    component = sapien.render.RenderBodyComponent()
+    if shape.kind == "box":
+        component.attach(sapien.render.RenderShapeBox(half, material))
+    else:
+        component.attach(sapien.render.RenderShapeCylinder(half[1], half[0], material))
+    entity = sapien.Entity()
+    entity.add_component(component)
+    scene.add_entity(entity)
+    place_occluder(entity, occluder, 0)
+    return entity
+
+
+def place_occluder(entity: Any, occluder: Occluder, frame: int) -> None:
+    """Move an occluder's entity to where it is at a frame of the script."""
+    import sapien
+
+    entity.set_pose(sapien.Pose(occluder.world_from_shape[frame]))
+
+
+def _turn(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    matrix = np.eye(3)
+    matrix[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+    return matrix
+
+
+# Rotations that bring a cylinder's axis, which is x, upright, or towards the camera.
+_UP = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+_TOWARDS = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])

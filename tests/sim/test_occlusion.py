@@ -1,0 +1,151 @@
+"""Takes with occlusions: what moves when, what is hidden when, and that the pictures agree."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from quest.errors import ConfigError, ObjectError
+from quest.sim.generate import generate_take
+from quest.sim.motion import HOLD_FRAMES
+from quest.sim.objects import SimObject, load_object
+from quest.sim.occlusion import SURROUNDINGS, occlusion_script
+from quest.sim.renderer import Renderer
+from quest.sim.staging import TakeSettings
+from quest.sim.suites import HIDDEN_FRAMES, SUITES, Suite
+from quest.types import Take
+from tests.sim.small_objects import CARCASS, DRAWER, articulation, write_object
+from tests.sim.test_generate import arrays
+
+ALONE = replace(SUITES["occlusion"], hidden=12)
+BESIDE = replace(ALONE, look_alike=True)
+SMALL = TakeSettings(views=1, size=64)
+
+seeds = st.integers(0, 2**31 - 1)
+
+
+@pytest.fixture(scope="module")
+def chest(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
+    """Two drawers with handles."""
+    lower = replace(DRAWER, name="lower", origin=(0.02, 0, 0.25))
+    return load_object(write_object(Path(tmp_path_factory.mktemp("objects")) / "chest", CARCASS, DRAWER, lower))
+
+
+@given(seeds, st.integers(*HIDDEN_FRAMES), st.integers(1, 3), st.sampled_from(sorted(SUITES)))
+def test_joints_move_in_view_and_stop_while_hidden(seed: int, hidden: int, count: int, name: str) -> None:
+    suite = SUITES[name]
+    thing = articulation(("revolute", 0, 1.5), ("prismatic", 0, 0.4), ("revolute", -2, 0.1))
+    joints = tuple(range(count))
+    position, episodes = occlusion_script(thing, joints, suite, hidden, np.random.default_rng(seed))
+    assert [e.joint for e in episodes] == list(joints)
+    assert len(position) == episodes[-1].end
+    np.testing.assert_array_equal(position[:HOLD_FRAMES], np.tile(thing.rest, (HOLD_FRAMES, 1)))
+    for e, following in zip(episodes, [*episodes[1:], None], strict=True):
+        assert following is None or following.start == e.end
+        assert e.shown - e.hidden == hidden
+        assert e.hidden < e.stops < e.shown
+        assert e.hidden - e.slide - e.moves >= 11  # frames that show it moving with nothing before the object
+        opened = np.abs(position[:, e.joint] - thing.rest[e.joint])
+        assert not opened[: e.moves].any()
+        assert np.ptp(opened[e.stops - 1 :]) < 1e-12
+        assert 0.35 * opened[-1] < opened[e.hidden - 1] < 0.98 * opened[-1]
+        assert (np.diff(opened[e.moves - 1 : e.stops]) > 0).all()
+        away = e.away(len(position))
+        np.testing.assert_array_equal(np.flatnonzero(away == 0), np.arange(e.hidden, e.shown))
+        assert ((away > 0) & (away < 1)).sum() == 2 * e.slide
+
+
+def test_sixty_frames_hidden() -> None:
+    for seed in range(20):
+        _, (e,) = occlusion_script(
+            articulation(("prismatic", 0, 1)), (0,), SUITES["occlusion"], 60, np.random.default_rng(seed)
+        )
+        assert e.end - e.shown - e.slide >= 20
+        assert e.hidden - e.slide - e.moves >= 12
+
+
+def check_hidden(take: Take) -> None:
+    """Every hidden entity is hidden in its frames with its surroundings, and seen before and after."""
+    view, names = take.views[0], [e.name for e in take.info.entities]
+    depth_m, size = view.clip.depth_m, view.clip.camera.width
+    assert depth_m is not None
+    y, x = np.mgrid[:size, :size] + 0.5
+    for name, first, end in take.info.provenance["hidden"]:
+        e = names.index(name)
+        entity = take.info.entities[e]
+        assert entity.joint in take.info.moved_joints
+        assert not view.visible[first:end, e].any()
+        assert view.visible[0, e]
+        assert view.visible[first - 5, e]
+        assert not (view.entity_id[first:end] == 1 + e).any()
+        for t in range(first, end):
+            around = np.hypot(x - view.uv_px[t, e, 0], y - view.uv_px[t, e, 1]) <= SURROUNDINGS * size
+            z = (view.clip.cam_from_world[t] @ [*take.point_world[t, e], 1.0])[2]
+            before = (view.link_id[t] == 0) & (depth_m[t] > 0) & (depth_m[t] < z)
+            assert before[around].mean() >= 0.8
+        opened = np.abs(take.joint_position[:, entity.joint] - take.joint_position[0, entity.joint])
+        assert opened[end - 1] > opened[first]  # it moves on
+        assert opened[end - 1] == opened[-1]  # and has stopped
+
+
+@pytest.mark.render
+def test_alone(cabinet: SimObject, renderer: Renderer) -> None:
+    take = generate_take(cabinet, 1, 0, renderer=renderer, settings=SMALL, suite=ALONE, provenance={"commit": "none"})
+    assert take.info.name == "cabinet-L1-occlusion12-s000000"
+    assert (take.info.suite, take.info.level) == ("occlusion", 1)
+    assert (take.info.provenance["commit"], take.info.provenance["look_alike"]) == ("none", False)
+    ((name, first, end),) = take.info.provenance["hidden"]
+    assert end - first == 12
+    check_hidden(take)
+    e = [entity.name for entity in take.info.entities].index(name)
+    assert take.views[0].visible[-1, e]
+    again = arrays(generate_take(cabinet, 1, 0, renderer=renderer, settings=SMALL, suite=ALONE))
+    for key, array in arrays(take).items():
+        np.testing.assert_array_equal(array, again[key], err_msg=key)
+
+
+@pytest.mark.render
+def test_beside_a_look_alike_with_every_second_frame(chest: SimObject, renderer: Renderer) -> None:
+    settings = replace(SMALL, every=2)
+    take = generate_take(chest, 1, 1, renderer=renderer, settings=settings, suite=BESIDE)
+    ((name, first, end),) = take.info.provenance["hidden"]
+    assert end - first == 6
+    check_hidden(take)
+    names = [entity.name for entity in take.info.entities]
+    other = 1 - names.index(name)
+    assert take.views[0].visible[first:end, other].mean() > 0.8
+
+
+@pytest.mark.render
+def test_two_joints_one_after_the_other(chest: SimObject, renderer: Renderer) -> None:
+    suite = replace(SUITES["lockers"], hidden=10)
+    take = generate_take(chest, 2, 0, renderer=renderer, settings=SMALL, suite=suite)
+    assert take.info.suite == "lockers"
+    assert len(take) == 2 * (30 + 10)
+    assert len({name for name, _, _ in take.info.provenance["hidden"]}) == 2
+    check_hidden(take)
+
+
+@pytest.mark.render
+def test_nothing_that_the_suite_could_hide(cabinet: SimObject, chest: SimObject, renderer: Renderer) -> None:
+    with pytest.raises(ObjectError, match="same label, found none"):
+        generate_take(cabinet, 1, 0, renderer=renderer, settings=SMALL, suite=BESIDE)
+    with pytest.raises(ObjectError, match="no look-alike in view, found none in 24 draws"):
+        generate_take(chest, 1, 0, renderer=renderer, settings=SMALL, suite=ALONE)
+    with pytest.raises(ConfigError, match="1 view"):
+        generate_take(chest, 1, 0, renderer=renderer, settings=replace(SMALL, views=2), suite=BESIDE)
+
+
+@pytest.mark.parametrize("hidden", [9, 121])
+def test_hidden_for_too_short_or_too_long(hidden: int) -> None:
+    with pytest.raises(ConfigError, match=f"10 to 120 frames, got {hidden}"):
+        replace(SUITES["occlusion"], hidden=hidden)
+
+
+def test_presets() -> None:
+    assert all(isinstance(suite, Suite) and suite.name == name for name, suite in SUITES.items())
+    assert SUITES["lockers"].level == 4
+    assert SUITES["lockers"].hidden == 30
