@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from quest.errors import InputError
-from quest.grounding import JointEstimator, JointKind, fit_joint
+from quest.grounding import JointEstimator, JointKind, JointPrior, fit_joint
 from tests.grounding.tracks import angle_deg, make_track
 
 
@@ -45,6 +45,84 @@ def test_a_point_that_tells_nothing_new_costs_no_fit(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("quest.grounding.online.fit_joint", lambda *a, **k: pytest.fail("fitted again"))
     estimator.add(np.full(3, 0.001))
     assert estimator.joint is before
+
+
+def test_outliers_do_not_crowd_out_the_motion():
+    """Every fifth point is wrong by decimetres, for far more frames than are kept."""
+    points, axis, _ = make_track(JointKind.REVOLUTE, amount=1.2, sigma=0.002, seed=2, n=400)
+    rng = np.random.default_rng(2)
+    points[::5] += 0.15 * rng.normal(size=points[::5].shape)
+    estimator = JointEstimator(0.002, capacity=32)
+    for point in points:
+        estimator.add(point)
+        joint = estimator.joint
+    assert joint is not None
+    assert joint.kind is JointKind.REVOLUTE
+    assert angle_deg(joint.axis, axis) < 1.5
+    assert joint.upper - joint.lower == pytest.approx(1.2, abs=0.05)
+
+
+def test_what_the_joint_foretold_waits_for_more(monkeypatch: pytest.MonkeyPatch):
+    points, _, _ = make_track(JointKind.PRISMATIC, amount=0.5, sigma=0.002, seed=1)
+    estimator = JointEstimator(0.002)
+    for point in points:
+        estimator.add(point)
+    joint, fits = estimator.joint, []
+    assert joint is not None
+    monkeypatch.setattr("quest.grounding.online.fit_joint", lambda *a, **k: fits.append(1) or joint)
+    for q in np.linspace(0.05, 0.45, 9):
+        estimator.add(joint.at(np.array([q]))[0] + [0.003, 0.0, 0.0])
+        assert estimator.joint is joint
+    assert len(fits) <= 3
+    estimator.add(joint.at(np.array([0.2]))[0] + 0.1)
+    assert estimator.joint is joint
+    assert len(fits) <= 4
+
+
+@pytest.mark.parametrize("kind", [JointKind.PRISMATIC, JointKind.REVOLUTE])
+def test_restored_estimators_go_on_to_the_same_bytes(kind: JointKind):
+    points, axis, origin = make_track(kind, amount=1.0, sigma=0.003, seed=6, n=120)
+    points[7::11] += 0.1
+    whole, first = JointEstimator(0.003, capacity=24), JointEstimator(0.003, capacity=24)
+    for t, point in enumerate(points):
+        prior = JointPrior(0.6, axis, 0.3 + 0.001 * t, axis, 0.3, origin, 0.2) if t > 20 else None
+        for estimator in (whole, first):
+            estimator.prior = prior
+            estimator.add(point)
+        if t % 3:
+            assert whole.joint is not None
+            assert first.joint is not None
+        if t in (0, 5, 40, 90):
+            second = JointEstimator(1.0)
+            second.restore({name: value.copy() for name, value in first.state().items()})
+            first = second
+    one, other = whole.state(), first.state()
+    assert list(one) == list(other)
+    assert all(one[name].tobytes() == other[name].tobytes() for name in one)
+    assert all(value.dtype == np.float64 for value in one.values())
+
+
+def test_a_copy_goes_its_own_way():
+    points, _, _ = make_track(JointKind.PRISMATIC, amount=0.5, sigma=0.002, seed=1)
+    estimator = JointEstimator(0.002)
+    for point in points[:30]:
+        estimator.add(point)
+    before = estimator.state()
+    other = estimator.copy()
+    for point in points[30:]:
+        other.add(point)
+    assert len(other.state()["points"]) > len(before["points"])
+    assert all((estimator.state()[name] == before[name]).all() for name in before)
+
+
+def test_a_state_that_is_not_one_is_refused():
+    estimator = JointEstimator(0.01)
+    with pytest.raises(InputError, match="lacks"):
+        estimator.restore({"points": np.zeros((0, 3))})
+    with pytest.raises(InputError, match="belong together"):
+        estimator.restore(estimator.state() | {"counts": np.ones(4)})
+    with pytest.raises(InputError, match="joint prior: the state lacks"):
+        JointPrior.restored({})
 
 
 def test_bad_input_is_refused():

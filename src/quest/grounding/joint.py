@@ -6,11 +6,14 @@ section 4, for the three models.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+
+from quest.errors import InputError
 
 
 class JointKind(StrEnum):
@@ -19,6 +22,9 @@ class JointKind(StrEnum):
     STATIC = "static"
     PRISMATIC = "prismatic"
     REVOLUTE = "revolute"
+
+
+_KINDS = tuple(JointKind)
 
 
 @dataclass(frozen=True)
@@ -49,6 +55,29 @@ class Joint:
     sigma: float
     n: int
 
+    @property
+    def radius(self) -> float:
+        """Distance of the point from the axis of turning; 0 for other kinds."""
+        return float(np.linalg.norm(self.rest - self.origin))
+
+    @property
+    def axis_sigma_rad(self) -> float:
+        """Standard deviation of the axis' direction about each of two perpendicular directions; NaN if static."""
+        if self.kind is JointKind.STATIC:
+            return float("nan")
+        return float(np.sqrt(np.trace(self.covariance[:2, :2]) / 2))
+
+    def describe(self, unit: str = "m") -> str:
+        """One line for people; ``unit`` is the name of the track's unit of length."""
+        if self.kind is JointKind.STATIC:
+            return f"static, at {_numbers(self.rest)} {unit}"
+        known = f"axis +-{np.degrees(self.axis_sigma_rad):.1f} degrees"
+        if self.kind is JointKind.PRISMATIC:
+            seen = f"seen {self.lower:.2f} to {self.upper:.2f} {unit}"
+            return f"prismatic, axis {_numbers(self.axis)}, {seen}, {known}"
+        seen = f"seen {np.degrees(self.lower):.0f} to {np.degrees(self.upper):.0f} degrees"
+        return f"revolute, axis {_numbers(self.axis)}, radius {self.radius:.2f} {unit}, {seen}, {known}"
+
     def at(self, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
         """Points of the curve."""
         if self.kind is JointKind.STATIC:
@@ -76,6 +105,61 @@ class Joint:
         freedom = 3 if self.kind is JointKind.STATIC else 2
         return np.sqrt(np.maximum(variance, 0) / freedom)
 
+    def transformed(
+        self, rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"], scale: float = 1.0
+    ) -> Joint:
+        """The same joint in a frame whose points are ``scale * rotation @ point + translation``.
+
+        Raises:
+            InputError: no proper rotation, a scale that is not positive, or numbers that are not finite.
+        """
+        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-5) and np.linalg.det(rotation) > 0
+        if not (proper and np.isfinite(translation).all() and np.isfinite(scale) and scale > 0):
+            raise InputError(
+                "joint: expected a rotation, a finite translation and a positive scale, "
+                f"got {rotation}, {translation}, {scale}"
+            )
+        axis = rotation @ self.axis
+        axis = axis / np.linalg.norm(axis)
+        if self.kind is JointKind.STATIC:
+            change = scale * rotation
+        else:
+            # The turned basis is not that of the turned axis.
+            turn = perpendicular(axis).T @ rotation @ perpendicular(self.axis)
+            change = scale * np.eye(len(self.covariance))
+            change[:2, :2], change[2:4, 2:4] = turn, scale * turn
+        length = scale if self.kind is JointKind.PRISMATIC else 1.0
+        return replace(
+            self,
+            axis=axis,
+            origin=scale * rotation @ self.origin + translation,
+            rest=scale * rotation @ self.rest + translation,
+            lower=length * self.lower,
+            upper=length * self.upper,
+            covariance=change @ self.covariance @ change.T,
+            sigma=scale * self.sigma,
+        )
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The joint as numeric arrays."""
+        state = {f.name: np.array(getattr(self, f.name), np.float64) for f in fields(self)[1:]}
+        return state | {"kind": np.array(_KINDS.index(self.kind), np.float64)}
+
+    @classmethod
+    def restored(cls, state: dict[str, np.ndarray]) -> Joint:
+        """The joint that :meth:`state` gave.
+
+        Raises:
+            InputError: an entry is missing.
+        """
+        missing = {f.name for f in fields(cls)} - set(state)
+        if missing:
+            raise InputError(f"joint: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
+        values = {f.name: np.array(state[f.name], np.float64) for f in fields(cls)[1:]}
+        plain: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in values.items()}
+        plain["n"] = int(plain["n"])
+        return cls(_KINDS[int(state["kind"])], **plain)
+
     def _tangent(self, q: np.ndarray) -> np.ndarray:
         if self.kind is JointKind.STATIC:
             return np.zeros((len(q), 3))
@@ -98,6 +182,10 @@ class Joint:
         radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-12)
         height = np.repeat(self.axis[None, :, None], len(q), axis=0)
         return np.concatenate((tilt, shift, radial[:, :, None], height), axis=2)
+
+
+def _numbers(vector: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x:.2f}" for x in vector) + ")"
 
 
 def perpendicular(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:

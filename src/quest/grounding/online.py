@@ -7,11 +7,17 @@ from jaxtyping import Float
 
 from quest.errors import InputError
 from quest.grounding.fit import fit_joint
-from quest.grounding.joint import Joint
+from quest.grounding.joint import Joint, JointKind
 from quest.grounding.prior import JointPrior
 
 _MERGE_SIGMAS = 0.7
 _MOST_COUNTED = 4.0
+_NEW_PLACES = 4
+_FEW_PLACES = 12
+_AS_EXPECTED_SIGMAS = 3.0
+_OUTLIER_SIGMAS = 5.0
+_MOST_OUTLIERS = 0.25
+_FURTHER = 0.1
 
 
 class JointEstimator:
@@ -19,10 +25,12 @@ class JointEstimator:
 
     Points nearer to each other than a fraction of the noise become one, their mean; so a long stand-still does not
     crowd out the motion, and a mean counts at most as four points, because errors of neighbouring frames are alike.
+    A point where the joint says that it is, among those that were seen, waits for three others before the joint is
+    fitted again.
 
     Args:
         sigma: standard deviation of a point per coordinate.
-        capacity: most points that are kept; of more, the two nearest become one.
+        capacity: most points that are kept; of more, the two nearest become one, or the oldest of many outliers goes.
 
     Attributes:
         prior: what is believed besides the track; takes effect at the next fit.
@@ -32,10 +40,11 @@ class JointEstimator:
         if not (np.isfinite(sigma) and sigma > 0) or capacity < 4:
             raise InputError(f"joint: expected a positive sigma and a capacity of 4 or more, got {sigma}, {capacity}")
         self.prior: JointPrior | None = None
-        self._sigma = sigma
-        self._capacity = capacity
+        self._sigma = float(sigma)
+        self._capacity = int(capacity)
         self._points = np.zeros((0, 3))
         self._counts = np.zeros(0)
+        self._waiting = 0
         self._stale = False
         self._joint: Joint | None = None
 
@@ -44,8 +53,8 @@ class JointEstimator:
         """The joint that explains the points so far; None without any. Fitted when something new is known."""
         if self._stale:
             sigma = self._sigma / np.sqrt(np.minimum(self._counts, _MOST_COUNTED))
-            self._joint = fit_joint(self._points, sigma, prior=self.prior)
-            self._stale = False
+            self._joint = fit_joint(self._points, sigma, prior=self.prior, near=self._joint)
+            self._stale, self._waiting = False, 0
         return self._joint
 
     def add(self, point: Float[np.ndarray, "3"]) -> None:
@@ -64,23 +73,87 @@ class JointEstimator:
                 return
         self._points = np.vstack((self._points, point))
         self._counts = np.append(self._counts, 1.0)
-        self._stale = True
+        self._tell(not self._as_expected(point))
         if len(self._points) > self._capacity:
-            self._join_nearest()
+            self._make_room()
+
+    def copy(self) -> JointEstimator:
+        """Another estimator that goes on from here by itself."""
+        other = JointEstimator(self._sigma, capacity=self._capacity)
+        other.restore(self.state())
+        return other
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that was learned and set, as numeric arrays: what is restored from it goes on to the same bytes."""
+        state = {"points": self._points.copy(), "counts": self._counts.copy()}
+        state["settings"] = np.array([self._sigma, self._capacity, self._waiting, self._stale], np.float64)
+        if self._joint is not None:
+            state |= {f"joint.{name}": value for name, value in self._joint.state().items()}
+        if self.prior is not None:
+            state |= {f"prior.{name}": value for name, value in self.prior.state().items()}
+        return state
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from what :meth:`state` gave.
+
+        Raises:
+            InputError: entries are missing or do not belong together.
+        """
+        missing = {"points", "counts", "settings"} - set(state)
+        if missing:
+            raise InputError(f"joint: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
+        n = len(state["points"])
+        if state["points"].shape != (n, 3) or state["counts"].shape != (n,) or state["settings"].shape != (4,):
+            raise InputError("joint: points, counts and settings of the state do not belong together")
+        self._points, self._counts = (np.array(state[name], np.float64) for name in ("points", "counts"))
+        sigma, capacity, waiting, stale = state["settings"]
+        self._sigma, self._capacity, self._waiting, self._stale = float(sigma), int(capacity), int(waiting), bool(stale)
+        joint, prior = _below(state, "joint."), _below(state, "prior.")
+        self._joint = Joint.restored(joint) if joint else None
+        self.prior = JointPrior.restored(prior) if prior else None
+
+    def _tell(self, urgent: bool) -> None:
+        """Something new is known; it waits for more of its kind unless it is urgent."""
+        self._waiting += 1
+        self._stale |= urgent or self._waiting >= _NEW_PLACES
+
+    def _as_expected(self, point: np.ndarray) -> bool:
+        """Whether the joint explains a point well, and has been seen to go nearly as far."""
+        joint = self._joint
+        if joint is None or len(self._points) < _FEW_PLACES:
+            return False
+        q = joint.locate(point[None])
+        further = _FURTHER * (joint.upper - joint.lower)
+        seen = joint.lower - further <= q[0] <= joint.upper + further
+        return bool(seen and np.linalg.norm(point - joint.at(q)[0]) < _AS_EXPECTED_SIGMAS * self._sigma)
 
     def _merge(self, index: int, point: np.ndarray) -> None:
         # A running mean that forgets, so that the memory of a long stand-still stays as mobile as a short one's.
         count = self._counts[index] + 1
         self._points[index] += (point - self._points[index]) / min(count, 16.0)
         self._counts[index] = count
-        self._stale |= count <= _MOST_COUNTED
+        if count <= _MOST_COUNTED:
+            self._tell(not self._as_expected(point))
 
-    def _join_nearest(self) -> None:
+    def _make_room(self) -> None:
+        if self._joint is not None and self._joint.kind is not JointKind.STATIC:
+            gap = np.linalg.norm(self._points - self._joint.at(self._joint.locate(self._points)), axis=1)
+            off = np.flatnonzero(gap[:-1] > _OUTLIER_SIGMAS * self._sigma)
+            if len(off) > _MOST_OUTLIERS * len(gap):
+                self._drop(int(off[0]))
+                return
         gap = np.linalg.norm(self._points[:, None] - self._points[None], axis=-1)
         np.fill_diagonal(gap, np.inf)
-        first, second = sorted(np.unravel_index(int(gap.argmin()), gap.shape))
+        first, second = sorted(int(i) for i in np.unravel_index(int(gap.argmin()), gap.shape))
         weight = self._counts[[first, second]]
         self._points[first] = weight @ self._points[[first, second]] / weight.sum()
         self._counts[first] = weight.sum()
-        self._points = np.delete(self._points, second, axis=0)
-        self._counts = np.delete(self._counts, second)
+        self._drop(second)
+
+    def _drop(self, index: int) -> None:
+        self._points = np.delete(self._points, index, axis=0)
+        self._counts = np.delete(self._counts, index)
+
+
+def _below(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

@@ -1,0 +1,83 @@
+"""A joint by itself: other frames, words, arrays."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from quest.errors import InputError
+from quest.grounding import Joint, JointKind
+from tests.grounding.tracks import unit
+from tests.tiny import BAD_INPUT
+
+SIZES = {JointKind.STATIC: 3, JointKind.PRISMATIC: 4, JointKind.REVOLUTE: 6}
+
+
+def make_joint(kind: JointKind, seed: int) -> Joint:
+    rng = np.random.default_rng(seed)
+    axis, origin = unit(rng), rng.normal(size=3)
+    rest = origin + 0.4 * np.cross(axis, unit(rng)) if kind is JointKind.REVOLUTE else origin
+    root = 0.1 * rng.normal(size=(SIZES[kind], SIZES[kind]))
+    return Joint(kind, axis, origin, rest, -0.1, 0.8, root @ root.T, 0.01, 20)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10_000), st.sampled_from(list(JointKind)), st.floats(0.05, 20.0))
+def test_a_joint_goes_into_another_frame_as_its_curve_does(seed: int, kind: JointKind, scale: float):
+    rng = np.random.default_rng(seed + 1)
+    joint, turn, shift = make_joint(kind, seed), Rotation.random(rng=rng).as_matrix(), rng.normal(size=3)
+    moved = joint.transformed(turn, shift, scale)
+    q, points = np.linspace(-0.5, 1.5, 9), rng.normal(size=(7, 3))
+    unit_of_q = scale if kind is JointKind.PRISMATIC else 1.0
+    np.testing.assert_allclose(moved.at(unit_of_q * q), scale * joint.at(q) @ turn.T + shift, atol=1e-9 * (1 + scale))
+    there = scale * points @ turn.T + shift
+    np.testing.assert_allclose(moved.locate(there), unit_of_q * joint.locate(points), atol=1e-7 * (1 + scale))
+    np.testing.assert_allclose(moved.spread(unit_of_q * q), scale * joint.spread(q), rtol=1e-7)
+    assert (moved.lower, moved.upper) == pytest.approx((unit_of_q * joint.lower, unit_of_q * joint.upper))
+    assert moved.sigma == pytest.approx(scale * joint.sigma)
+    back = moved.transformed(turn.T, -turn.T @ shift / scale, 1 / scale)
+    np.testing.assert_allclose(back.covariance, joint.covariance, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(back.axis, joint.axis, atol=1e-9)
+
+
+def test_only_rigid_motions_and_scales_are_frames():
+    joint = make_joint(JointKind.REVOLUTE, 0)
+    for turn, scale in ((np.diag([1.0, 1.0, -1.0]), 1.0), (2 * np.eye(3), 1.0), (np.eye(3), 0.0)):
+        with pytest.raises(InputError, match="expected a rotation"):
+            joint.transformed(turn, np.zeros(3), scale)
+    with pytest.raises(BAD_INPUT):
+        joint.transformed(np.eye(3), np.full(3, np.nan), 1.0)
+
+
+def test_joints_are_told_in_words():
+    covariance = np.diag(np.square([0.03, 0.03, 0.01, 0.01, 0.01, 0.01]))
+    axis, arm = np.array([0.0, 0.0, 1.0]), np.array([0.41, 0.0, 0.0])
+    door = Joint(JointKind.REVOLUTE, axis, np.zeros(3), arm, -0.05, 0.82, covariance, 0.01, 20)
+    assert door.axis_sigma_rad == pytest.approx(0.03)
+    assert door.radius == pytest.approx(0.41)
+    assert door.describe() == (
+        "revolute, axis (0.00, 0.00, 1.00), radius 0.41 m, seen -3 to 47 degrees, axis +-1.7 degrees"
+    )
+    drawer = Joint(JointKind.PRISMATIC, axis, arm, arm, 0.0, 0.3, covariance[:4, :4], 0.01, 20)
+    assert drawer.describe() == "prismatic, axis (0.00, 0.00, 1.00), seen 0.00 to 0.30 m, axis +-1.7 degrees"
+    still = Joint(JointKind.STATIC, axis, arm, arm, 0.0, 0.0, covariance[:3, :3], 0.01, 20)
+    assert still.describe() == "static, at (0.41, 0.00, 0.00) m"
+    assert np.isnan(still.axis_sigma_rad)
+
+
+@pytest.mark.parametrize("kind", list(JointKind))
+def test_arrays_give_the_same_joint_back(kind: JointKind):
+    joint = make_joint(kind, 3)
+    state = joint.state()
+    assert all(value.dtype == np.float64 for value in state.values())
+    again = Joint.restored(state)
+    assert again.kind is kind
+    for f in fields(Joint):
+        np.testing.assert_array_equal(np.asarray(getattr(again, f.name)), np.asarray(getattr(joint, f.name)))
+    with pytest.raises(InputError, match="lacks kind"):
+        Joint.restored({name: value for name, value in state.items() if name != "kind"})
