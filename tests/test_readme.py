@@ -61,8 +61,9 @@ def test_links_lead_somewhere():
 @pytest.mark.slow
 def test_python_example_runs(monkeypatch, capsys):
     monkeypatch.chdir(ROOT)
-    (block,) = blocks(README, "python")
-    exec(compile(block, "<example of the README>", "exec"), {})
+    shared: dict = {}
+    for block in blocks(README, "python"):
+        exec(compile(block, "<example of the README>", "exec"), shared)
     assert "handle" in capsys.readouterr().out
 
 

@@ -8,6 +8,10 @@ import numpy as np
 import torch
 
 from quest.model.config import NetworkConfig
+from quest.monitor import SIGNALS, Calibration
+from quest.monitor import memory as memories
+from quest.monitor.calibrator import Calibrator
+from quest.monitor.statistic import Cusum
 from quest.track import Tracker, TrackerConfig
 from quest.types import Clip
 from tests.synthetic import make_take
@@ -27,6 +31,21 @@ def make_tracker(network: NetworkConfig = DEFAULT, config: TrackerConfig = EAGER
 def make_clip(*, frames: int = 6, size: tuple[int, int] = (64, 64)) -> Clip:
     """The first view of a synthetic take."""
     return make_take(frames=frames, views=1, entities=2, size=size).views[0].clip
+
+
+def make_calibration(*, alarming: bool) -> Calibration:
+    """A monitor that finds every frame suspicious, or none, whatever the signals."""
+    signals, features = len(SIGNALS), memories.FEATURES
+    calibrator = Calibrator(
+        center=np.zeros(signals),
+        scale=np.ones(signals),
+        direct=np.zeros((1, features)),
+        inner=np.zeros((1, features, 0)),
+        inner_bias=np.zeros((1, 0)),
+        outer=np.zeros((1, 0)),
+        bias=np.array([3.0 if alarming else -3.0]),
+    )
+    return Calibration(calibrator, Cusum(0.0), np.linspace(0.0, 5.0, 200), 60, "made up")
 
 
 def without_depth(clip: Clip, frames: slice) -> Clip:

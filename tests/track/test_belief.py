@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from quest.errors import ConfigError, WeightsError
-from quest.track.belief import Belief, update
+from quest.track.belief import Belief, moved, update
 from quest.track.settings import TrackerConfig
 
 SIDE = 8
@@ -43,7 +43,8 @@ def step(
 ) -> Belief:
     where = plane() if point is None else point
     favour = torch.zeros_like(logits) if favour is None else favour
-    return update(belief, logits, torch.full((len(logits),), seen), where, grid(), favour, CONFIG)
+    prior = None if belief is None else moved(belief, where, grid(), CONFIG.move_sigma)
+    return Belief(update(prior, logits, torch.full((len(logits),), seen), favour, CONFIG), where)
 
 
 def best(belief: Belief) -> list[int]:
@@ -153,6 +154,14 @@ def test_settings_round_trip():
 def test_foreign_settings_are_refused(text: str):
     with pytest.raises(WeightsError):
         TrackerConfig.from_json(text)
+
+
+def test_longer_gaps_let_things_move_farther():
+    logits = peaked(0, height=30.0)
+    before = step(None, logits)
+    near, far = (moved(before, plane(), grid(), sigma)[0] for sigma in (0.1, 0.5))
+    assert far[SIDE * SIDE - 1] > near[SIDE * SIDE - 1]
+    torch.testing.assert_close(far.sum(), torch.tensor(1.0))
 
 
 def test_what_else_is_known_decides_between_equals():

@@ -9,18 +9,18 @@ import pytest
 import torch
 
 from quest.model.observation import cell_centres
-from quest.track.evidence import Evidence
+from quest.track.evidence import FrameEvidence
 from tests.tiny import DEFAULT, make_frames
 
 WALL_M = 1.5
 
 
-def evidence(log_p: torch.Tensor | None = None) -> tuple[Evidence, float]:
+def evidence(log_p: torch.Tensor | None = None) -> tuple[FrameEvidence, float]:
     """One frame that looks at a wall, and the metres of a reference unit."""
     frames = make_frames(batch=1, frames=1)
     frames = replace(frames, depth_m=torch.full_like(frames.depth_m, WALL_M))
     log_p = torch.zeros(DEFAULT.cells**2) if log_p is None else log_p
-    return Evidence(frames, log_p, DEFAULT), float(frames.scale[0])
+    return FrameEvidence(frames, log_p, DEFAULT), float(frames.scale[0])
 
 
 def place(depth_m: float, *, x_px: float = 32.0) -> np.ndarray:
@@ -35,24 +35,21 @@ def place(depth_m: float, *, x_px: float = 32.0) -> np.ndarray:
 def test_room_is_what_is_seen_behind_a_place(depth_m: float, room_m: float):
     frame, scale = evidence()
     assert frame.room(place(depth_m)[None])[0] == pytest.approx(room_m / scale, abs=1e-4)
-    assert frame.covers(place(depth_m)) == (room_m < -0.1)
-    assert frame.free(place(depth_m)[None])[0] == (room_m > 0.1)
 
 
 def test_nothing_is_known_where_nothing_is_seen():
     frame, _ = evidence()
     outside = place(1.5, x_px=-20.0)[None]
     assert np.isnan(frame.room(outside)).all()
-    assert np.isnan(frame.score(outside)).all()
-    assert not frame.covers(outside[0])
-    assert not frame.free(outside).any()
+    assert np.isnan(frame.ratio(outside)).all()
 
 
-def test_score_is_that_of_the_cell():
+def test_ratio_is_that_of_the_cell_to_chance():
     log_p = torch.randn(DEFAULT.cells**2, generator=torch.Generator().manual_seed(0))
     frame, _ = evidence(log_p)
     cell = 35
     x, y = cell_centres(DEFAULT)[cell].tolist()
     frames = make_frames(batch=1, frames=1)
     point = frames.to_reference(torch.tensor([[[[x, y]]]]), torch.tensor([[[WALL_M]]]))[0, 0].double().numpy()
-    assert frame.score(point)[0] == pytest.approx(float(log_p[cell]), abs=1e-3)
+    chance = -np.log(DEFAULT.cells**2)
+    assert frame.ratio(point)[0] == pytest.approx(float(log_p[cell]) - chance, abs=1e-3)

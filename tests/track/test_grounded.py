@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
@@ -32,16 +35,28 @@ def opened(to: float = 1.2, *, seed: int = 0) -> Ground:
     return ground
 
 
-def nothing(points: np.ndarray) -> np.ndarray:
-    return np.full(len(points), np.nan)
+@dataclass
+class Sight:
+    """A frame that shows the query at some places and sees others behind or before something."""
+
+    shown: Callable[[np.ndarray], np.ndarray] = lambda p: np.full(len(p), np.nan)
+    behind: Callable[[np.ndarray], np.ndarray] = lambda p: np.full(len(p), np.nan)
+
+    def ratio(self, point: np.ndarray) -> np.ndarray:
+        return self.shown(point)
+
+    def room(self, point: np.ndarray) -> np.ndarray:
+        return self.behind(point)
 
 
-def nowhere(points: np.ndarray) -> np.ndarray:
-    return np.zeros(len(points), bool)
+BLIND = Sight()
+COVERED = Sight(behind=lambda p: np.full(len(p), -1.0))
 
 
-def hide(ground: Ground, before: np.ndarray, *, point=(np.nan,) * 3, seen=0.0, evidence=nothing, free=nowhere):
-    return ground.hide(before, np.array(point), seen, evidence, free)
+def hide(
+    ground: Ground, before: np.ndarray, *, point=(np.nan,) * 3, seen=0.0, frame: Sight = BLIND, buried: bool = False
+):
+    return ground.hide(before, np.array(point), seen, frame, buried=buried)
 
 
 def test_before_anything_moves_the_belief_favours_its_curve():
@@ -79,7 +94,7 @@ def test_a_hidden_query_follows_the_evidence_along_its_joint():
     ground, place = opened(), on_door(1.2)
     for target in np.linspace(1.2, 2.0, 20):
         goal = on_door(target)
-        place = hide(ground, place, evidence=lambda p, g=goal: -20 * np.linalg.norm(p - g, axis=1))
+        place = hide(ground, place, frame=Sight(lambda p, g=goal: -50 * np.linalg.norm(p - g, axis=1)))
     assert np.linalg.norm(place - on_door(2.0)) < 0.08
 
 
@@ -87,8 +102,18 @@ def test_a_hidden_query_is_not_where_one_looks_through():
     """Everything up to 1.5 rad is seen to be empty, so the door must have gone on."""
     ground, place = opened(), on_door(1.2)
     for _ in range(30):
-        place = hide(ground, place, free=lambda p: np.arctan2(p[:, 1], p[:, 0]) < 1.5)
+        place = hide(ground, place, frame=Sight(behind=lambda p: np.where(np.arctan2(p[:, 1], p[:, 0]) < 1.5, 1.0, -1)))
     assert np.arctan2(place[1], place[0]) > 1.45
+
+
+def test_behind_something_nothing_is_learnt_from_what_is_before_it():
+    """What looks like the query on a board that covers it everywhere does not draw it back; it moves on as it moved."""
+    ground, place = opened(), on_door(1.2)
+    goal = on_door(0.2)
+    board = Sight(lambda p: -50 * np.linalg.norm(p - goal, axis=1) + 9, COVERED.behind)
+    for _ in range(30):
+        place = hide(ground, place, frame=board, buried=True)
+    assert 1.2 < np.arctan2(place[1], place[0]) < 1.9
 
 
 def test_being_seen_again_ends_hiding():
@@ -106,3 +131,48 @@ def test_a_query_that_may_be_seen_after_all_is_near_that_place():
     assert np.linalg.norm(place - on_door(1.9)) < 0.1
     far = hide(ground, place, point=on_door(1.9) + 2 * AXIS, seen=0.4)
     assert np.linalg.norm(far - on_door(1.9)) < 0.15
+
+
+def test_what_the_joint_allows_may_be_covered():
+    ground, place = opened(), on_door(1.2)
+    assert ground.covered(place, COVERED, 1.0) == pytest.approx(1.0)
+    ahead = Sight(behind=lambda p: np.where(np.arctan2(p[:, 1], p[:, 0]) > 1.2, -1.0, 0.0))
+    assert 0.3 < ground.covered(place, ahead, 1.0) < 0.7
+    assert ground.covered(place, BLIND, 1.0) == 0.0
+    assert Ground(CONFIG).covered(place, COVERED, 1.0) == 1.0
+
+
+def test_a_hidden_query_is_expected_along_its_joint():
+    ground = opened()
+    on, off = on_door(1.25), on_door(1.25) + 0.4 * AXIS
+    expected = ground.expected(on_door(1.2), np.stack((on, off, np.full(3, np.nan))), 1.0)
+    assert expected is not None
+    assert expected.sum() == pytest.approx(1.0)
+    assert expected[0] > 0.99
+    assert ground.expected(on_door(1.2), np.full((4, 3), np.nan), 1.0) is None
+    assert Ground(CONFIG).expected(on, on[None], 1.0) is None
+
+
+def test_residual_is_in_standard_deviations():
+    ground = opened()
+    assert ground.residual(on_door(0.7)) < 1
+    assert ground.residual(on_door(0.7) + 0.2 * AXIS) == pytest.approx(0.2 / CONFIG.point_sigma, rel=0.3)
+    assert np.isnan(ground.residual(np.full(3, np.nan)))
+    assert np.isnan(Ground(CONFIG).residual(on_door(0.0)))
+
+
+@pytest.mark.parametrize("hidden", [False, True])
+def test_a_copy_answers_alike_and_learns_by_itself(hidden: bool):
+    ground = opened()
+    if hidden:
+        hide(ground, on_door(1.2))
+    copy = ground.copy()
+    points = on_door(np.linspace(-1, 2, 50)) + 0.08 * AXIS
+    np.testing.assert_array_equal(copy.favour(points), ground.favour(points))
+    np.testing.assert_array_equal(hide(copy, on_door(1.2)), hide(ground, on_door(1.2)))
+    for angle in np.linspace(1.2, 1.6, 10):
+        copy.see(on_door(angle), door_row(on_door(angle)))
+        ground.see(on_door(angle), door_row(on_door(angle)))
+    np.testing.assert_array_equal(copy.favour(points), ground.favour(points))
+    copy.see(on_door(2.4), door_row(on_door(2.4)))
+    assert (copy.favour(points) != ground.favour(points)).any()

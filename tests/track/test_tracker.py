@@ -110,13 +110,13 @@ def test_a_query_that_binds_counts_its_frame_once(clip: Clip):
     stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
     with torch.inference_mode():
         stream.step(frame.rgb, frame.depth_m, 0.0, frame.cam_from_world)
-        anchor = stream._anchor
+        anchor = stream._binding.anchor
         assert anchor is not None
         window = Observation.stack(list(stream._ring))
         x = tracker.network.embed(anchor, window)[:, -1:]
         assert isinstance(tracker.network.head, HeatmapHead)
         logits = tracker.network.head.logits(x, window.during(slice(-1, None)))[0, 0]
-        for k, one in enumerate(stream._bound):
+        for k, one in enumerate(stream._following):
             assert one.belief is not None
             expected = (logits[k] / tracker.config.temperature).softmax(-1)
             torch.testing.assert_close(one.belief.probability[0], expected, rtol=1e-3, atol=1e-6)
@@ -219,7 +219,7 @@ def test_answers_are_in_source_pixels(size: tuple[int, int]):
     tracker, clip = make_tracker(), make_clip(frames=3, size=size)
     assert clip.depth_m is not None
     stream = tracker.stream(clip.camera, [])
-    box = stream._letterbox
+    box = stream._intake.letterbox
     square = Clip(
         "square",
         box.camera,
@@ -283,7 +283,7 @@ def test_memory_is_bounded(clip: Clip):
         stream.step(frame.rgb, frame.depth_m, float(t))
         assert len(stream._ring) == DEFAULT.window
     assert all(observed.tokens.shape[1] == 1 for observed in stream._ring)
-    assert len(stream._bound) == 2
+    assert len(stream._following) == 2
 
 
 @pytest.mark.parametrize(
@@ -296,6 +296,7 @@ def test_memory_is_bounded(clip: Clip):
         ({"depth_m": np.zeros((64, 64), np.uint16)}, "units"),
         ({"cam_from_world": np.eye(3)}, "4 x 4"),
         ({"cam_from_world": np.full((4, 4), np.nan)}, "finite"),
+        ({"stamp_s": float("nan")}, "stamp"),
     ],
 )
 def test_bad_frames(changes: dict, named: str, clip: Clip, pytestconfig: pytest.Config):
@@ -370,7 +371,7 @@ def test_an_answer_that_leaps_onto_what_came_is_not_seen(clip: Clip, monkeypatch
     final = tracker.network.head.judge[-1]
     assert isinstance(final, torch.nn.Linear)
     torch.nn.init.constant_(final.bias, 5.0)  # sure that everything is seen
-    monkeypatch.setattr("quest.track.stream._AFTER_ALL", 1.0)
+    monkeypatch.setattr("quest.track.placing._AFTER_ALL", 1.0)
     believed = tracker.track(replace(clip, depth_m=board), POINTS)
     monkeypatch.undo()
     tracks = tracker.track(replace(clip, depth_m=board), POINTS)

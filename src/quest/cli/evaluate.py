@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from quest.evaluation.runner import Evaluated
     from quest.evaluation.selection import SplitPart
 
-TrackerName = Literal["quest", "lk", "hold-still"]
+TrackerName = Literal["quest", "quest-ungrounded", "lk", "hold-still"]
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Eval:
     Attributes:
         takes: folder of the take store.
         protocol: point (the true pixel is given) and semantic (nothing is given).
-        trackers: what to compare.
+        trackers: what to compare; quest-ungrounded is quest without joints.
         weights: name or file of the weights of the tracker quest.
         split: parts of the object split; training objects are reported only if train is named here.
         level: levels to evaluate; all by default.
@@ -115,17 +115,18 @@ class Eval:
         names = list(dict.fromkeys(self.trackers))
         if "point" in self.protocol and "hold-still" not in names:
             names.append("hold-still")
-        trackers: list[ClipTracker] = []
-        for name in names:
-            if name == "quest":
-                import quest
+        trackers: dict[str, ClipTracker] = {"lk": LucasKanade(), "hold-still": HoldStill()}
+        if any(name.startswith("quest") for name in names):
+            import quest
 
-                tracker = quest.load(self.weights)
-                remember_frames(tracker.network, capacity=1000)  # both protocols see the same frames
-                trackers.append(tracker)
-            else:
-                trackers.append(LucasKanade() if name == "lk" else HoldStill())
-        return trackers
+            tracker = quest.load(self.weights)
+            remember_frames(tracker.network, capacity=1000)  # all protocols and settings see the same frames
+            trackers["quest"] = tracker
+            if "quest-ungrounded" in names:
+                trackers["quest-ungrounded"] = tracker.with_config(
+                    replace(tracker.config, ground=False), name="quest-ungrounded"
+                )
+        return [trackers[name] for name in names]
 
     def _evaluate(
         self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], console: Console

@@ -13,7 +13,9 @@ from rich.markup import escape
 from quest.cli.data import Data
 from quest.cli.doctor import Doctor
 from quest.cli.evaluate import Eval
+from quest.cli.evaluate_monitor import EvalMonitor
 from quest.cli.generate import Generate
+from quest.cli.monitor import Monitor
 from quest.cli.track import Track
 from quest.cli.train import Train
 from quest.cli.weights import Weights
@@ -28,7 +30,9 @@ COMMANDS: dict[str, type[Command]] = {
     "data": Data,
     "train": Train,
     "track": Track,
+    "monitor": Monitor,
     "eval": Eval,
+    "eval-monitor": EvalMonitor,
     "weights": Weights,
     "doctor": Doctor,
 }

@@ -12,9 +12,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from quest.errors import InputError
-from quest.types import State, Tracks
+from quest.types import Joints, State, Tracks
 
-VERSION = 1
+VERSION = 2
 _METADATA_KEY = b"quest-tracks"
 
 SCHEMA = pa.schema(
@@ -32,16 +32,19 @@ SCHEMA = pa.schema(
         ("confidence", pa.float32()),
         ("visible", pa.bool_()),
         ("state", pa.string()),
+        ("lost_p", pa.float32()),
+        ("alarm", pa.bool_()),
     ]
 )
-"""Columns: pixels in the source image, metres in the world frame; null where there is no position."""
+"""Columns: pixels in the source image, metres in the world frame; null where there is no position, and where a tracker
+does not say how probably it is lost or whether it alarms."""
 
 
 def write_tracks(tracks: Tracks, path: str | Path) -> None:
     """Write tracks as Parquet, all or nothing; an existing file is replaced.
 
-    Rows are ordered by frame, then query. Names, labels, time stamps and frame flags are in the metadata too, so that
-    tracks without queries come back whole.
+    Rows are ordered by frame, then query. Names, labels, time stamps, frame flags and joints are in the metadata, so
+    that tracks without queries come back whole.
     """
     frames, queries = tracks.uv_px.shape[:2]
     frame, query = (index.ravel() for index in np.indices((frames, queries), dtype=np.int32))
@@ -60,6 +63,8 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
         "confidence": tracks.confidence.ravel(),
         "visible": tracks.visible.ravel(),
         "state": [str(state) for state in tracks.state.ravel()],
+        "lost_p": [None] * len(frame) if tracks.lost_p is None else tracks.lost_p.ravel(),
+        "alarm": [None] * len(frame) if tracks.alarm is None else tracks.alarm.ravel(),
     }
     arrays = [pa.array(columns[field.name], type=field.type, from_pandas=True) for field in SCHEMA]
     metadata = {
@@ -68,6 +73,8 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
         "labels": tracks.labels,
         "stamp_s": [float(stamp) for stamp in tracks.stamp_s],
         "frame_flags": tracks.frame_flags,
+        "watched": tracks.lost_p is not None,
+        "joints": None if tracks.joints is None else _joints_to_json(tracks.joints),
     }
     schema = SCHEMA.with_metadata({_METADATA_KEY: json.dumps(metadata).encode()})
     target = Path(path)
@@ -129,4 +136,24 @@ def read_tracks(path: str | Path) -> Tracks:
         ),
         stamp_s=np.array(metadata["stamp_s"], dtype=np.float64),
         frame_flags=tuple(metadata["frame_flags"]),
+        lost_p=column("lost_p").astype(np.float32) if metadata["watched"] else None,
+        alarm=column("alarm").astype(bool) if metadata["watched"] else None,
+        joints=None if metadata["joints"] is None else _joints_from_json(metadata["joints"]),
     )
+
+
+def _joints_to_json(joints: Joints) -> list[dict]:
+    """One entry per query; JSON has no NaN."""
+    rows = zip(joints.kind, joints.axis, joints.origin, strict=True)
+    return [{"kind": k, "axis": _finite(a), "origin_m": _finite(o)} for k, a, o in rows]
+
+
+def _finite(vector: np.ndarray) -> list[float] | None:
+    return [float(v) for v in vector] if np.isfinite(vector).all() else None
+
+
+def _joints_from_json(rows: list[dict]) -> Joints:
+    def stacked(name: str) -> np.ndarray:
+        return np.array([row[name] or [np.nan] * 3 for row in rows], np.float32).reshape(len(rows), 3)
+
+    return Joints(tuple(row["kind"] for row in rows), stacked("axis"), stacked("origin_m"))

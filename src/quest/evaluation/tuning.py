@@ -123,7 +123,7 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
 def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[str], list[float]]:
     """Canvas pixels, labels and logits of all candidates in a view's first frame, best first."""
     clip = take.views[view].clip
-    peaks = tracker.stream(clip.camera).candidates(clip.frame(0))
+    peaks = tracker.candidates(clip.camera, clip.frame(0))
     size = tracker.network.config.encoder.image_size
     return peaks.uv.cpu().numpy() * size, [LABELS[int(n)] for n in peaks.label], peaks.logit.tolist()
 
@@ -148,7 +148,7 @@ def _scores(
     tracker: Tracker, configs: Sequence[TrackerConfig], store: TakeStore, takes: Mapping[str, SplitPart]
 ) -> list[float]:
     """Mean over sources of the mean 3D distance of moved entities, for every configuration."""
-    trials = [_Named(tracker, config, f"{i}") for i, config in enumerate(configs)]
+    trials = [tracker.with_config(config, name=f"{i}") for i, config in enumerate(configs)]
     records = evaluate(store, takes, trials, protocols=("point",)).records
     return [_ape([r for r in records if r.subject.tracker == trial.name]) for trial in trials]
 
@@ -161,11 +161,3 @@ def _ape(records: list[EntityRecord]) -> float:
     if not by_source:
         raise ConfigError("tuning: no entity moves in these takes")
     return float(np.mean([np.concatenate(d).mean() for d in by_source.values()]))
-
-
-class _Named(Tracker):
-    """A tracker that shares another's network under settings and a name of its own."""
-
-    def __init__(self, tracker: Tracker, config: TrackerConfig, name: str) -> None:
-        super().__init__(tracker.network, config, device=tracker.device)
-        self.name = name

@@ -38,6 +38,10 @@ class Anchor:
             torch.cat((self.valid, other.valid), dim=1),
         )
 
+    def select(self, rows: Int[Tensor, " R"]) -> Anchor:
+        """Some of these queries."""
+        return Anchor(self.content[:, rows], self.template[:, rows], self.valid[:, rows])
+
 
 @dataclass(frozen=True)
 class Prediction:

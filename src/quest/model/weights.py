@@ -30,6 +30,7 @@ class LoadedNetwork:
         settings: settings of the tracker that were chosen with these weights, as JSON text.
         about: where the weights come from.
         sha256: of the file.
+        monitor: calibration of the monitor that was fitted with these weights, as JSON text; None without.
     """
 
     name: str
@@ -38,9 +39,10 @@ class LoadedNetwork:
     settings: str
     about: str
     sha256: str
+    monitor: str | None = None
 
 
-def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str) -> None:
+def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str, monitor: str | None = None) -> None:
     """Write a network in half precision, atomically.
 
     Args:
@@ -48,9 +50,11 @@ def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str
         network: the network with its encoder.
         settings: settings of the tracker, as JSON text.
         about: where the weights come from, a line for people.
+        monitor: calibration of the monitor, as JSON text; None without.
     """
     tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
+    metadata |= {} if monitor is None else {"monitor": monitor}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file(tensors, partial, metadata=metadata)
@@ -95,5 +99,12 @@ def load_network(name: str | Path) -> LoadedNetwork:
     load_exactly(network, {k: v.to(torch.float32) for k, v in state.items()}, what=f"weights {path}")
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    about = metadata.get("about", "")
-    return LoadedNetwork(str(name), path, network.eval(), metadata.get("settings", "{}"), about, sha256)
+    return LoadedNetwork(
+        name=str(name),
+        path=path,
+        network=network.eval(),
+        settings=metadata.get("settings", "{}"),
+        about=metadata.get("about", ""),
+        sha256=sha256,
+        monitor=metadata.get("monitor"),
+    )

@@ -31,34 +31,43 @@ class Belief:
     cell_point: Float[Tensor, "C 3"]
 
 
-def update(
-    belief: Belief | None,
-    logits: Float[Tensor, "K C"],
-    seen: Float[Tensor, " K"],
-    cell_point: Float[Tensor, "C 3"],
-    cell_uv: Float[Tensor, "C 2"],
-    favour: Float[Tensor, "K C"],
-    config: TrackerConfig,
-) -> Belief:
-    """One step of the recursion.
+def moved(
+    belief: Belief, cell_point: Float[Tensor, "C 3"], cell_uv: Float[Tensor, "C 2"], sigma: float
+) -> Float[Tensor, "K C"]:
+    """Where entities may be now that were seen in the previous frame; sums to one over the cells.
 
     Args:
-        belief: after the previous frame; None at the first.
-        logits: scores of the newest frame's cells.
-        seen: probability that each entity is seen, by which the frame's scores are trusted.
+        belief: after the previous frame.
         cell_point: the newest frame's lifted cells.
         cell_uv: the cells' centres in [-1, 1]^2, which stand in where depth is missing.
+        sigma: how far things move.
+    """
+    return belief.probability @ _move(belief.cell_point, cell_point, cell_uv, sigma)
+
+
+def update(
+    prior: Float[Tensor, "K C"] | None,
+    logits: Float[Tensor, "K C"],
+    seen: Float[Tensor, " K"],
+    favour: Float[Tensor, "K C"],
+    config: TrackerConfig,
+) -> Float[Tensor, "K C"]:
+    """One step of the recursion: the probability of every cell.
+
+    Args:
+        prior: where entities may be before the frame is looked at; None where anywhere, in their first frame and in a
+            search.
+        logits: scores of the newest frame's cells.
+        seen: probability that each entity is seen, by which the frame's scores are trusted.
         favour: log weights of the cells by what else is known, the joint.
         config: how far things move.
     """
     likelihood = (logits / config.temperature).log_softmax(dim=-1)
-    if belief is None:
-        return Belief(likelihood.exp(), cell_point)
-    move = _move(belief.cell_point, cell_point, cell_uv, config.move_sigma)
-    prior = (1 - config.jump) * (belief.probability @ move) + config.jump / likelihood.shape[-1]
+    if prior is None:
+        return (likelihood + favour).softmax(dim=-1)
+    prior = (1 - config.jump) * prior + config.jump / likelihood.shape[-1]
     # A hidden entity's scores say little about where it is.
-    posterior = (seen.clamp(0.1, 1.0).unsqueeze(-1) * likelihood + favour + prior.log()).softmax(dim=-1)
-    return Belief(posterior, cell_point)
+    return (seen.clamp(0.1, 1.0).unsqueeze(-1) * likelihood + favour + prior.log()).softmax(dim=-1)
 
 
 def _move(

@@ -1,20 +1,20 @@
-"""What one frame says of places where a hidden query could be."""
+"""What one frame says of places where a query could be."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from quest.model.config import NetworkConfig
 from quest.model.decoder import sample_grid
 from quest.model.observation import FrameBatch
 
-_TOLERANCE = 0.06
 
-
-class Evidence:
+class FrameEvidence:
     """The newest frame as seen from points of the reference frame.
 
     Args:
@@ -28,24 +28,17 @@ class Evidence:
         self._log_p = log_p
         self._config = config
 
-    def score(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
-        """Log probability of the heatmap where points project to; NaN outside the image."""
+    def ratio(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """Log of how much likelier than a cell by chance each place is to show the query; NaN outside the image."""
         uv_px = self._frames.from_reference(self._tensor(point))[0]
         uv = uv_px / self._config.encoder.image_size
         inside = ((uv >= 0) & (uv <= 1)).all(-1)
         value = sample_grid(self._log_p[None, :, None], uv.nan_to_num(0.5), self._config.cells).squeeze(-1)
-        return torch.where(inside, value, torch.nan)[0].cpu().double().numpy()
-
-    def covers(self, point: Float[np.ndarray, "3"]) -> bool:
-        """Whether something is seen well before a point."""
-        return bool(self.room(point[None])[0] < -_TOLERANCE)
-
-    def free(self, point: Float[np.ndarray, "M 3"]) -> Bool[np.ndarray, " M"]:
-        """Whether one looks through points: what is seen lies well behind them."""
-        return self.room(point) > _TOLERANCE
+        value = torch.where(inside, value, torch.nan)[0].cpu().double().numpy()
+        return value + math.log(self._config.cells**2)
 
     def room(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
-        """How far what is seen lies behind points along +z, reference units; NaN where nothing is known."""
+        """How far what is seen lies behind each place along +z, reference units; NaN where nothing is known."""
         at = self._tensor(point)
         seen_m = self._frames.near_depth_at(self._frames.from_reference(at))[0, 0]
         gap = (seen_m - self._frames.to_camera(at)[0, 0, :, 2]) / self._frames.scale[0]

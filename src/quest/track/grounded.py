@@ -5,8 +5,10 @@ Everything here is in the reference frame of the stream (see :mod:`quest.model.o
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -18,8 +20,26 @@ from quest.track.settings import TrackerConfig
 _SAMPLES = 97
 _SLIDE_REACH = 1.2
 _TURN_REACH_RAD = 2.4
+_TOLERANCE = 0.06
+_LINK_DEPTH = 0.25
 _LOG_FREE_SPACE = -4.0
-_UNTOLD = -6.0
+_LOG_MISSED = -2.0
+_RECENT = 6
+_SLOWING = 0.92
+_MOST_CLOSED = 6.0
+
+
+@runtime_checkable
+class Evidence(Protocol):
+    """What a frame says of places in the reference frame."""
+
+    def ratio(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """Log of how much likelier than a cell by chance each place is to show the query; NaN outside the image."""
+        ...
+
+    def room(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """How far what is seen lies behind each place, reference units; NaN where nothing is known."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -68,6 +88,16 @@ class _Expectation:
         self.foot += weight[2] * (point + row.foot)
         self.information += weight
 
+    def state(self) -> dict[str, np.ndarray]:
+        """All fields as arrays."""
+        return {f.name: np.array(getattr(self, f.name)) for f in fields(self)}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, np.ndarray]) -> _Expectation:
+        """Read what :meth:`state` gave."""
+        joined = {f.name: np.array(state[f.name]) for f in fields(cls)}
+        return cls(**{**joined, "rows": int(joined["rows"]), "logit": float(joined["logit"])})
+
     def prior(self) -> JointPrior:
         """The beliefs as one; errors of neighbouring frames are alike, so that many are worth no more than one."""
         (slide, slide_scatter), (turn, turn_scatter) = _principal(self.slide), _principal(self.turn)
@@ -115,17 +145,14 @@ class Ground:
         self._expectation = _Expectation()
         self._estimator = JointEstimator(config.point_sigma)
         self._curves: tuple[Curve, ...] = ()
+        self._recent: deque[np.ndarray] = deque(maxlen=_RECENT)
         self._along: np.ndarray | None = None
+        self._hidden = 0
 
     @property
     def joint(self) -> Joint | None:
         """The joint that the track so far shows; None before the first point."""
         return self._estimator.joint
-
-    @property
-    def still(self) -> bool:
-        """Whether the query has not been seen to move."""
-        return self.joint is None or self.joint.kind is JointKind.STATIC
 
     def see(self, point: Float[np.ndarray, "3"], row: BeliefRow) -> None:
         """Learn from a frame in which the query is seen and trusted."""
@@ -133,7 +160,8 @@ class Ground:
         self._estimator.prior = prior = self._expectation.prior()
         self._estimator.add(point)
         self._curves = self._make_curves(prior)
-        self._along = None
+        self._recent.append(point)
+        self._along, self._hidden = None, 0
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
@@ -153,7 +181,7 @@ class Ground:
         """A point that is seen, drawn towards the joint as far as the joint is known better than the point."""
         if not self._curves:
             return point
-        curve = max(self._curves, key=lambda c: c.log_weight)
+        curve = self._best_curve
         q = curve.joint.locate(point[None])
         on, spread = curve.joint.at(q)[0], float(curve.joint.spread(q)[0])
         sigma = self._config.point_sigma
@@ -162,13 +190,57 @@ class Ground:
         doubt = 1 - np.exp(-0.5 * np.square(np.linalg.norm(point - on) / np.hypot(spread, 2 * sigma)))
         return on + max(share, doubt) * (point - on)
 
+    def residual(self, point: Float[np.ndarray, "3"]) -> float:
+        """Distance of a point to the curve of the joint, in standard deviations of both; NaN before the first sight."""
+        if not self._curves or not np.isfinite(point).all():
+            return float("nan")
+        curve = self._best_curve
+        q = curve.joint.locate(point[None])
+        gap = np.linalg.norm(point - curve.joint.at(q)[0])
+        return float(gap / np.hypot(curve.joint.spread(q)[0], self._config.point_sigma))
+
+    def covered(self, before: Float[np.ndarray, "3"], frame: Evidence, elapsed: float) -> float:
+        """Share of the places where a query can be now that lie behind something that is not its own link.
+
+        A part that turns away hides its own handle; what came before it is nearer to the camera than that.
+
+        Args:
+            before: where it was last.
+            frame: what the newest frame says of places.
+            elapsed: frames since then.
+        """
+        if not self._curves or self.joint is None or self.joint.kind is JointKind.STATIC:
+            return float(frame.room(before[None])[0] < -_TOLERANCE)
+        return float(self._predicted(before, elapsed) @ self._buried(frame))
+
+    def expected(
+        self, before: Float[np.ndarray, "3"], point: Float[np.ndarray, "C 3"], elapsed: float
+    ) -> Float[np.ndarray, " C"] | None:
+        """How probably a query that was hidden is at each of some points now; None where nothing is known of them.
+
+        Args:
+            before: where it was held.
+            point: the points, NaN where unknown.
+            elapsed: frames since then.
+        """
+        known = np.isfinite(point).all(axis=1)
+        if not self._curves or not known.any():
+            return None
+        curve = self._best_curve
+        sigma = np.hypot(curve.spread, self._config.joint_sigma)
+        gap = np.linalg.norm(np.nan_to_num(point)[:, None] - curve.point[None], axis=-1) / sigma
+        density = np.where(known, np.exp(-0.5 * np.square(gap)) @ self._predicted(before, elapsed), 0.0)
+        return density / density.sum() if density.sum() > 1e-12 else None
+
     def hide(
         self,
         before: Float[np.ndarray, "3"],
         point: Float[np.ndarray, "3"],
         seen: float,
-        evidence: Callable[[np.ndarray], np.ndarray],
-        free: Callable[[np.ndarray], np.ndarray],
+        frame: Evidence,
+        *,
+        buried: bool = False,
+        elapsed: float = 1.0,
     ) -> Float[np.ndarray, "3"]:
         """Where a query is that is probably hidden: the mean along its joint.
 
@@ -176,27 +248,93 @@ class Ground:
             before: where it was last.
             point: where it would be if it were seen after all; NaN if unknown.
             seen: probability of that.
-            evidence: log score of the frame for points (M x 3), NaN outside the image.
-            free: whether one looks through points.
+            frame: what the newest frame says of places.
+            buried: whether something came before it. Then what the frame shows before it says nothing, and it moves on
+                as it moved; else it is its own link that hides it, and the network knows roughly where.
+            elapsed: frames since it was there.
         """
         if not self._curves:
             return before
-        curve = max(self._curves, key=lambda c: c.log_weight)
-        sigma = self._config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1)
-        if self._along is None:
-            at = float(curve.joint.locate(before[None])[0])
-            self._along = _normalised(-0.5 * np.square((curve.q - at) / sigma))
-        prior = self._along @ _rows_normalised(-0.5 * np.square((curve.q[:, None] - curve.q[None]) / sigma))
-        score = self._config.hidden_trust * np.nan_to_num(evidence(curve.point), nan=_UNTOLD)
+        curve, prior = self._best_curve, self._predicted(before, elapsed, moving=buried)
+        score = self._config.hidden_trust * np.nan_to_num(frame.ratio(curve.point))
+        if buried:
+            # What seems to show it adds nothing: frames are alike, and a look-alike would soon outweigh everything.
+            score = np.where(self._buried(frame), 0.0, np.clip(score, _LOG_MISSED, 0.0))
         # Where one looks through the place, the query would be seen.
-        score = score + np.where(free(curve.point), _LOG_FREE_SPACE, 0.0)
+        tolerance = _TOLERANCE + (curve.spread if buried else 0.0)
+        score = np.where(frame.room(curve.point) > tolerance, score + _LOG_FREE_SPACE, score)
         likelihood = (1 - seen) * _normalised(score)
         if np.isfinite(point).all():
             gap = np.linalg.norm(curve.point - point, axis=1) / np.hypot(curve.spread, 2 * self._config.point_sigma)
             likelihood += seen * np.exp(-0.5 * gap.min() ** 2) * _normalised(-0.5 * np.square(gap))
         posterior = prior * (likelihood + 1e-9)
-        self._along = posterior / posterior.sum()
+        self._along, self._hidden = posterior / posterior.sum(), self._hidden + 1
         return curve.joint.at(np.array([self._along @ curve.q]))[0]
+
+    def copy(self) -> Ground:
+        """The same, which learns by itself from now on."""
+        return Ground.restored(self._config, self.state())
+
+    def state(self) -> dict[str, np.ndarray]:
+        """Everything that its answers depend on, as numeric arrays."""
+        found = {f"expectation.{key}": value for key, value in self._expectation.state().items()}
+        found |= {f"estimator.{key}": value for key, value in self._estimator.state().items()}
+        found |= {"recent": np.array(self._recent).reshape(-1, 3), "hidden": np.array(self._hidden)}
+        return found if self._along is None else {**found, "along": self._along}
+
+    @classmethod
+    def restored(cls, config: TrackerConfig, state: Mapping[str, np.ndarray]) -> Ground:
+        """Go on where :meth:`state` was taken."""
+        ground = cls(config)
+        parts: dict[str, dict[str, np.ndarray]] = {"expectation": {}, "estimator": {}}
+        for key, value in state.items():
+            owner, _, name = key.partition(".")
+            parts.setdefault(owner, {})[name] = value
+        ground._expectation = _Expectation.restored(parts["expectation"])
+        ground._estimator.restore(parts["estimator"])
+        if ground._expectation.rows:
+            ground._estimator.prior = prior = ground._expectation.prior()
+            ground._curves = ground._make_curves(prior)
+        ground._recent.extend(state["recent"])
+        ground._along, ground._hidden = state.get("along"), int(state["hidden"])
+        return ground
+
+    @property
+    def _best_curve(self) -> Curve:
+        return max(self._curves, key=lambda c: c.log_weight)
+
+    def _buried(self, frame: Evidence) -> np.ndarray:
+        """Which samples of the best curve lie behind something that is not the query's own link."""
+        curve = self._best_curve
+        return frame.room(curve.point) < -(_LINK_DEPTH + curve.spread)
+
+    def _predicted(self, before: np.ndarray, elapsed: float, *, moving: bool = True) -> np.ndarray:
+        """Probability of the samples of the best curve, before the frame is looked at.
+
+        Args:
+            before: where the query was last.
+            elapsed: frames since then.
+            moving: whether what moved moves on, slower and slower, and does not close further than it was seen closed.
+        """
+        curve = self._best_curve
+        sigma = self._config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1) * elapsed
+        if self._along is None:
+            at = float(curve.joint.locate(before[None])[0])
+            start = _normalised(-0.5 * np.square((curve.q - at) / sigma))
+        else:
+            start = self._along
+        step = self._speed(curve.joint) * _SLOWING**self._hidden * elapsed if moving else 0.0
+        moved = start @ _rows_normalised(-0.5 * np.square((curve.q[:, None] + step - curve.q[None]) / sigma))
+        if moving:
+            moved = moved * np.exp(-np.clip((curve.joint.lower - curve.q) / sigma - 1, 0.0, _MOST_CLOSED))
+        return moved / moved.sum()
+
+    def _speed(self, joint: Joint) -> float:
+        """How far along its joint a query moved per frame when it was last seen."""
+        if joint.kind is JointKind.STATIC or len(self._recent) < 2:
+            return 0.0
+        q = joint.locate(np.stack(self._recent))
+        return float((q[-1] - q[0]) / (len(q) - 1))
 
     def _make_curves(self, prior: JointPrior) -> tuple[Curve, ...]:
         joint = self._estimator.joint
@@ -230,5 +368,5 @@ def _normalised(log_p: np.ndarray) -> np.ndarray:
 
 
 def _rows_normalised(log_p: np.ndarray) -> np.ndarray:
-    p = np.exp(log_p)
+    p = np.exp(log_p - log_p.max(axis=1, keepdims=True))
     return p / p.sum(axis=1, keepdims=True)

@@ -26,6 +26,8 @@ class TrackerConfig:
         along_sigma: how far a hidden entity moves along its joint between frames, reference units (twice that in
             radians).
         hidden_trust: how much the heatmap says of a hidden entity's place along its joint.
+        found_below: probability of a lost identity below which a search has found its entity.
+        found_frames: how many frames in a row it must be that low.
         slot_bias: added to the affordance logit, so that slots worth keeping have a confidence above one half.
         slot_gain: multiplies the affordance logit.
         slot_threshold: probability above which discovery takes a slot.
@@ -44,6 +46,8 @@ class TrackerConfig:
     off_joint: float = -2.0
     along_sigma: float = 0.03
     hidden_trust: float = 0.5
+    found_below: float = 0.2
+    found_frames: int = 3
     slot_bias: float = 0.0
     slot_gain: float = 1.0
     slot_threshold: float = 0.5

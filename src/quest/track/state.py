@@ -7,24 +7,33 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from quest.grounding import Joint
+from quest.monitor import Alarm, Signals
 from quest.types import State
 
 
 @dataclass(frozen=True)
 class StreamState:
-    """Answers for one frame; K grows when queries bind.
+    """Answers for one frame; K grows when queries bind and shrinks when they are retired.
 
     Attributes:
         names: name per query.
         labels: label per query, or None.
         uv_px: pixel in the source frame.
         point_world: world point in metres, NaN where it cannot be lifted.
-        confidence: probability that the identity is right.
+        confidence: the network's own belief that the identity is right.
         visible: whether the entity is seen.
         state: :class:`~quest.types.State` per query.
         stamp_s: the frame's time.
         has_depth: whether the frame brought any depth.
-        query: which of the queries, in the order in which they were asked, each row answers; discovered slots count up.
+        query: the number of the query that each row answers; discovered slots count up.
+        joint: the joint that explains each track so far, in the world, metres; None before the first seen point and
+            without depth.
+        lost_p: calibrated probability that the identity is lost; NaN where the weights carry no calibration.
+        alarm: the open alarm of each query, or None.
+        signals: what the monitor judged by.
+        flags: degradations of this frame in words, such as missing depth; a late or duplicate frame repeats the answer
+            before.
     """
 
     names: tuple[str, ...]
@@ -37,3 +46,8 @@ class StreamState:
     stamp_s: float
     has_depth: bool
     query: tuple[int, ...]
+    joint: tuple[Joint | None, ...]
+    lost_p: Float32[np.ndarray, " K"]
+    alarm: tuple[Alarm | None, ...]
+    signals: Signals
+    flags: tuple[str, ...] = ()

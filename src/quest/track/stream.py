@@ -3,51 +3,40 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, fields, replace
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from quest.data.letterbox import Letterbox
 from quest.errors import InputError
 from quest.geometry import invert, transform
+from quest.grounding import Joint, LinkGroups
 from quest.model.decoder import Anchor, HeatmapHead, Prediction
-from quest.model.discovery import Peaks, find_peaks
-from quest.model.network import UNKNOWN_LABEL, QuestNetwork
-from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
-from quest.track.belief import Belief, update
-from quest.track.evidence import Evidence
-from quest.track.grounded import Ground, joint_rows
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch, Observation
+from quest.monitor import SIGNALS, Alarm, Monitor, Signals, Verdict
+from quest.track.binding import Binding, Waiting
+from quest.track.following import Answer, Following, part
+from quest.track.grounded import joint_rows
+from quest.track.intake import Arrival, Intake
 from quest.track.lifting import lift_near
+from quest.track.matching import match
+from quest.track.measuring import measure, no_signals
+from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
 from quest.track.settings import TrackerConfig
+from quest.track.sharing import SIGMA, share
 from quest.track.state import StreamState
-from quest.types import LABELS, Camera, Frame, Query, State
-
-_LOST_BELOW = 0.3
-_LEAP = 0.12
-_AFTER_ALL = 0.2
-
-
-@dataclass
-class _Bound:
-    """A query that has found its entity."""
-
-    query: int
-    name: str
-    label: str | None
-    slot: int | None
-    ground: Ground
-    belief: Belief | None = None
-    last_seen: Tensor | None = None
+from quest.types import Camera, Query, State
 
 
 class Stream:
     """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
 
-    The memory is a ring of T observed frames, one anchor and one belief per query.
+    The memory is a ring of T observed frames and, per query, an anchor, a belief, a joint and what the monitor needs.
 
     Args:
         network: trained network in evaluation mode.
@@ -56,6 +45,7 @@ class Stream:
         queries: what to follow; None discovers entities in the first frame.
         device: where the network runs.
         autocast: whether the network computes in bfloat16.
+        monitor: watches for lost identities; None for no alarms and no recovery.
 
     Raises:
         InputError: a point query lies outside the image.
@@ -70,27 +60,87 @@ class Stream:
         *,
         device: torch.device,
         autocast: bool,
+        monitor: Monitor | None = None,
     ) -> None:
         self._network = network
         self._config = config
-        self._letterbox = Letterbox(camera, network.config.encoder.image_size)
-        self._discover_all = queries is None
-        self._waiting = list(enumerate(queries or ()))
-        for _, query in self._waiting:
-            _check_pixel(query, camera)
         self._device = device
         self._autocast = autocast
+        self._monitor = monitor
+        self._intake = Intake(network, camera, device=device)
+        self._binding = Binding(network, config, self._intake.letterbox, queries)
         self._ring: deque[Observation] = deque(maxlen=network.config.window)
-        self._reference: tuple[Tensor, Tensor, Tensor] | None = None
-        self._reference_has_depth = False
-        self._bound: list[_Bound] = []
-        self._anchor: Anchor | None = None
+        self._following: list[Following] = []
+        self._links = LinkGroups(SIGMA)
+        self._callbacks: list[Callable[[Alarm], None]] = []
         self._t = 0
+        self._stamp_s, self._has_depth = 0.0, False
+
+    @property
+    def camera(self) -> Camera:
+        """Intrinsics of the frames."""
+        return self._intake.letterbox.source
+
+    @property
+    def alpha(self) -> float | None:
+        """The share of streams without any loss that may raise an alarm; None where nothing is watched."""
+        return None if self._monitor is None else self._monitor.alpha
+
+    @property
+    def frame(self) -> int:
+        """Index of the next frame; point queries that are added now begin there or later."""
+        return self._t
 
     @property
     def unbound(self) -> tuple[Query, ...]:
         """Queries that have not found their entity, and point queries whose frame has not come."""
-        return tuple(query for _, query in self._waiting)
+        return tuple(w.query for w in self._binding.waiting)
+
+    def add(self, query: Query) -> int:
+        """Follow one more entity from the next frame on; returns the query's number.
+
+        Raises:
+            InputError: a point query lies outside the image or in a frame that has passed.
+        """
+        return self._binding.ask(query, frame=self._t)
+
+    def retire(self, query: int | str) -> None:
+        """Follow a query no longer, by its number or name.
+
+        Raises:
+            InputError: no query of that number or name is followed or waits.
+        """
+        number = self._number(query)
+        rows = [i for i, f in enumerate(self._following) if f.query != number]
+        if len(rows) < len(self._following):
+            self._binding.keep(rows)
+            self._links.forget(number)
+            if self._monitor is not None:
+                self._monitor.forget(number)
+        self._following = [self._following[i] for i in rows]
+        self._binding.waiting = [w for w in self._binding.waiting if w.number != number]
+
+    def rename(self, query: int | str, name: str) -> None:
+        """Call a query by another name in all answers from now on.
+
+        Raises:
+            InputError: no query of that number or name is followed or waits, or another has the new name.
+        """
+        number = self._number(query)
+        if name in self._names().values():
+            raise InputError(f"query {query!r}: another query is called {name!r} already; choose another name")
+        for following in self._following:
+            if following.query == number:
+                following.name = name
+                if self._monitor is not None:
+                    self._monitor.rename(number, name)
+        self._binding.waiting = [
+            replace(w, query=replace(w.query, name=name)) if w.number == number else w for w in self._binding.waiting
+        ]
+
+    def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
+        """Call a function with every alarm in the step that raises it, before the step returns."""
+        self._callbacks.append(callback)
 
     def step(
         self,
@@ -101,292 +151,245 @@ class Stream:
     ) -> StreamState:
         """Track the next frame.
 
+        A frame that is older than the one before, or the same again, changes nothing: the answer before is repeated,
+        flagged. Longer gaps between stamps let things move farther.
+
         Args:
             rgb: colours.
             depth_m: metres along +z; 0 or NaN where missing, None without depth.
             stamp_s: time in seconds.
-            cam_from_world: pose of the camera; the world is the camera if None.
+            cam_from_world: pose of the camera; the last one if None, and if there was none, the world is the camera.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, or the pose is no 4 x 4 matrix.
+            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
         """
-        self._check(rgb, depth_m, cam_from_world)
+        intake = self._intake
+        intake.check(self._t, rgb, depth_m, stamp_s, cam_from_world)
+        if intake.admit(rgb, stamp_s) is not Arrival.NEW:
+            self._t += 1
+            return self._state()
         with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
-            frames = self._frame_batch(rgb, depth_m, np.eye(4) if cam_from_world is None else cam_from_world)
+            frames, renewed = intake.prepare(rgb, depth_m, cam_from_world)
+            if renewed:
+                # Coordinates change with the reference, so nothing observed before may be mixed with it.
+                self._ring.clear()
+                self._links = LinkGroups(SIGMA)
+                for following in self._following:
+                    following.forget_places(self._config)
             observed = self._network.observe(frames)
             while len(self._ring) < self._network.config.window - 1:
                 self._ring.append(observed)
             self._ring.append(observed)
-            self._bind(observed, frames)
-            state = self._answer(frames, stamp_s, bool((frames.depth_m > 0).any()))
+            for found in self._binding.bind(self._t, observed, frames, self._following):
+                self._following.append(found)
+                if self._monitor is not None:
+                    self._monitor.watch(found.query, found.name)
+            self._stamp_s, self._has_depth = stamp_s, bool((frames.depth_m > 0).any())
+            self._answer(frames)
         self._t += 1
-        return state
+        return self._state()
 
-    def candidates(self, frame: Frame) -> Peaks:
-        """What discovery would choose from in a frame, whatever its score; nothing is bound.
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Everything that the next answers depend on: numeric arrays, and what JSON can hold.
 
-        Raises:
-            InputError: the frame does not have the camera's size or type, or the pose is no 4 x 4 matrix.
+        Callbacks are left out.
         """
-        self._check(frame.rgb, frame.depth_m, frame.cam_from_world)
-        with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
-            frames = self._frame_batch(frame.rgb, frame.depth_m, frame.cam_from_world)
-            observed = self._network.observe(frames)
-            return find_peaks(self._network, observed, radius_cells=self._config.slot_radius_cells)
+        arrays = {f"intake.{key}": value for key, value in self._intake.state().items()}
+        arrays |= {f"links.{key}": value for key, value in self._links.state().items()}
+        for i, observed in enumerate(self._ring):
+            arrays |= {f"ring{i}.{f.name}": _numpy(getattr(observed, f.name)) for f in fields(Observation)}
+        if self._binding.anchor is not None:
+            arrays |= {f"anchor.{f.name}": _numpy(getattr(self._binding.anchor, f.name)) for f in fields(Anchor)}
+        for i, query in enumerate(self._following):
+            arrays |= {f"query{i}.{key}": value for key, value in query.state().items()}
+        if self._monitor is not None:
+            arrays |= {f"monitor.{key}": value for key, value in self._monitor.state().items()}
+        words = {
+            "frame": self._t,
+            "stamp_s": self._stamp_s,
+            "has_depth": self._has_depth,
+            "flags": list(self._intake.flags),
+            "discover": self._binding.discover,
+            "numbered": self._binding.numbered,
+            "waiting": [asdict(w) for w in self._binding.waiting],
+            "following": [[f.query, f.name, f.label] for f in self._following],
+        }
+        return arrays, words
 
-    def _check(self, rgb: np.ndarray, depth_m: np.ndarray | None, cam_from_world: np.ndarray | None) -> None:
-        camera = self._letterbox.source
-        expected = (camera.height, camera.width, 3)
-        if rgb.shape != expected or rgb.dtype != np.uint8:
-            raise InputError(f"frame {self._t}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
-        if depth_m is not None and (depth_m.shape != expected[:2] or not np.issubdtype(depth_m.dtype, np.floating)):
-            raise InputError(
-                f"frame {self._t}: expected depth {expected[:2]} in metres as float, got {depth_m.shape} of "
-                f"{depth_m.dtype}; multiply raw units by their size in metres"
-            )
-        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(f"frame {self._t}: expected a finite 4 x 4 cam_from_world, got {pose.tolist()}")
+    def restore(self, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> None:
+        """Go on where :meth:`state` was taken, in a stream of the same network, settings and camera."""
+        device = self._device
+        self._t, self._stamp_s, self._has_depth = words["frame"], words["stamp_s"], words["has_depth"]
+        self._intake.restore(part(arrays, "intake."))
+        self._links.restore(part(arrays, "links."))
+        self._intake.flags = tuple(words["flags"])
+        self._ring.clear()
+        for i in range(self._network.config.window):
+            observed = part(arrays, f"ring{i}.")
+            if observed:
+                self._ring.append(Observation(**{k: torch.from_numpy(v).to(device) for k, v in observed.items()}))
+        anchor = part(arrays, "anchor.")
+        binding = self._binding
+        binding.anchor = Anchor(**{k: torch.from_numpy(v).to(device) for k, v in anchor.items()}) if anchor else None
+        binding.discover, binding.numbered = words["discover"], words["numbered"]
+        binding.waiting = [Waiting.from_json(waiting) for waiting in words["waiting"]]
+        self._following = [
+            Following.restored(number, name, label, part(arrays, f"query{i}."), config=self._config, device=device)
+            for i, (number, name, label) in enumerate(words["following"])
+        ]
+        if self._monitor is not None:
+            self._monitor.restore(part(arrays, "monitor."))
 
-    def _frame_batch(self, rgb: np.ndarray, depth_m: np.ndarray | None, cam_from_world: np.ndarray) -> FrameBatch:
-        network, box = self._network, self._letterbox
-        size = network.config.encoder.image_size
-        image = torch.from_numpy(np.ascontiguousarray(box.rgb(rgb))).to(self._device)
-        raw = np.zeros((size, size), np.float32) if depth_m is None else box.depth(depth_m)
-        depth = torch.from_numpy(raw).to(self._device)[None]
-        cells = cell_depth(depth, network.config.cell_px)
-        camera = box.camera
-        intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=self._device)
-        # Poses stay on the CPU in double precision, which not every device has.
-        pose = torch.from_numpy(np.asarray(cam_from_world, np.float64))
-        has_depth = bool((depth > 0).any())
-        if self._reference is None or (has_depth and not self._reference_has_depth):
-            # Coordinates change with the reference, so nothing observed before may be mixed with it.
-            center, scale = reference_of(cells, intrinsics, size)
-            self._reference, self._reference_has_depth = (pose, center, scale), has_depth
-            self._ring.clear()
-            for bound in self._bound:
-                bound.belief = bound.last_seen = None
-                bound.ground = Ground(self._config)
-        ref_pose, center, scale = self._reference
-        return FrameBatch(
-            features=network.encode(image[None])[:, None].float(),
-            rgb=image[None, None],
-            depth_m=depth[None],
-            cell_depth_m=cells[None],
-            intrinsics=intrinsics,
-            ref_from_cam=(ref_pose @ invert(pose)).float().to(self._device)[None, None],
-            center=center,
-            scale=scale,
-        )
-
-    def _bind(self, observed: Observation, frames: FrameBatch) -> None:
-        if self._network.config.queries == "learned":
-            self._bind_learned(frames)
+    def _answer(self, frames: FrameBatch) -> None:
+        """Place every query in the newest frame, judge it, and keep the answers."""
+        following = self._following
+        if not following or self._binding.anchor is None:
             return
-        if self._t == 0 and (self._discover_all or any(q.kind != "point" for _, q in self._waiting)):
-            self._bind_slots(observed, frames)
-        due = self._due()
-        if due:
-            size = self._network.config.encoder.image_size
-            uv_px = np.array([q.uv_px for _, q in due], np.float32)
-            uv = torch.from_numpy(self._letterbox.to_canvas(uv_px) / size)
-            label = torch.tensor([LABELS.index(q.label) if q.label else UNKNOWN_LABEL for _, q in due])
-            self._join(observed, frames, uv, label)
-            for i, query in due:
-                self._bound.append(self._start(i, query.name or f"point {i}", query.label))
-                self._waiting.remove((i, query))
-
-    def _start(self, query: int, name: str, label: str | None, slot: int | None = None) -> _Bound:
-        return _Bound(query, name, label, slot, Ground(self._config))
-
-    def _due(self) -> list[tuple[int, Query]]:
-        return [(i, q) for i, q in self._waiting if q.kind == "point" and q.frame == self._t]
-
-    def _bind_slots(self, observed: Observation, frames: FrameBatch) -> None:
-        config = self._config
-        slots = find_peaks(self._network, observed, radius_cells=config.slot_radius_cells)
-        existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
-        found = [LABELS[int(n)] for n in slots.label]
-        bound: list[_Bound] = []
-        if self._discover_all:
-            good = [i for i, e in enumerate(existence) if e > config.slot_threshold]
-            bound = [self._start(n, f"{found[i]} {n}", found[i], i) for n, i in enumerate(good)]
-        for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
-            used = {b.slot for b in bound}
-            fits = [i for i, label in enumerate(found) if i not in used and query.label in (None, label)]
-            if fits and existence[fits[0]] > config.prompt_threshold:
-                slot = fits[0]
-                bound.append(self._start(n, query.name or f"{found[slot]} {n}", found[slot], slot))
-                self._waiting.remove((n, query))
-        if bound:
-            index = torch.tensor([b.slot for b in bound])
-            self._join(observed, frames, slots.uv[index], slots.label[index])
-            self._bound += bound
-
-    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor) -> None:
-        """Bind more queries; the anchors of the others stay as they are."""
-        uv, label = uv[None].to(self._device), label[None].to(self._device)
-        uv_px = uv[:, None] * self._network.config.encoder.image_size
-        point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
-        valid = torch.ones(label.shape, dtype=torch.bool, device=self._device)
-        anchor = self._network.bind(observed, uv, point, label, valid)
-        self._anchor = anchor if self._anchor is None else self._anchor.join(anchor)
-
-    def _bind_learned(self, frames: FrameBatch) -> None:
-        """Learned queries are there from the start; a point is answered by the slot nearest to it when it is asked."""
-        if self._anchor is None:
-            self._anchor = self._network.slots(1)
-        if self._t == 0:
-            label = self._network.learned_label(self._anchor.content)[0].argmax(dim=-1)
-            if self._discover_all:
-                self._bound = [self._start(i, f"slot {i}", LABELS[int(n)], i) for i, n in enumerate(label)]
-            for n, query in [(n, q) for n, q in self._waiting if q.kind != "point"]:
-                used = {b.slot for b in self._bound}
-                fits = [i for i, k in enumerate(label) if i not in used and query.label in (None, LABELS[int(k)])]
-                if fits:
-                    slot = fits[0]
-                    self._bound.append(self._start(n, query.name or f"slot {slot}", LABELS[int(label[slot])], slot))
-                    self._waiting.remove((n, query))
-        due = self._due()
-        if due:
-            prediction = self._network.decode(self._anchor, self._ring[-1], frames)
-            size = self._network.config.encoder.image_size
-            for i, query in due:
-                uv = torch.from_numpy(self._letterbox.to_canvas(np.array(query.uv_px, np.float64)) / size).to(
-                    prediction.uv
-                )
-                slot = int((prediction.uv[0, -1] - uv).norm(dim=-1).argmin())
-                self._bound.append(self._start(i, query.name or f"point {i}", query.label, slot))
-                self._waiting.remove((i, query))
-
-    def _answer(self, frames: FrameBatch, stamp_s: float, has_depth: bool) -> StreamState:
-        if not self._bound or self._anchor is None:
-            empty = np.zeros((0, 3), np.float32)
-            return StreamState((), (), empty[:, :2], empty, empty[:, 0], empty[:, 0] > 0, (), stamp_s, has_depth, ())
         window = Observation.stack(list(self._ring))
-        head = self._network.head
-        if isinstance(head, HeatmapHead):
-            x = self._network.embed(self._anchor, window)[:, -1:]
-            newest = window.during(slice(-1, None))
-            prediction = self._track_cells(head, x, newest)
-            place = self._ground if self._config.ground else self._hold
-            prediction, uv, point = place(
-                prediction, lift_near(prediction, frames, self._config.lift_tolerance), frames
-            )
-        else:
-            prediction = self._network.decode(self._anchor, window.during(slice(-1, None)), frames)
-            index = torch.tensor([b.slot for b in self._bound])
-            uv, point = prediction.uv[0, 0, index], prediction.point[0, 0, index]
-            prediction = Prediction(*(getattr(prediction, n)[:, :, index] for n in Prediction.__dataclass_fields__))
-        world = self._to_world(point, has_depth)
-        visible_p = prediction.visible_logit[0, 0].sigmoid().cpu().numpy()
-        confidence = prediction.right_logit[0, 0].sigmoid().cpu().numpy()
-        visible = (visible_p > 0.5) & ((uv >= 0) & (uv <= 1)).all(-1).cpu().numpy()
-        size = self._network.config.encoder.image_size
-        return StreamState(
-            names=tuple(b.name for b in self._bound),
-            labels=tuple(b.label for b in self._bound),
-            uv_px=self._letterbox.to_source(uv.cpu().numpy() * size).astype(np.float32),
-            point_world=world,
-            confidence=confidence.astype(np.float32),
-            visible=visible,
-            state=tuple(
-                State.LOST if c < _LOST_BELOW else State.TRACKING if v else State.HELD
-                for c, v in zip(confidence, visible, strict=True)
-            ),
-            stamp_s=stamp_s,
-            has_depth=has_depth,
-            query=tuple(b.query for b in self._bound),
+        newest = window.during(slice(-1, None))
+        if not isinstance(self._network.head, HeatmapHead):
+            self._answer_learned(newest, frames)
+            return
+        prediction = match(
+            self._network, self._config, self._binding.anchor, window, following, elapsed=self._intake.elapsed
         )
-
-    def _track_cells(self, head: HeatmapHead, x: Tensor, newest: Observation) -> Prediction:
-        """Fuse the newest heatmap with the belief and answer at the best cell."""
-        assert self._anchor is not None
-        logits = head.logits(x, newest)
-        seen = head.confidences(x, logits, newest, logits.argmax(dim=-1))[0, 0, :, 0].sigmoid()
-        cell_point = newest.cell_point[0, 0].float()
-        size = self._network.config.encoder.image_size
-        cell_uv = 2 * cell_centres(self._network.config, device=logits.device) / size - 1
-        posterior, favour = torch.empty_like(logits[0, 0]), torch.zeros_like(logits[0, 0])
+        candidate = as_array(lift_near(prediction, frames, self._config.lift_tolerance))
+        placer = Placer(
+            following, prediction, frames,
+            network=self._network.config, config=self._config, elapsed=self._intake.elapsed,
+        )  # fmt: skip
+        placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:
-            place = cell_point.cpu().numpy()
-            favour = torch.from_numpy(np.stack([b.ground.favour(place) for b in self._bound])).to(logits)
-        # Queries that have just bound have no belief yet; those of all others live on the previous frame's cells.
-        fresh_rows = [i for i, b in enumerate(self._bound) if b.belief is None]
-        known_rows = [i for i, b in enumerate(self._bound) if b.belief is not None]
-        for rows, fresh in ((fresh_rows, True), (known_rows, False)):
-            if not rows:
+            share(self._links, self._t, following, placed)
+        uv, judged_uv = (self._project(p, frames, prediction) for p in (placed.point, placed.judged))
+        signals = measure(self._network, self._binding.anchor, newest, prediction, placed, judged_uv, following)
+        for k, query in enumerate(following):
+            query.move(placed.point[k], held=bool(placed.held[k]), embedding=prediction.embedding[0, 0, k])
+        right = as_array(prediction.right_logit[0, 0].sigmoid())
+        self._keep(uv, placed, right, signals)
+
+    def _project(self, point: np.ndarray, frames: FrameBatch, prediction: Prediction) -> Float[Tensor, "K 2"]:
+        """Points in [0, 1]^2 of the input; where they are unknown, what the network sees."""
+        at = torch.from_numpy(point).to(frames.depth_m)
+        uv = frames.from_reference(at[None, None])[0, 0] / self._network.config.encoder.image_size
+        return torch.where(torch.isfinite(uv).all(dim=-1, keepdim=True), uv, prediction.uv[0, 0])
+
+    def _answer_learned(self, newest: Observation, frames: FrameBatch) -> None:
+        assert self._binding.anchor is not None
+        prediction = self._network.decode(self._binding.anchor, newest, frames)
+        index = torch.tensor([f.slot for f in self._following])
+        seen, right = (as_array(p[0, 0, index].sigmoid()) for p in (prediction.visible_logit, prediction.right_logit))
+        point, unknown = as_array(prediction.point[0, 0, index]), np.full(len(index), np.nan)
+        no = np.zeros(len(index), bool)
+        placed = Placed(point, point, seen, no, no, unknown, unknown)
+        self._keep(prediction.uv[0, 0, index], placed, right, no_signals(len(index)))
+
+    def _keep(
+        self,
+        uv: Float[Tensor, "K 2"],
+        placed: Placed,
+        right: Float[np.ndarray, " K"],
+        signals: Signals,
+    ) -> None:
+        """Judge the answers and keep them; begin or end recoveries; tell of alarms."""
+        size, following = self._network.config.encoder.image_size, self._following
+        inside = ((uv >= 0) & (uv <= 1)).all(-1).cpu().numpy()
+        uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
+        world = self._to_world(placed.point)
+        verdict = None
+        if self._monitor is not None:
+            verdict = self._monitor.step([f.query for f in following], signals, frame=self._t, stamp_s=self._stamp_s)
+            self._recover(verdict, placed)
+        for k, query in enumerate(following):
+            visible = bool(placed.seen[k] > 0.5 and inside[k] and not query.doubted)
+            lost = query.doubted or bool(right[k] < LOST_BELOW)
+            query.answer = Answer(
+                uv_px=uv_px[k],
+                point_world=world[k],
+                confidence=float(right[k]),
+                visible=visible,
+                state=State.LOST if lost else State.TRACKING if visible else State.HELD,
+                lost_p=float("nan") if verdict is None else float(verdict.lost_p[k]),
+                signals=signals.values[k],
+            )
+        for alarm in () if verdict is None else verdict.raised:
+            for callback in self._callbacks:
+                callback(alarm)
+
+    def _recover(self, verdict: Verdict, placed: Placed) -> None:
+        """Search for what an alarm says is lost; end the alarm where the search holds what matches the anchor."""
+        assert self._monitor is not None
+        for k, query in enumerate(self._following):
+            right = verdict.lost_p[k] < self._config.found_below
+            if not query.doubted:
+                if verdict.open[k] is not None:
+                    query.doubt()
+                    self._monitor.search(query.query)
+                elif right and not query.held:
+                    query.keep()
                 continue
-            before = None if fresh else self._joint_belief(rows)
-            after = update(before, logits[0, 0, rows], seen[rows], cell_point, cell_uv, favour[rows], self._config)
-            posterior[rows] = after.probability
-            for row, probability in zip(rows, after.probability, strict=True):
-                self._bound[row].belief = Belief(probability[None], cell_point)
-        fused = posterior.clamp(min=1e-12).log()[None, None]
-        return head(x, self._anchor, newest, fused)
+            query.good = query.good + 1 if right and np.isfinite(placed.judged[k]).all() else 0
+            if query.good >= self._config.found_frames:
+                query.trust(placed.judged[k])
+                self._monitor.clear(query.query)
 
-    def _joint_belief(self, rows: list[int]) -> Belief:
-        beliefs = [b for b in (self._bound[i].belief for i in rows) if b is not None]
-        return Belief(torch.cat([b.probability for b in beliefs]), beliefs[0].cell_point)
-
-    def _hold(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Prediction, Tensor, Tensor]:
-        """Pixels and points, those of hidden entities where they were last seen."""
-        seen = prediction.visible_logit[0, 0].sigmoid() >= self._config.hold_below
-        for k, bound in enumerate(self._bound):
-            if bool(seen[k]) or bound.last_seen is None:
-                bound.last_seen = point[k]
-        held = torch.stack([b.last_seen for b in self._bound if b.last_seen is not None])
-        uv = frames.from_reference(held[None, None])[0, 0] / self._network.config.encoder.image_size
-        keep = seen | ~torch.isfinite(uv).all(dim=-1)
-        uv = torch.where(keep.unsqueeze(-1), prediction.uv[0, 0], uv)
-        return prediction, uv, torch.where(keep.unsqueeze(-1), point, held)
-
-    def _ground(self, prediction: Prediction, point: Tensor, frames: FrameBatch) -> tuple[Prediction, Tensor, Tensor]:
-        """Pixels and points, drawn towards their joints; those of hidden entities by their joints alone.
-
-        Where something came before the place of an entity that stood still and the answer leapt, it leapt onto what
-        came: the entity is behind it, and the prediction's visibility is taken back.
-        """
-        joints = joint_rows(self._network.joint(prediction.embedding))
-        seen, right = prediction.visible_logit[0, 0].sigmoid(), prediction.right_logit[0, 0].sigmoid()
-        log_p = prediction.logits[0, 0].log_softmax(dim=-1)
-        placed = point.clone()
-        for k, bound in enumerate(self._bound):
-            own = point[k].cpu().double().numpy()
-            evidence = Evidence(frames, log_p[k], self._network.config)
-            before = None if bound.last_seen is None else bound.last_seen.cpu().double().numpy()
-            if before is not None and bound.ground.still and evidence.covers(before):
-                leapt = not np.linalg.norm(own - before) < _LEAP
-                seen[k] = seen[k].clamp(max=_AFTER_ALL) if leapt else seen[k]
-            if before is None or seen[k] >= self._config.hold_below:
-                if not np.isfinite(own).all():
-                    continue
-                if right[k] >= _LOST_BELOW:
-                    bound.ground.see(own, joints[k])
-                own = bound.ground.settle(own)
-            else:
-                own = bound.ground.hide(before, own, float(seen[k]), evidence.score, evidence.free)
-            placed[k] = torch.from_numpy(own).to(placed)
-            bound.last_seen = placed[k]
-        uv = frames.from_reference(placed[None, None])[0, 0] / self._network.config.encoder.image_size
-        uv = torch.where(torch.isfinite(uv).all(dim=-1, keepdim=True), uv, prediction.uv[0, 0])
-        return replace(prediction, visible_logit=seen.logit()[None, None]), uv, placed
-
-    def _to_world(self, point: Tensor, has_depth: bool) -> Float32[np.ndarray, "K 3"]:
-        assert self._reference is not None
-        pose, center, scale = self._reference
-        metric = point.cpu().double() * scale.cpu().double() + center.cpu().double()
-        if not has_depth:
+    def _to_world(self, point: Float[np.ndarray, "K 3"]) -> Float32[np.ndarray, "K 3"]:
+        reference = self._intake.reference
+        assert reference is not None
+        metric = torch.from_numpy(point) * reference.scale.cpu().double() + reference.center.cpu().double()
+        if not self._has_depth:
             metric = torch.full_like(metric, torch.nan)
-        return transform(invert(pose)[None], metric).numpy().astype(np.float32)
+        return transform(invert(reference.cam_from_world)[None], metric).numpy().astype(np.float32)
 
+    def _state(self) -> StreamState:
+        """The newest answers of all queries."""
+        rows = [(f, f.answer) for f in self._following if f.answer is not None]
+        answers = [answer for _, answer in rows]
+        flags = self._intake.flags
 
-def _check_pixel(query: Query, camera: Camera) -> None:
-    if query.uv_px is None:
-        return
-    x, y = query.uv_px
-    if not (0 <= x <= camera.width and 0 <= y <= camera.height):
-        raise InputError(
-            f"query {query.name!r}: expected a pixel within {camera.width} x {camera.height}, got ({x:.1f}, {y:.1f})"
+        def stacked(name: str, *shape: int) -> np.ndarray:
+            return np.array([getattr(a, name) for a in answers], np.float32).reshape(len(answers), *shape)
+
+        return StreamState(
+            names=tuple(f.name for f, _ in rows),
+            labels=tuple(f.label for f, _ in rows),
+            uv_px=stacked("uv_px", 2),
+            point_world=stacked("point_world", 3),
+            confidence=stacked("confidence"),
+            visible=np.array([a.visible for a in answers], bool),
+            state=tuple(a.state for a in answers),
+            stamp_s=self._stamp_s,
+            has_depth=self._has_depth,
+            query=tuple(f.query for f, _ in rows),
+            joint=tuple(self._world_joint(f) for f, _ in rows),
+            lost_p=stacked("lost_p"),
+            alarm=tuple(None if self._monitor is None else self._monitor.alarm(f.query) for f, _ in rows),
+            signals=Signals(stacked("signals", len(SIGNALS))),
+            flags=flags,
         )
+
+    def _world_joint(self, query: Following) -> Joint | None:
+        reference, joint = self._intake.reference, self._links.joint(query.query) or query.ground.joint
+        if joint is None or reference is None or not reference.has_depth:
+            return None
+        world_from_cam = np.linalg.inv(reference.cam_from_world.numpy())
+        rotation = world_from_cam[:3, :3]
+        translation = rotation @ as_array(reference.center[0]) + world_from_cam[:3, 3]
+        return joint.transformed(rotation, translation, float(reference.scale[0]))
+
+    def _names(self) -> dict[int, str]:
+        """Names by number of all queries that are followed or wait."""
+        waiting = {w.number: w.query.name for w in self._binding.waiting if w.query.name}
+        return waiting | {f.query: f.name for f in self._following}
+
+    def _number(self, query: int | str) -> int:
+        names = self._names()
+        numbers = [*names, *(w.number for w in self._binding.waiting)]
+        found = [n for n in numbers if n == query or names.get(n) == query]
+        if not found:
+            raise InputError(f"query {query!r}: no such number or name; there are {names}")
+        return found[0]
+
+
+def _numpy(tensor: Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy()

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from quest.errors import ConfigError, InputError
+from quest.grounding import JointKind
+from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.weights import load_network
+from quest.monitor import Calibration, Monitor
+from quest.track.intake import Intake
+from quest.track.saving import SavedStream
 from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
 from quest.track.stream import Stream
-from quest.types import Camera, Clip, Query, State, Tracks
+from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
+DEFAULT_ALPHA = 0.05
 NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
 PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are NaN"
 NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
@@ -29,53 +37,128 @@ class Tracker:
         network: trained network.
         config: settings of tracking.
         device: where the network runs.
-        weights_hash: SHA-256 of the file that the network came from, for result files.
+        weights_hash: SHA-256 of the file that the network came from, for result files and saved streams.
+        calibration: of the monitor; None for no alarms.
     """
 
     name = "quest"
 
     def __init__(
-        self, network: QuestNetwork, config: TrackerConfig, *, device: torch.device, weights_hash: str | None = None
+        self,
+        network: QuestNetwork,
+        config: TrackerConfig,
+        *,
+        device: torch.device,
+        weights_hash: str | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         self.network = network.to(device).eval()
         self.config = config
         self.device = device
         self.weights_hash = weights_hash
+        self.calibration = calibration
         self._autocast = fast_bfloat16(device)
 
-    def stream(self, camera: Camera, queries: Sequence[Query] | None = None) -> Stream:
+    def with_config(self, config: TrackerConfig, *, name: str) -> Tracker:
+        """A tracker that shares this one's network under other settings.
+
+        Args:
+            config: its settings.
+            name: what tables call it.
+        """
+        other = Tracker(
+            self.network, config, device=self.device, weights_hash=self.weights_hash, calibration=self.calibration
+        )
+        other.name, other._autocast = name, self._autocast
+        return other
+
+    def stream(
+        self, camera: Camera, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA
+    ) -> Stream:
         """Start tracking frames that come one by one.
 
         Args:
             camera: intrinsics of the frames.
             queries: what to follow; None discovers entities in the first frame.
+            alpha: probability of any alarm in a stream in which no identity is lost (``docs/monitor.md`` says what is
+                promised); None for no alarms and no recovery. Weights without a calibration raise no alarms.
 
         Raises:
             InputError: a point query lies outside the image.
+            ConfigError: alpha is no probability.
         """
-        return Stream(self.network, self.config, camera, queries, device=self.device, autocast=self._autocast)
+        monitor = None
+        if alpha is not None and self.calibration is not None:
+            monitor = Monitor(self.calibration, alpha=alpha)
+        return Stream(
+            self.network, self.config, camera, queries, device=self.device, autocast=self._autocast, monitor=monitor
+        )
 
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+    def candidates(self, camera: Camera, frame: Frame) -> Peaks:
+        """What discovery would choose from in a frame, whatever its score.
+
+        Args:
+            camera: intrinsics of the frame.
+            frame: the frame.
+
+        Raises:
+            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
+        """
+        intake = Intake(self.network, camera, device=self.device)
+        intake.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._autocast):
+            frames, _ = intake.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
+            observed = self.network.observe(frames)
+            return find_peaks(self.network, observed, radius_cells=self.config.slot_radius_cells)
+
+    def save(self, stream: Stream) -> bytes:
+        """A stream of this tracker as bytes; callbacks are left out."""
+        arrays, words = stream.state()
+        return SavedStream(self._maker(stream.camera), stream.alpha, words, arrays).to_bytes()
+
+    def restore(self, data: bytes) -> Stream:
+        """Go on with a stream that :meth:`save` gave, as if nothing had happened in between.
+
+        Raises:
+            InputError: the bytes are torn, or belong to other weights or settings.
+        """
+        saved = SavedStream.from_bytes(data)
+        camera = Camera(**saved.maker["camera"])
+        if saved.maker != self._maker(camera):
+            raise InputError("saved stream: it belongs to other weights or settings; load those that it was made with")
+        stream = self.stream(camera, (), alpha=saved.alpha)
+        stream.restore(saved.arrays, saved.words)
+        return stream
+
+    def track(
+        self, clip: Clip, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA
+    ) -> Tracks:
         """Track a whole clip: the stream's step in a loop.
 
         Args:
             clip: the frames.
             queries: what to follow; None discovers entities in the first frame.
+            alpha: as in :meth:`stream`.
 
         Raises:
             InputError: a point query lies outside the clip.
+            ConfigError: alpha is no probability.
         """
         for query in queries or ():
             if query.frame >= len(clip):
                 raise InputError(
                     f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames"
                 )
-        stream = self.stream(clip.camera, queries)
+        stream = self.stream(clip.camera, queries, alpha=alpha)
         states = []
         for t in range(len(clip)):
             frame = clip.frame(t)
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
         return collect(states, queries)
+
+    def _maker(self, camera: Camera) -> dict[str, Any]:
+        """What a saved stream must be restored with."""
+        return {"weights": self.weights_hash, "settings": self.config.to_json(), "camera": asdict(camera)}
 
 
 def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker:
@@ -90,8 +173,13 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker
         ConfigError: no such device.
     """
     loaded = load_network(name)
-    config = TrackerConfig.from_json(loaded.settings)
-    return Tracker(loaded.network, config, device=pick_device(device), weights_hash=loaded.sha256)
+    return Tracker(
+        loaded.network,
+        TrackerConfig.from_json(loaded.settings),
+        device=pick_device(device),
+        weights_hash=loaded.sha256,
+        calibration=Calibration.from_json(loaded.monitor) if loaded.monitor else None,
+    )
 
 
 def pick_device(name: str) -> torch.device:
@@ -135,13 +223,14 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
         names[i], labels[i] = name, label
     uv = np.full((t, k, 2), np.nan, np.float32)
     point = np.full((t, k, 3), np.nan, np.float32)
-    confidence = np.zeros((t, k), np.float32)
-    visible = np.zeros((t, k), bool)
+    confidence, lost_p = np.zeros((t, k), np.float32), np.full((t, k), np.nan, np.float32)
+    visible, alarm = np.zeros((t, k), bool), np.zeros((t, k), bool)
     state = np.full((t, k), State.LOST.value, dtype="<U8")
     for i, s in enumerate(states):
         rows = list(s.query)
         uv[i, rows], point[i, rows] = s.uv_px, s.point_world
         confidence[i, rows], visible[i, rows] = s.confidence, s.visible
+        lost_p[i, rows], alarm[i, rows] = s.lost_p, [a is not None for a in s.alarm]
         state[i, rows] = [value.value for value in s.state]
     with_depth = [s.has_depth for s in states]
     flags = [] if all(with_depth) else [PARTLY_NO_DEPTH_FLAG if any(with_depth) else NO_DEPTH_FLAG]
@@ -149,4 +238,29 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
     flags += [f"query {name!r} found no entity: lost in every frame" for name in lost]
     flags += [NOTHING_FOUND_FLAG] if queries is None and not k else []
     stamps = np.array([s.stamp_s for s in states])
-    return Tracks(tuple(names), tuple(labels), uv, point, confidence, visible, state, stamps, tuple(flags))
+    return Tracks(
+        names=tuple(names),
+        labels=tuple(labels),
+        uv_px=uv,
+        point_world=point,
+        confidence=confidence,
+        visible=visible,
+        state=state,
+        stamp_s=stamps,
+        frame_flags=tuple(flags),
+        lost_p=lost_p,
+        alarm=alarm,
+        joints=_joints(last, k),
+    )
+
+
+def _joints(last: StreamState, queries: int) -> Joints:
+    """The joints of the last frame as arrays in the order of the queries."""
+    kind = ["unknown"] * queries
+    axis, origin = (np.full((queries, 3), np.nan, np.float32) for _ in range(2))
+    for i, joint in zip(last.query, last.joint, strict=True):
+        if joint is not None:
+            kind[i], axis[i], origin[i] = joint.kind.value, joint.axis, joint.origin
+            if joint.kind is JointKind.STATIC:
+                axis[i] = np.nan
+    return Joints(tuple(kind), axis, origin)

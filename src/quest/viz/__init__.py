@@ -1,1 +1,1 @@
-"""Pictures a person can judge: overlay videos and contact sheets."""
+"""Pictures a person can judge: overlay videos, contact sheets, and a live view in the terminal."""

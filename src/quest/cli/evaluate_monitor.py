@@ -1,0 +1,123 @@
+"""``quest eval-monitor``: how well the monitor tells lost identities, beside plainer rules."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from quest.data.store import TakeStore
+    from quest.evaluation.results import Run
+    from quest.evaluation.selection import SplitPart
+    from quest.track import Tracker
+
+
+@dataclass(frozen=True)
+class EvalMonitor:
+    """Judge the monitor on takes: a table in the terminal and, with --out, a result file.
+
+    Every view of every take is tracked once with alarms off and its signals are kept in --records; the monitor, CUSUM,
+    Page-Hinkley and a threshold on the network's confidence are then played on them, all calibrated on the same
+    streams.
+
+    Attributes:
+        takes: stores with takes of objects that took no part in the calibration.
+        records: folder for the recorded streams.
+        calibration: folder of the streams that the weights were calibrated on.
+        weights: name or file of the weights.
+        split: parts of the object split.
+        level: levels to evaluate; all by default.
+        alpha: shares of loss-free streams that may alarm.
+        shard: part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one judges.
+        resamples: of the bootstrap over objects.
+        seed: of the bootstrap.
+        out: result file (.json).
+    """
+
+    takes: tuple[Path, ...]
+    records: Path
+    calibration: Path
+    weights: str = "quest-s16"
+    split: tuple[Literal["validation", "test", "unlisted"], ...] = ("test",)
+    level: tuple[int, ...] = ()
+    alpha: tuple[float, ...] = (0.01, 0.05, 0.1)
+    shard: str = "0/1"
+    resamples: int = 200
+    seed: int = 0
+    out: Path | None = None
+
+    def run(self) -> int:
+        """Record, judge, print the table, write the file.
+
+        Raises:
+            ConfigError: weights without a calibration, objects that they were calibrated on, or bad settings.
+            InputError: the calibration streams are missing or of other weights.
+            TakeError: a store is missing or a take is torn.
+        """
+        from rich.console import Console
+
+        from quest.data.store import TakeStore
+        from quest.errors import ConfigError
+        from quest.evaluation.detectors import our_monitor, rivals
+        from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
+        from quest.evaluation.selection import select_takes
+        from quest.evaluation.stream_record import Shard, read_records, record_streams, tracker_id
+        from quest.track import load
+
+        if self.resamples < 1 or not self.alpha or not all(0 < a < 1 for a in self.alpha):
+            raise ConfigError(f"eval-monitor: expected resamples >= 1 and 0 < alpha < 1, got {self}")
+        start_s = time.monotonic()
+        console = Console(stderr=True, highlight=False)
+        tracker = load(self.weights)
+        if tracker.calibration is None:
+            raise ConfigError(f"weights {self.weights}: they have no monitor; run `quest weights calibrate` first")
+        stores = [TakeStore(path) for path in self.takes]
+        takes = [(s, select_takes(s.infos(), split=self.split, levels=self.level)) for s in stores]
+        recorded = record_streams(
+            tracker,
+            takes,
+            self.records,
+            shard=Shard.parse(self.shard),
+            progress=lambda name, done, total: console.print(f"{done + 1}/{total} {name}"),
+        )
+        if recorded.missing:
+            console.print(f"{recorded.missing} streams are left to other shards; nothing is judged yet")
+            return 0
+        known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
+        both = {r.object_id for r in known} & {r.object_id for r in recorded.records}
+        if both:
+            raise ConfigError(f"objects {', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
+        detectors = (
+            our_monitor(tracker.calibration),
+            *rivals(known, block_frames=tracker.calibration.block_frames),
+        )
+        rows = drift_rows(detectors, recorded.records, alphas=self.alpha, resamples=self.resamples, seed=self.seed)
+        Console(width=TABLE_WIDTH).print(drift_table(rows))
+        if self.out is not None:
+            write_drift(rows, self._run(tracker, takes, start_s), tracker.calibration.about, self.out)
+            console.print(f"wrote {self.out}")
+        return 0
+
+    def _run(self, tracker: Tracker, takes: list[tuple[TakeStore, dict[str, SplitPart]]], start_s: float) -> Run:
+        from quest.data.provenance import code_commit, combined_hash, machine, package_versions
+        from quest.evaluation.results import Run
+
+        hashes = [(name, store.data_hash(name)) for store, chosen in takes for name in chosen]
+        return Run(
+            command=shlex.join(["quest", *sys.argv[1:]]),
+            commit=code_commit(),
+            data_hash=combined_hash(hashes),
+            weights=self.weights,
+            weights_hash=tracker.weights_hash,
+            resamples=self.resamples,
+            seed=self.seed,
+            machine=machine(),
+            versions=package_versions(),
+            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
+            seconds=round(time.monotonic() - start_s, 1),
+        )

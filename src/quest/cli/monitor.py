@@ -1,0 +1,104 @@
+"""``quest monitor``: watch the tracker at work on a recording, live, with its alarms."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.markup import escape
+
+from quest.cli.source import Source
+
+if TYPE_CHECKING:
+    from quest.track import Stream, StreamState
+    from quest.types import Clip
+
+EXIT_ALARM = 3
+
+NOTHING_FOUND = (
+    "nothing to follow was found; point at it with --point FRAME,X,Y (a pixel of that frame), "
+    "or name it with --label handle, knob, rim or front, which are taken at less confidence"
+)
+
+
+@dataclass(frozen=True)
+class Monitor(Source):
+    """Watch a recording or a take live: states, joints and alarms, frame by frame.
+
+    Without queries the entities are discovered. Exit code: 0 if no alarm is open at the end, 3 if one is.
+    """
+
+    alpha: float = 0.05
+    """Share of streams without any loss that may raise an alarm."""
+    jsonl: Path | None = None
+    """Write one JSON object per frame to this file; - is standard output, and then the view goes to standard error."""
+    realtime: bool = False
+    """Play at the recording's own pace; no frame is left out, so a slow machine falls behind."""
+
+    def run(self) -> int:
+        """Step through the clip, show, write.
+
+        Raises:
+            ConfigError: alpha is no probability.
+            InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
+        """
+        from quest.errors import ConfigError, InputError
+        from quest.track.state_lines import StateLines
+        from quest.viz.live import LiveView, query_words
+
+        if not 0.0 < self.alpha < 1.0:
+            raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
+        console = self._console()
+        clip = self.read()
+        queries = self.queries(clip)
+        tracker = self.tracker()
+        stream = tracker.stream(clip.camera, queries, alpha=self.alpha)
+        console.print(f"watching {escape(clip.name)}: {len(clip)} frames, {escape(self.weights)} on {tracker.device}")
+        if stream.alpha is None:
+            console.print(
+                f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
+                "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
+            )
+        view = LiveView(console, name=clip.name, frames=len(clip), alpha=stream.alpha)
+        state = None
+        try:
+            with contextlib.nullcontext() if self.jsonl is None else StateLines(self.jsonl) as lines, view:
+                for t, state, behind_s in self._play(stream, clip):
+                    if lines is not None:
+                        lines.write(state, frame=t)
+                    view.show(t, state, waiting=stream.unbound, behind_s=behind_s)
+                    if not (state.names or stream.unbound):
+                        break
+        except KeyboardInterrupt:
+            console.print(view.summary())
+            raise
+        if state is None or not state.names:
+            raise InputError(f"clip {clip.name!r}: {NOTHING_FOUND}")
+        for query in stream.unbound:
+            console.print(f"[yellow]note:[/] {escape(query_words(query))}: found no entity; ask for it by --point")
+        console.print(view.summary())
+        return EXIT_ALARM if any(alarm is not None for alarm in state.alarm) else 0
+
+    def _console(self) -> Console:
+        to_output = str(self.jsonl) == "-"
+        # A table that redraws itself would run into lines which come out in the same terminal.
+        clash = to_output and sys.stdout.isatty()
+        console = Console(stderr=to_output, highlight=False, force_interactive=False if clash else None)
+        console.soft_wrap = not console.is_interactive
+        return console
+
+    def _play(self, stream: Stream, clip: Clip) -> Iterator[tuple[int, StreamState, float]]:
+        """Index and answers of every frame, and how many seconds they come too late for the recording's pace."""
+        begun_s = time.monotonic() - clip.stamp_s[0]
+        for t in range(len(clip)):
+            frame = clip.frame(t)
+            if self.realtime:
+                time.sleep(max(0.0, begun_s + frame.stamp_s - time.monotonic()))
+            state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+            yield t, state, max(0.0, time.monotonic() - begun_s - frame.stamp_s) if self.realtime else 0.0

@@ -1,0 +1,93 @@
+"""Arguments that the commands share which follow entities in a recording or a take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import tyro
+
+if TYPE_CHECKING:
+    from quest.track import Tracker
+    from quest.types import Clip, Query
+
+SAMPLE = "sample"
+
+
+@dataclass(frozen=True)
+class Source:
+    """What to follow, where, and with which weights."""
+
+    clip: tyro.conf.Positional[str]
+    """A recording folder, a video, a take (STORE/NAME.zarr), or the word sample for the clip that ships."""
+    weights: str = "quest-s16"
+    """Name of shipped weights or a file."""
+    point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An entity by pixel, as FRAME,X,Y or FRAME,X,Y,NAME; give it again for each entity."""
+    label: tyro.conf.UseAppendAction[tuple[Literal["handle", "knob", "rim", "front"], ...]] = ()
+    """The most confident entity of a label; give it again for more."""
+    view: int = 0
+    """Which camera of a take."""
+    depth: Path | None = None
+    """Folder of 16-bit depth images; default: depth beside the colours."""
+    camera: Path | None = None
+    """Camera file; default: camera.json beside the colours."""
+    depth_scale_m: float | None = None
+    """Metres per unit of the depth images; default: what the camera file says."""
+    device: str = "auto"
+    """cpu, cuda, mps or auto."""
+
+    def read(self) -> Clip:
+        """The recording or the view of a take.
+
+        Raises:
+            RecordingError: there is no such recording, or it is not as expected.
+            TakeError: there is no such take, or it is torn.
+        """
+        from quest.data.recording import read_recording
+        from quest.data.sample import sample_folder
+        from quest.data.store import open_clip
+
+        if self.clip.rstrip("/").endswith(".zarr"):
+            return open_clip(self.clip, view=self.view)
+        path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
+        return read_recording(path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m)
+
+    def queries(self, clip: Clip) -> list[Query] | None:
+        """What was asked; None where nothing was, and everything is to be discovered.
+
+        Args:
+            clip: in which it was asked.
+
+        Raises:
+            InputError: a point is not written as expected, or its frame is not in the clip.
+        """
+        from quest.errors import InputError
+        from quest.types import Query
+
+        queries = []
+        for text in self.point:
+            parts = text.split(",", 3)
+            try:
+                frame, x, y = int(parts[0]), float(parts[1]), float(parts[2])
+            except (ValueError, IndexError) as error:
+                raise InputError(
+                    f"--point {text!r}: expected FRAME,X,Y or FRAME,X,Y,NAME, such as 0,120.5,88"
+                ) from error
+            if frame >= len(clip):
+                raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {len(clip) - 1}, got {frame}")
+            queries.append(Query.point(frame, x, y, name=parts[3] if len(parts) > 3 else ""))
+        queries += [Query.semantic(label) for label in self.label]
+        return queries or None
+
+    def tracker(self) -> Tracker:
+        """The tracker of the weights.
+
+        Raises:
+            WeightsError: no such weights, or the file is damaged.
+            ConfigError: no such device.
+        """
+        from quest.track import load
+
+        return load(self.weights, device=self.device)

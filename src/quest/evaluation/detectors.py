@@ -1,0 +1,224 @@
+"""The monitor and the rules that it is compared with, each calibrated by the same rule on the same streams.
+
+Every detector collects evidence with a statistic and alarms where that exceeds a conformal threshold. The monitor's
+evidence is its log odds of a loss; that of the others is the network's own doubt, one minus its confidence.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float64
+
+from quest.errors import ConfigError
+from quest.evaluation.drift import DEADLINE_FRAMES, delay_of, losses
+from quest.evaluation.replay import replay_features, replay_logits, replay_statistic
+from quest.evaluation.stream_record import StreamRecord
+from quest.monitor import Calibration
+from quest.monitor.calibrator import probability
+from quest.monitor.conformal import Threshold, spend, threshold
+from quest.monitor.statistic import Cusum, Latest, PageHinkley, Statistic
+
+AnyStatistic = TypeVar("AnyStatistic", bound=Statistic)
+
+FIT_PERCENT = 40
+"""Share of the objects whose streams the calibrator is fitted on; those of the others give the thresholds."""
+
+_JUDGED_AT = (0.05, 0.1)
+
+_CUSUM_DRIFTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.3, 0.5)
+_PAGE_HINKLEY_DELTAS = (0.0, 0.005, 0.02, 0.05, 0.1, 0.2)
+
+
+@dataclass(frozen=True)
+class Detector:
+    """Something that raises alarms.
+
+    Attributes:
+        name: what tables call it.
+        statistic: collects evidence.
+        maxima: of the statistic in loss-free calibration streams; ascending.
+        block_frames: length of these streams.
+        calibration: the monitor's; None for the rules on the network's own confidence.
+        probabilistic: whether the score of a frame is meant as a probability.
+    """
+
+    name: str
+    statistic: Statistic
+    maxima: Float64[np.ndarray, " n"]
+    block_frames: int
+    calibration: Calibration | None = None
+    probabilistic: bool = False
+
+    def limits(self, frames: int, alpha: float) -> list[Threshold]:
+        """The threshold in each frame of a stream.
+
+        Args:
+            frames: length of the stream.
+            alpha: share of loss-free streams that may alarm.
+        """
+        blocks = [
+            threshold(self.maxima, spend(alpha, block=b + 1, restart=0)) for b in range(-(-frames // self.block_frames))
+        ]
+        return [blocks[t // self.block_frames] for t in range(frames)]
+
+
+@dataclass(frozen=True)
+class Played:
+    """A detector's answers to streams.
+
+    Attributes:
+        score: per stream, frame and query; the larger, the more it speaks for a loss in this frame.
+        path: the statistic; minus infinity before a query was asked.
+    """
+
+    score: list[np.ndarray]
+    path: list[np.ndarray]
+
+
+def play(detector: Detector, records: Sequence[StreamRecord]) -> Played:
+    """A detector's answers to recorded streams."""
+    if detector.calibration is None:
+        evidence = [doubt(record) for record in records]
+    else:
+        calibrator = detector.calibration.calibrator
+        evidence = replay_logits(calibrator, replay_features(calibrator, records))
+    path = replay_statistic(detector.statistic, evidence, records, block_frames=detector.block_frames)
+    score = path if detector.calibration is None else [probability(value) for value in evidence]
+    return Played(score, path)
+
+
+def doubt(record: StreamRecord) -> Float64[np.ndarray, "T K"]:
+    """One minus the network's own confidence; one where it has none."""
+    return np.nan_to_num(1.0 - record.confidence.astype(np.float64), nan=1.0)
+
+
+def our_monitor(calibration: Calibration) -> Detector:
+    """The monitor that is stored with the weights."""
+    return Detector(
+        "monitor",
+        calibration.statistic,
+        calibration.maxima,
+        calibration.block_frames,
+        calibration=calibration,
+        probabilistic=True,
+    )
+
+
+def rivals(records: Sequence[StreamRecord], *, block_frames: int) -> tuple[Detector, ...]:
+    """CUSUM, Page-Hinkley and a threshold on the network's own confidence, at their best settings.
+
+    Settings are chosen, as the monitor's are, on the streams that it is fitted on; thresholds come from the others.
+
+    Args:
+        records: all calibration streams.
+        block_frames: length of the calibration streams.
+
+    Raises:
+        ConfigError: the streams do not suffice.
+    """
+    fit, rest = fit_part(records)
+    evidence = [doubt(record) for record in fit]
+    cusum = choose([Cusum(drift) for drift in _CUSUM_DRIFTS], evidence, fit, block_frames=block_frames)
+    hinkley = choose([PageHinkley(d) for d in _PAGE_HINKLEY_DELTAS], evidence, fit, block_frames=block_frames)
+    plain = {"cusum": cusum[0], "page-hinkley": hinkley[0], "threshold": Latest()}
+    found = []
+    for name, statistic in plain.items():
+        maxima = loss_free_maxima(statistic, rest, [doubt(r) for r in rest], block_frames=block_frames)
+        found.append(Detector(name, statistic, maxima, block_frames, probabilistic=name == "threshold"))
+    return tuple(found)
+
+
+def fit_part(records: Sequence[StreamRecord]) -> tuple[list[StreamRecord], list[StreamRecord]]:
+    """Streams that calibrators are fitted on, and those that give thresholds; no object is in both.
+
+    An object's part follows from its name alone, so that it does not depend on which others there are.
+    """
+    fit = [r for r in records if _number(f"object {r.object_id}") % 100 < FIT_PERCENT]
+    rest = [r for r in records if _number(f"object {r.object_id}") % 100 >= FIT_PERCENT]
+    return fit, rest
+
+
+def one_per_object(records: Sequence[StreamRecord]) -> list[int]:
+    """Indices of one stream per object, drawn without looking at what happens in it."""
+    chosen: dict[str, int] = {}
+    for i, record in enumerate(records):
+        other = chosen.get(record.object_id)
+        if other is None or _lot(record) < _lot(records[other]):
+            chosen[record.object_id] = i
+    return sorted(chosen.values())
+
+
+def loss_free_maxima(
+    statistic: Statistic,
+    records: Sequence[StreamRecord],
+    evidence: Sequence[Float64[np.ndarray, "_ _"]],
+    *,
+    block_frames: int,
+) -> Float64[np.ndarray, " n"]:
+    """Largest value of the statistic in the first block of one stream per object, where nothing is lost; ascending.
+
+    Raises:
+        ConfigError: no stream is left.
+    """
+    long = [i for i, record in enumerate(records) if len(record) >= block_frames]
+    drawn = [long[i] for i in one_per_object([records[i] for i in long])]
+    free = [i for i in drawn if not (records[i].lost & records[i].watched)[:block_frames].any()]
+    if not free:
+        raise ConfigError(
+            f"monitor: expected loss-free streams of at least {block_frames} frames to take thresholds from, found "
+            f"none among {len(records)}; record more takes"
+        )
+    streams = [records[i] for i in free]
+    path = replay_statistic(statistic, [evidence[i] for i in free], streams, block_frames=block_frames)
+    return np.sort([value[:block_frames].max() for value in path])
+
+
+def choose(
+    candidates: Sequence[AnyStatistic],
+    evidence: Sequence[Float64[np.ndarray, "_ _"]],
+    records: Sequence[StreamRecord],
+    *,
+    block_frames: int,
+) -> tuple[AnyStatistic, list[float]]:
+    """The statistic that finds losses soonest at equal false alarms.
+
+    The judge is the mean delay, a missed loss counting as :data:`~quest.evaluation.drift.DEADLINE_FRAMES`, at
+    thresholds from the loss-free ones of the same streams. Ties go to the first.
+
+    Returns:
+        The statistic, and the mean delay of every candidate in frames.
+
+    Raises:
+        ConfigError: the streams have no loss or none without.
+    """
+    free = [i for i, record in enumerate(records) if record.loss_free]
+    events = [(i, loss) for i, record in enumerate(records) for loss in losses(record) if not loss.too_late]
+    if not free or not events:
+        raise ConfigError(
+            f"monitor: expected streams with losses and streams without to fit on, got {len(events)} losses and "
+            f"{len(free)} loss-free streams; record more takes"
+        )
+    delays = []
+    for candidate in candidates:
+        path = replay_statistic(candidate, evidence, records, block_frames=block_frames)
+        maxima = np.sort([path[i].max() for i in free])
+        found = []
+        for alpha in _JUDGED_AT:
+            limit = maxima[min(int(np.ceil(round((len(maxima) + 1) * (1.0 - alpha), 9))), len(maxima)) - 1]
+            for i, loss in events:
+                found.append(min(delay_of(loss, path[i][:, loss.query] > limit), DEADLINE_FRAMES))
+        delays.append(float(np.mean(found)))
+    return candidates[int(np.argmin(delays))], delays
+
+
+def _number(text: str) -> int:
+    return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+
+
+def _lot(record: StreamRecord) -> int:
+    return _number(f"stream {record.take} {record.view}")

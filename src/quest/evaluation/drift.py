@@ -1,0 +1,153 @@
+"""How well drift is detected: scores of frames, and alarms of streams. ``docs/metrics.md`` has the definitions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.stats import beta
+
+from quest.evaluation.bootstrap import LEVEL
+from quest.evaluation.stream_record import StreamRecord, runs
+
+DEADLINE_FRAMES = 30
+"""A loss is missed if no alarm comes within this many frames of its first, or before it ends if that is later."""
+
+LEAST_FRAMES = 10
+"""A loss that begins with fewer frames left in the stream is not judged: nobody could have said much yet."""
+
+BINS = 15
+"""Of the calibration error, equally wide."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """The first loss of a query's identity in a stream.
+
+    Attributes:
+        query: index of the query.
+        start: its first frame.
+        deadline: the frame after the last one in which an alarm still counts.
+        too_late: whether it begins so late in the stream that it is not judged.
+    """
+
+    query: int
+    start: int
+    deadline: int
+    too_late: bool
+
+
+def losses(record: StreamRecord) -> list[Loss]:
+    """First losses of the queries of a stream; later ones depend on whether the first alarm was cleared."""
+    found = []
+    frames = len(record)
+    for k in range(record.lost.shape[1]):
+        spans = runs((record.lost & record.watched)[:, k])
+        if spans:
+            start, end = spans[0]
+            deadline = min(max(start + DEADLINE_FRAMES, end), frames)
+            found.append(Loss(k, start, deadline, too_late=start + LEAST_FRAMES > frames))
+    return found
+
+
+def delay_of(loss: Loss, above: Bool[np.ndarray, " T"]) -> float:
+    """Frames from the start of a loss to the first frame, at or after it, that alarms; infinite if it is missed.
+
+    Args:
+        loss: when it was.
+        above: frames in which the statistic is above its threshold.
+    """
+    frames = np.flatnonzero(above[loss.start : loss.deadline])
+    return float(frames[0]) if len(frames) else math.inf
+
+
+def auroc(score: Float[np.ndarray, " M"], lost: Bool[np.ndarray, " M"]) -> float:
+    """Area under the ROC curve: how often a lost frame scores higher than another one, ties counting half.
+
+    Args:
+        score: per frame and query; the larger, the more it speaks for a loss.
+        lost: truth.
+
+    Returns:
+        NaN if there are only lost frames, or none.
+    """
+    return ranked_auroc(np.unique(score, return_inverse=True)[1], lost, np.ones(len(score)))
+
+
+def ranked_auroc(rank: Int[np.ndarray, " M"], lost: Bool[np.ndarray, " M"], weight: Float[np.ndarray, " M"]) -> float:
+    """:func:`auroc` of weighted frames whose scores have been ranked before, which resampling needs again and again.
+
+    Args:
+        rank: of each score among the different scores.
+        lost: truth.
+        weight: of each.
+    """
+    bad = np.bincount(rank, weights=weight * lost)
+    good = np.bincount(rank, weights=weight * ~lost)
+    pairs = bad.sum() * good.sum()
+    return float((bad * (np.cumsum(good) - 0.5 * good)).sum() / pairs) if pairs > 0 else math.nan
+
+
+def augrc(area: float, share: float) -> float:
+    """Area under the generalised risk-coverage curve: mean share of all frames that are accepted and lost.
+
+    Frames are accepted in the order of their scores, the least suspicious first.
+
+    Reference: Traub et al., Overcoming common flaws in the evaluation of selective classification systems, NeurIPS
+    2024, equation 6.
+
+    Args:
+        area: AUROC.
+        share: of lost frames.
+    """
+    return (1.0 - area) * share * (1.0 - share) + 0.5 * share**2
+
+
+def calibration_error(
+    p: Float[np.ndarray, " M"], lost: Bool[np.ndarray, " M"], weight: Float[np.ndarray, " M"] | None = None
+) -> float:
+    """Expected calibration error: mean over frames of | mean P(lost) - share lost | in the frame's bin of P(lost).
+
+    Reference: Guo et al., On calibration of modern neural networks, ICML 2017, equation 3.
+
+    Args:
+        p: probability of a loss.
+        lost: truth.
+        weight: of each; all alike by default.
+    """
+    weight = np.ones(len(p)) if weight is None else weight
+    index = np.minimum((p * BINS).astype(int), BINS - 1)
+    said = np.bincount(index, weights=weight * p, minlength=BINS)
+    true = np.bincount(index, weights=weight * lost, minlength=BINS)
+    return float(np.abs(said - true).sum() / weight.sum())
+
+
+def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
+    """Exact 95 % interval of a share.
+
+    Reference: Clopper and Pearson, Biometrika 26, 1934.
+
+    Args:
+        hits: how often it happened.
+        trials: how often it could have; at least 1.
+    """
+    tail = (1.0 - LEVEL) / 2.0
+    low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
+    high = float(beta.ppf(1.0 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    return low, high
+
+
+def quantile(value: Float[np.ndarray, " M"], share: float, weight: Float[np.ndarray, " M"] | None = None) -> float:
+    """The least value that at least this share of the weight does not exceed; infinite values take part.
+
+    Returns:
+        NaN without any weight.
+    """
+    weight = np.ones(len(value)) if weight is None else weight
+    if not weight.sum() > 0:
+        return math.nan
+    order = np.argsort(value, kind="stable")
+    below = np.cumsum(weight[order])
+    return float(value[order][np.searchsorted(below, share * below[-1] * (1.0 - 1e-12))])

@@ -1,0 +1,323 @@
+"""Drift detection as rows: every detector on the same streams, with intervals; the file and the table of them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+
+from quest.evaluation.bootstrap import LEVEL, Value, draw_objects
+from quest.evaluation.detectors import Detector, Played, one_per_object, play
+from quest.evaluation.drift import (
+    augrc,
+    calibration_error,
+    clopper_pearson,
+    delay_of,
+    losses,
+    quantile,
+    ranked_auroc,
+)
+from quest.evaluation.results import Run
+from quest.evaluation.stream_record import StreamRecord
+
+FORMAT = 1
+"""Version of the result file."""
+
+TABLE_WIDTH = 170
+"""Characters that the table needs."""
+
+
+@dataclass(frozen=True)
+class AlarmRow:
+    """Alarms at one alpha.
+
+    Attributes:
+        alpha: share of loss-free streams that may alarm.
+        threshold: in the first block; None where the calibration streams are too few for any.
+        extrapolated: whether it is read off a fitted tail.
+        trials: loss-free streams, one per object.
+        false_alarms: how many of them raised an alarm.
+        low: lower end of the exact 95 % interval of their share; None without streams.
+        high: upper end.
+        all_trials: all loss-free streams, those of one object dependent on each other.
+        all_false_alarms: how many of them raised an alarm.
+        missed: share of judged losses that are missed.
+        early: share of judged losses whose query had alarmed before.
+        delay_median: frames from the loss to the alarm; a missed loss has an infinite delay, and the value is None
+            where the median is infinite or there are no losses.
+        delay_p90: the same for 90 %.
+    """
+
+    alpha: float
+    threshold: float | None
+    extrapolated: bool
+    trials: int
+    false_alarms: int
+    low: float | None
+    high: float | None
+    all_trials: int
+    all_false_alarms: int
+    missed: Value | None
+    early: Value | None
+    delay_median: Value | None
+    delay_p90: Value | None
+
+
+@dataclass(frozen=True)
+class DriftRow:
+    """One detector on one kind of streams.
+
+    Attributes:
+        detector: its name.
+        part: part of the object split.
+        source: ``partnet-mobility`` or ``procedural``.
+        objects: how many.
+        streams: how many.
+        frames: (frame, query) pairs.
+        lost_frames: of these.
+        losses: first losses of queries that are judged.
+        too_late: first losses that begin too near the end of the stream to be judged.
+        auroc: per frame.
+        augrc: per frame.
+        ece: per frame; None where the score is no probability.
+        alarms: at every alpha.
+    """
+
+    detector: str
+    part: str
+    source: str
+    objects: int
+    streams: int
+    frames: int
+    lost_frames: int
+    losses: int
+    too_late: int
+    auroc: Value | None
+    augrc: Value | None
+    ece: Value | None
+    alarms: tuple[AlarmRow, ...]
+
+
+def drift_rows(
+    detectors: Sequence[Detector],
+    records: Sequence[StreamRecord],
+    *,
+    alphas: Sequence[float],
+    resamples: int,
+    seed: int,
+) -> tuple[DriftRow, ...]:
+    """Rows per part of the split, source and detector.
+
+    Args:
+        detectors: all calibrated.
+        records: streams to judge on; none of them took part in any calibration.
+        alphas: shares of loss-free streams that may alarm.
+        resamples: of the bootstrap over objects.
+        seed: of the bootstrap.
+    """
+    rows = []
+    kinds = sorted({(r.part, r.source) for r in records})
+    for part, source in kinds:
+        group = [r for r in records if (r.part, r.source) == (part, source)]
+        objects = sorted({r.object_id for r in group})
+        draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
+        owner = np.array([objects.index(r.object_id) for r in group])
+        rows += [_row(detector, group, owner, draws.astype(np.float64), alphas) for detector in detectors]
+    return tuple(rows)
+
+
+def _row(
+    detector: Detector, records: list[StreamRecord], owner: np.ndarray, draws: np.ndarray, alphas: Sequence[float]
+) -> DriftRow:
+    played = play(detector, records)
+    watched = [r.watched for r in records]
+    score = np.concatenate([s[w] for s, w in zip(played.score, watched, strict=True)])
+    lost = np.concatenate([r.lost[w] for r, w in zip(records, watched, strict=True)])
+    weights = _Weights(np.repeat(owner, [int(w.sum()) for w in watched]), draws)
+    rank = np.unique(score, return_inverse=True)[1]
+
+    def area(weight: np.ndarray) -> float:
+        return ranked_auroc(rank, lost, weight)
+
+    def risk(weight: np.ndarray) -> float:
+        return augrc(area(weight), float((weight * lost).sum() / weight.sum()))
+
+    judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if not loss.too_late]
+    return DriftRow(
+        detector=detector.name,
+        part=records[0].part,
+        source=records[0].source,
+        objects=draws.shape[1],
+        streams=len(records),
+        frames=len(lost),
+        lost_frames=int(lost.sum()),
+        losses=len(judged),
+        too_late=sum(loss.too_late for r in records for loss in losses(r)),
+        auroc=weights.value(area, len(lost)),
+        augrc=weights.value(risk, len(lost)),
+        ece=weights.value(lambda w: calibration_error(score, lost, w), len(lost)) if detector.probabilistic else None,
+        alarms=tuple(_alarm_row(detector, played, records, owner, draws, alpha) for alpha in alphas),
+    )
+
+
+@dataclass(frozen=True)
+class _Weights:
+    """Terms and the objects they belong to, for intervals.
+
+    Attributes:
+        owner: object of each term.
+        draws: how often each object is drawn in each resample.
+    """
+
+    owner: np.ndarray
+    draws: np.ndarray
+
+    def value(self, metric: Callable[[np.ndarray], float], count: int) -> Value | None:
+        """The metric and its percentile interval; None where it is not defined or infinite."""
+        mean = metric(np.ones(len(self.owner)))
+        if not count or not math.isfinite(mean):
+            return None
+        if self.draws.shape[1] < 2:
+            return Value(mean, None, None, count)
+        drawn = (draw[self.owner] for draw in self.draws)
+        samples = np.array([metric(weight) for weight in drawn if weight.sum() > 0])
+        samples = samples[~np.isnan(samples)]
+        low, high = (quantile(samples, share) for share in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0))
+        return Value(mean, _finite(low), _finite(high), count)
+
+
+def _alarm_row(
+    detector: Detector,
+    played: Played,
+    records: list[StreamRecord],
+    owner: np.ndarray,
+    draws: np.ndarray,
+    alpha: float,
+) -> AlarmRow:
+    limits = [detector.limits(len(r), alpha) for r in records]
+    above = [
+        path > np.array([limit.value for limit in own])[:, None] for path, own in zip(played.path, limits, strict=True)
+    ]
+    free = [i for i, r in enumerate(records) if r.loss_free]
+    alarmed = {i: bool(above[i].any()) for i in free}
+    drawn = [i for i in one_per_object(records) if i in alarmed]
+    false = sum(alarmed[i] for i in drawn)
+    low, high = clopper_pearson(false, len(drawn)) if drawn else (None, None)
+    judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if not loss.too_late]
+    delay = np.array([delay_of(loss, above[i][:, loss.query]) for i, loss in judged])
+    early = np.array([above[i][: loss.start, loss.query].any() for i, loss in judged], dtype=np.float64)
+    weights = _Weights(owner[[i for i, _ in judged]] if judged else np.zeros(0, int), draws)
+    missed = np.isinf(delay).astype(np.float64)
+
+    def mean(terms: np.ndarray) -> Value | None:
+        return weights.value(lambda w: float((w * terms).sum() / w.sum()), len(judged)) if judged else None
+
+    first = limits[0][0]
+    return AlarmRow(
+        alpha=alpha,
+        threshold=_finite(first.value),
+        extrapolated=first.extrapolated,
+        trials=len(drawn),
+        false_alarms=false,
+        low=low,
+        high=high,
+        all_trials=len(free),
+        all_false_alarms=sum(alarmed.values()),
+        missed=mean(missed),
+        early=mean(early),
+        delay_median=weights.value(lambda w: quantile(delay, 0.5, w), len(judged)),
+        delay_p90=weights.value(lambda w: quantile(delay, 0.9, w), len(judged)),
+    )
+
+
+def _finite(value: float | None) -> float | None:
+    return value if value is not None and math.isfinite(value) else None
+
+
+def write_drift(rows: Sequence[DriftRow], run: Run, about: str, path: Path) -> None:
+    """Write the result file, whole or not at all.
+
+    Args:
+        rows: the table.
+        run: what made it.
+        about: what the monitor was calibrated on.
+        path: a file ending in ``.json``.
+    """
+    raw = {"format": FORMAT, "run": asdict(run), "calibration": about, "rows": [asdict(row) for row in rows]}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(json.dumps(raw, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
+    """Rows as tables, one per part of the split and source."""
+    tables = []
+    for (part, source), group in groupby(rows, key=lambda row: (row.part, row.source)):
+        own = list(group)
+        first = own[0]
+        title = (
+            f"{source} · {part} objects · {first.objects} objects, {first.streams} streams, {first.frames} frames "
+            f"({first.lost_frames} lost), {first.losses} losses ({first.too_late} too late to judge)"
+        )
+        table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+        headings = (
+            "detector",
+            "AUROC",
+            "AUGRC",
+            "ECE",
+            "α %",
+            "false alarms %",
+            "of",
+            "missed %",
+            "early %",
+            "delay",
+            "p90",
+        )
+        for heading in headings:
+            table.add_column(heading, justify="left" if heading == "detector" else "right")
+        for row in own:
+            scores = (row.detector, _show(row.auroc), _show(row.augrc), _show(row.ece))
+            for i, alarm in enumerate(row.alarms):
+                table.add_row(*(scores if i == 0 else ("",) * 4), *_alarm_cells(alarm))
+        tables.append(table)
+    legend = (
+        "below or beside each number its 95 % interval: exact for false alarms (one loss-free stream per object), "
+        "bootstrap over objects for the others. ~: threshold from a fitted tail. delay in frames; >: not reached"
+    )
+    return Group(*tables, legend)
+
+
+def _alarm_cells(alarm: AlarmRow) -> tuple[str, ...]:
+    share = "-"
+    if alarm.low is not None and alarm.high is not None:
+        share = f"{100 * alarm.false_alarms / alarm.trials:.1f} ({100 * alarm.low:.1f}–{100 * alarm.high:.1f})"
+    none = "-" if alarm.missed is None else ">"
+    return (
+        f"{'~' if alarm.extrapolated else ''}{100 * alarm.alpha:g}",
+        share,
+        str(alarm.trials),
+        _show(alarm.missed, factor=100, decimals=1),
+        _show(alarm.early, factor=100, decimals=1),
+        _show(alarm.delay_median, decimals=0, none=none),
+        _show(alarm.delay_p90, decimals=0, none=none),
+    )
+
+
+def _show(value: Value | None, *, factor: float = 1.0, decimals: int = 3, none: str = "-") -> str:
+    if value is None:
+        return none
+    ends = "–".join("∞" if end is None else f"{factor * end:.{decimals}f}" for end in (value.low, value.high))
+    return f"{factor * value.mean:.{decimals}f} ({ends})"

@@ -1,0 +1,312 @@
+"""What the monitor is calibrated and judged on: the signals of a stream beside the truth, one file per stream."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int
+
+from quest.data.store import TakeStore
+from quest.errors import ConfigError, InputError
+from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
+from quest.evaluation.selection import SplitPart
+from quest.monitor import SIGNALS
+from quest.track import Tracker
+from quest.types import Query, Take
+
+LIFTING_PX = 8.0
+"""A seen entity whose pixel is this near to the true one is not lost, whatever its 3D point: pixels of the input."""
+
+FORMAT = 1
+"""Version of the files."""
+
+
+@dataclass(frozen=True)
+class StreamRecord:
+    """One stream: a view of a take, watched by a tracker whose monitor was switched off.
+
+    Attributes:
+        take: name of the take.
+        view: index of the view.
+        object_id: the object.
+        source: ``partnet-mobility`` or ``procedural``.
+        part: part of the object split.
+        level: how many joints move one after the other.
+        signals: per frame and query, in the order of :data:`quest.monitor.SIGNALS`; NaN where unknown.
+        lost: whether the identity is truly lost.
+        asked: frame in which each query was asked.
+        moved: whether the entity is at some time more than 0.1 from rest.
+        confidence: the network's own probability that the identity is right.
+    """
+
+    take: str
+    view: int
+    object_id: str
+    source: str
+    part: str
+    level: int
+    signals: Float32[np.ndarray, "T K S"]
+    lost: Bool[np.ndarray, "T K"]
+    asked: Int[np.ndarray, " K"]
+    moved: Bool[np.ndarray, " K"]
+    confidence: Float32[np.ndarray, "T K"]
+
+    def __len__(self) -> int:
+        return len(self.lost)
+
+    @property
+    def watched(self) -> Bool[np.ndarray, "T K"]:
+        """Frames in which each query was followed."""
+        return np.arange(len(self))[:, None] >= self.asked
+
+    @property
+    def loss_free(self) -> bool:
+        """Whether no identity is ever lost."""
+        return not (self.lost & self.watched).any()
+
+
+def lost(
+    take: Take,
+    view: int,
+    uv_px: Float32[np.ndarray, "T K 2"],
+    point_world: Float32[np.ndarray, "T K 3"],
+    entities: Int[np.ndarray, " K"],
+) -> Bool[np.ndarray, "T K"]:
+    """Whether an identity is lost: its answer is nearest to another entity, or within 0.1 of none, for 3 frames.
+
+    A frame in which the entity is seen and the answer's pixel is within :data:`LIFTING_PX` of the true one is no loss:
+    that is an error of lifting.
+
+    Args:
+        take: the truth.
+        view: index of the view.
+        uv_px: answers, pixels of the source image.
+        point_world: answers, metres.
+        entities: index in the take of the entity that each query asked for; all of them followable.
+    """
+    truth, camera = take.views[view], take.views[view].clip.camera
+    rank = np.searchsorted(take.tracked, entities)
+    nearest = identity(point_world, take.point_world[:, take.tracked], rank, half_diagonal_m=take.info.half_diagonal_m)
+    gap_px = distance_px(uv_px, truth.uv_px[:, entities], width=camera.width, height=camera.height)
+    on_it = truth.visible[:, entities] & (gap_px <= LIFTING_PX)
+    return lasting((nearest != rank) & ~on_it)
+
+
+def lasting(wrong: Bool[np.ndarray, "T K"], frames: int = SWITCH_FRAMES) -> Bool[np.ndarray, "T K"]:
+    """The runs of True that are at least so many frames long."""
+    kept = np.zeros_like(wrong)
+    for k in range(wrong.shape[1]):
+        for first, last in runs(wrong[:, k]):
+            if last - first >= frames:
+                kept[first:last, k] = True
+    return kept
+
+
+def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
+    """First frame, and frame after the last, of every run of True."""
+    edges = np.flatnonzero(np.diff(flags.astype(np.int8), prepend=0, append=0))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord | None:
+    """Ask for every entity that is visible in frame 0 by its true pixel, and step through the view.
+
+    Args:
+        tracker: its monitor is switched off.
+        take: with ground truth.
+        view: index of the view.
+        part: part of the object split.
+
+    Returns:
+        None if no entity is visible in frame 0.
+    """
+    truth = take.views[view]
+    entities = take.tracked[truth.visible[0, take.tracked]]
+    if not len(entities):
+        return None
+    # Names are neutral: a tracker must not read the label out of them.
+    queries = [
+        Query.point(0, float(x), float(y), name=f"query-{k}") for k, (x, y) in enumerate(truth.uv_px[0, entities])
+    ]
+    stream = tracker.stream(truth.clip.camera, queries, alpha=None)
+    t, k = len(take), len(entities)
+    signals = np.full((t, k, len(SIGNALS)), np.nan, np.float32)
+    uv_px = np.full((t, k, 2), np.nan, np.float32)
+    point_world = np.full((t, k, 3), np.nan, np.float32)
+    for i in range(t):
+        frame = truth.clip.frame(i)
+        state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        rows = list(state.query)
+        signals[i, rows], uv_px[i, rows], point_world[i, rows] = state.signals.values, state.uv_px, state.point_world
+    return StreamRecord(
+        take=take.info.name,
+        view=view,
+        object_id=take.info.object_id,
+        source=take.info.source,
+        part=part,
+        level=take.info.level,
+        signals=signals,
+        lost=lost(take, view, uv_px, point_world, entities),
+        asked=np.zeros(k, np.int64),
+        moved=take.moved[entities],
+        confidence=_confidence(signals),
+    )
+
+
+def tracker_id(tracker: Tracker) -> str:
+    """Twelve hexadecimal digits that tell apart networks and settings, but not what else is in a weights file."""
+    digest = hashlib.sha256(tracker.network.config.to_json().encode())
+    digest.update(tracker.config.to_json().encode())
+    for name, tensor in sorted(tracker.network.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().float().numpy().tobytes())
+    return digest.hexdigest()[:12]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A part of the streams, for processes side by side.
+
+    Attributes:
+        index: from 0.
+        count: how many parts there are.
+    """
+
+    index: int = 0
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read ``0/2``, the first of two.
+
+        Raises:
+            ConfigError: the text is of another form or the index too large.
+        """
+        index, _, count = text.partition("/")
+        if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+            raise ConfigError(f"shard {text!r}: expected index/count such as 0/2, the index below the count")
+        return cls(int(index), int(count))
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What a folder has of the streams that were asked for.
+
+    Attributes:
+        records: read back, in the order of stores, takes and views.
+        missing: streams that are left to other shards.
+    """
+
+    records: tuple[StreamRecord, ...]
+    missing: int
+
+
+def record_streams(
+    tracker: Tracker,
+    takes: Sequence[tuple[TakeStore, Mapping[str, SplitPart]]],
+    folder: Path,
+    *,
+    shard: Shard,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> Recorded:
+    """Record every view of every take that the folder does not have yet, and read back what it has.
+
+    Args:
+        tracker: its monitor is switched off. Streams that another tracker recorded are recorded again.
+        takes: stores with the takes to use and their part of the object split.
+        folder: one ``.npz`` per stream, written whole or not at all.
+        shard: the part of the streams that this process records.
+        progress: told of every stream before it is recorded: its name, how many come before it, how many there are.
+
+    Raises:
+        ConfigError: two stores have a take of the same name.
+        TakeError: a take cannot be read.
+    """
+    names = [name for _, chosen in takes for name in chosen]
+    if len(set(names)) < len(names):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        raise ConfigError(f"records: expected different names of takes in all stores, {twice[0]!r} comes twice")
+    made_by = tracker_id(tracker)
+    streams = []
+    for store, chosen in takes:
+        headers = store.headers()
+        streams += [(store, n, part, v) for n, part in chosen.items() for v in range(len(headers[n].cameras))]
+    take: Take | None = None
+    for i, (store, name, part, view) in enumerate(streams):
+        path = folder / f"{name}-view{view}.npz"
+        if i % shard.count != shard.index or (path.exists() and _read(path)[0] == made_by):
+            continue
+        progress(f"{name} view {view}", i, len(streams))
+        take = take if take is not None and take.info.name == name else store.read(name)
+        write_record(record_stream(tracker, take, view, part=part), path, made_by=made_by)
+    # Only now, since other shards went on meanwhile.
+    paths = [folder / f"{name}-view{view}.npz" for _, name, _, view in streams]
+    found = [_read(path) for path in paths if path.exists()]
+    own = [record for who, record in found if who == made_by]
+    return Recorded(tuple(record for record in own if record is not None), len(streams) - len(own))
+
+
+def write_record(record: StreamRecord | None, path: Path, *, made_by: str) -> None:
+    """Write a record whole or not at all; None leaves a mark that the stream has nothing to follow."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values: dict[str, Any] = {"format": np.array(FORMAT), "made_by": np.array(made_by)}
+    values |= {} if record is None else {f.name: np.asarray(getattr(record, f.name)) for f in fields(StreamRecord)}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **values)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_records(folder: str | Path, *, made_by: str) -> tuple[StreamRecord, ...]:
+    """All records of a folder that one tracker made, by file name.
+
+    Args:
+        folder: that :func:`record_streams` filled.
+        made_by: from :func:`tracker_id`.
+
+    Raises:
+        InputError: there are none, or one is damaged.
+    """
+    found = [_read(path) for path in sorted(Path(folder).glob("*.npz"))]
+    records = tuple(record for who, record in found if record is not None and who == made_by)
+    if not records:
+        raise InputError(
+            f"records {folder}: expected streams of the tracker {made_by}, found none among {len(found)} files; "
+            "record them with `quest weights calibrate`"
+        )
+    return records
+
+
+def _read(path: Path) -> tuple[str, StreamRecord | None]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if int(file["format"]) != FORMAT:
+                raise InputError(f"record {path}: expected format {FORMAT}, got {file['format']}; delete it")
+            made_by = str(file["made_by"])
+            if "take" not in file:
+                return made_by, None
+            raw = {f.name: file[f.name] for f in fields(StreamRecord)}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"record {path}: not a whole record ({error}); delete it and record again") from error
+    plain = {name: value.item() if value.ndim == 0 else value for name, value in raw.items()}
+    if plain["signals"].shape[-1] != len(SIGNALS):
+        raise InputError(f"record {path}: it has other signals than this version of quest; delete it and record again")
+    return made_by, StreamRecord(**plain)
+
+
+def _confidence(signals: Float32[np.ndarray, "T K S"]) -> Float32[np.ndarray, "T K"]:
+    """The network's own probability that the identity is right."""
+    logit = signals[..., SIGNALS.index("right_logit")].astype(np.float64)
+    return (1.0 / (1.0 + np.exp(-logit))).astype(np.float32)

@@ -1,0 +1,8 @@
+"""Drift signals, calibration, sequential alarms: knows when a query silently follows something else."""
+
+from quest.monitor.alarm import Alarm, Verdict
+from quest.monitor.calibration import Calibration
+from quest.monitor.monitor import Monitor
+from quest.monitor.signals import SIGNALS, Signals
+
+__all__ = ["SIGNALS", "Alarm", "Calibration", "Monitor", "Signals", "Verdict"]

@@ -1,0 +1,120 @@
+"""What the monitor knows from calibration streams; stored with the weights as one JSON text."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from quest.errors import ConfigError, WeightsError
+from quest.monitor import memory as memories
+from quest.monitor.calibrator import Calibrator
+from quest.monitor.conformal import Threshold, threshold
+from quest.monitor.signals import SIGNALS
+from quest.monitor.statistic import Cusum
+
+FORMAT = 1
+"""Version of the text."""
+
+_DIGITS = 4
+"""Significant digits of the calibrator's numbers."""
+
+_DECIMALS = 4
+"""Decimals of the maxima."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A calibrator, a statistic, and how large the statistic gets where nothing is lost.
+
+    Attributes:
+        calibrator: from signals to log odds of a loss.
+        statistic: collects these over frames.
+        maxima: of the statistic in each loss-free calibration stream, over queries and frames; ascending.
+        block_frames: length of the calibration streams, frames.
+        about: what it was calibrated on, a line for people.
+    """
+
+    calibrator: Calibrator
+    statistic: Cusum
+    maxima: Float64[np.ndarray, " n"]
+    block_frames: int
+    about: str
+
+    def __post_init__(self) -> None:
+        if not len(self.maxima) or not np.isfinite(self.maxima).all() or (np.diff(self.maxima) < 0).any():
+            raise WeightsError("monitor: expected at least one maximum, finite and ascending; calibrate again")
+        if self.block_frames < 1:
+            raise WeightsError(f"monitor: expected block_frames >= 1, got {self.block_frames}; calibrate again")
+
+    def threshold(self, alpha: float) -> Threshold:
+        """What loss-free streams of the calibration's length exceed with a probability of at most alpha.
+
+        Raises:
+            ConfigError: alpha is not in (0, 1).
+        """
+        return threshold(self.maxima, alpha)
+
+    def to_json(self) -> str:
+        """One line of text, stored with the weights.
+
+        The calibrator's numbers are rounded to four significant digits and the maxima up to four decimals, so fit the
+        maxima with a calibrator that has been through the text (:func:`rounded`).
+        """
+        raw = {
+            "format": FORMAT,
+            "signals": SIGNALS,
+            "features": memories.FEATURES,
+            "calibrator": {f.name: _plain(getattr(self.calibrator, f.name)) for f in fields(Calibrator)},
+            "statistic": {"drift": self.statistic.drift, "keep": self.statistic.keep},
+            "maxima": (np.ceil(np.round(self.maxima * 10**_DECIMALS, 6)) / 10**_DECIMALS).tolist(),
+            "block_frames": self.block_frames,
+            "about": self.about,
+        }
+        return json.dumps(raw, separators=(",", ":"), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> Calibration:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            WeightsError: the text is damaged, or was written for other signals.
+        """
+        try:
+            raw = json.loads(text)
+            if (raw["format"], tuple(raw["signals"]), raw["features"]) != (FORMAT, SIGNALS, memories.FEATURES):
+                raise WeightsError(
+                    "monitor stored with the weights: it was calibrated on other signals than this version of quest "
+                    "has; run `quest weights calibrate` again"
+                )
+            values = raw["calibrator"]
+            return cls(
+                calibrator=Calibrator(**{name: np.array(value, np.float64) for name, value in values.items()}),
+                statistic=Cusum(**raw["statistic"]),
+                maxima=np.array(raw["maxima"], np.float64),
+                block_frames=int(raw["block_frames"]),
+                about=str(raw["about"]),
+            )
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
+            raise WeightsError(
+                f"monitor stored with the weights cannot be read ({type(error).__name__}: {error}); "
+                "run `quest weights calibrate` again"
+            ) from error
+
+
+def rounded(calibrator: Calibrator) -> Calibrator:
+    """The calibrator as it is after being written and read: what thresholds must be computed with."""
+    return Calibrator(**{f.name: _round(getattr(calibrator, f.name)) for f in fields(Calibrator)})
+
+
+def _round(values: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
+    """Every number with four significant digits."""
+    texts = [f"{value:.{_DIGITS}g}" for value in values.ravel()]
+    return np.array([float(text) for text in texts]).reshape(values.shape)
+
+
+def _plain(values: np.ndarray) -> Any:
+    return _round(values).tolist()

@@ -1,0 +1,107 @@
+"""Sequential statistics: evidence collected over frames, per query.
+
+All have one interface, so that the monitor and the rules that it is compared with differ in nothing else. The state
+of N queries is an array of N by :attr:`size` numbers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float64
+
+from quest.errors import ConfigError
+
+
+@runtime_checkable
+class Statistic(Protocol):
+    """Collects evidence; the larger, the more it speaks for a loss.
+
+    Attributes:
+        size: numbers that are remembered per query.
+    """
+
+    size: ClassVar[int]
+
+    def update(
+        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
+    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
+        """Take in one frame.
+
+        Args:
+            state: from the frame before; zeros at the start.
+            evidence: of this frame.
+
+        Returns:
+            The new state and the value of the statistic.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class Cusum:
+    """The cumulative sum that is never negative: ``s = max(0, keep s + evidence - drift)``.
+
+    Reference: Page, Continuous inspection schemes, Biometrika 41, 1954. ``keep`` below 1 forgets, which bounds what a
+    long and faint suspicion can add up to.
+
+    Attributes:
+        drift: evidence that a frame without a loss may have.
+        keep: share of the sum that the next frame keeps, in [0, 1].
+    """
+
+    drift: float
+    keep: float = 1.0
+    size: ClassVar[int] = 1
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.drift) or not 0.0 <= self.keep <= 1.0:
+            raise ConfigError(f"statistic: expected a finite drift and 0 <= keep <= 1, got {self.drift}, {self.keep}")
+
+    def update(
+        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
+    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
+        """Take in one frame; see :class:`Statistic`."""
+        value = np.maximum(0.0, self.keep * state[:, 0] + evidence - self.drift)
+        return value[:, None], value
+
+
+@dataclass(frozen=True)
+class PageHinkley:
+    """Rise of the evidence above its own running mean: ``m_t - min m``, ``m_t = sum of (x_i - mean_i - delta)``.
+
+    Reference: Hinkley, Inference about the change-point from cumulative sum tests, Biometrika 58, 1971; in the form
+    that is usual for streams (Gama et al., A survey on concept drift adaptation, 2014, section 3.3.1).
+
+    Attributes:
+        delta: rise above the mean that is tolerated in a frame.
+    """
+
+    delta: float
+    size: ClassVar[int] = 4
+
+    def update(
+        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
+    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
+        """Take in one frame; see :class:`Statistic`."""
+        count, mean, total, least = state.T
+        count = count + 1.0
+        mean = mean + (evidence - mean) / count
+        total = total + evidence - mean - self.delta
+        least = np.minimum(least, total)
+        return np.stack([count, mean, total, least], axis=1), total - least
+
+
+@dataclass(frozen=True)
+class Latest:
+    """No memory: the evidence of the frame itself, which makes an alarm a threshold on it."""
+
+    size: ClassVar[int] = 0
+
+    def update(
+        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
+    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
+        """Take in one frame; see :class:`Statistic`."""
+        return state, evidence

@@ -1,0 +1,216 @@
+"""Queries find their entities: points directly, labels and slots among what discovery sees."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from quest.data.letterbox import Letterbox
+from quest.errors import InputError
+from quest.model.decoder import Anchor
+from quest.model.discovery import find_peaks
+from quest.model.network import UNKNOWN_LABEL, QuestNetwork
+from quest.model.observation import FrameBatch, Observation
+from quest.track.following import Following
+from quest.track.grounded import Ground
+from quest.track.settings import TrackerConfig
+from quest.types import LABELS, Query
+
+PATIENCE = 8
+"""Frames in which a label or slot looks for its entity."""
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A query that has not found its entity.
+
+    Attributes:
+        number: its number.
+        query: what was asked.
+        since: the frame from which it looks.
+    """
+
+    number: int
+    query: Query
+    since: int
+
+    @classmethod
+    def from_json(cls, raw: Mapping[str, Any]) -> Waiting:
+        """What :func:`dataclasses.asdict` gave, after a passage through JSON, which knows no tuples."""
+        uv_px = raw["query"]["uv_px"]
+        query = Query(**{**raw["query"], "uv_px": None if uv_px is None else (uv_px[0], uv_px[1])})
+        return cls(raw["number"], query, raw["since"])
+
+
+class Binding:
+    """Binds the queries of one stream.
+
+    Args:
+        network: the network.
+        config: settings of tracking.
+        letterbox: between the source image and the network's input.
+        queries: what to follow; None discovers entities in the first frame.
+
+    Attributes:
+        anchor: what the bound queries are bound to, in the order of binding; None before the first.
+        waiting: queries that have not found their entity.
+        discover: whether everything in the next frame is to be discovered.
+        numbered: how many numbers have been given.
+
+    Raises:
+        InputError: a point query lies outside the image.
+    """
+
+    def __init__(
+        self, network: QuestNetwork, config: TrackerConfig, letterbox: Letterbox, queries: Sequence[Query] | None
+    ) -> None:
+        self.anchor: Anchor | None = None
+        self.waiting: list[Waiting] = []
+        self.discover = queries is None
+        self.numbered = 0
+        self._network = network
+        self._config = config
+        self._letterbox = letterbox
+        for query in queries or ():
+            self.ask(query, frame=0)
+
+    def ask(self, query: Query, *, frame: int) -> int:
+        """Ask for one more entity from a frame on; returns the query's number.
+
+        Raises:
+            InputError: a point query lies outside the image or in a frame that has passed.
+        """
+        camera = self._letterbox.source
+        if query.uv_px is not None:
+            x, y = query.uv_px
+            if not (0 <= x <= camera.width and 0 <= y <= camera.height):
+                raise InputError(
+                    f"query {query.name!r}: expected a pixel within {camera.width} x {camera.height}, "
+                    f"got ({x:.1f}, {y:.1f})"
+                )
+            if query.frame < frame:
+                raise InputError(
+                    f"query {query.name!r}: frame {query.frame} has passed; the next frame is number {frame}"
+                )
+        self.waiting.append(Waiting(self._next_number(), query, max(frame, query.frame)))
+        return self.numbered - 1
+
+    def bind(
+        self, frame: int, observed: Observation, frames: FrameBatch, following: Sequence[Following]
+    ) -> list[Following]:
+        """Queries that find their entity in this frame.
+
+        Args:
+            frame: its index.
+            observed: the frame as observed (T = 1).
+            frames: the frame.
+            following: queries that have found theirs.
+        """
+        if self._network.config.queries == "learned":
+            return self._bind_learned(frame, observed, frames)
+        found = self._bind_slots(frame, observed, frames, following)
+        due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
+        if due:
+            label = torch.tensor([LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due])
+            self._join(observed, frames, self._canvas(due), label)
+            found += [self._begin(w, w.query.name or f"point {w.number}", w.query.label) for w in due]
+        return found
+
+    def keep(self, rows: Sequence[int]) -> None:
+        """Drop the anchors of all rows but these."""
+        if self.anchor is not None and self._network.config.queries != "learned":
+            index = torch.tensor(list(rows), dtype=torch.long, device=self.anchor.content.device)
+            self.anchor = self.anchor.select(index) if len(index) else None
+
+    def _next_number(self) -> int:
+        self.numbered += 1
+        return self.numbered - 1
+
+    def _begin(self, waiting: Waiting, name: str, label: str | None, slot: int | None = None) -> Following:
+        self.waiting = [w for w in self.waiting if w is not waiting]
+        return Following(waiting.number, name, label, slot, Ground(self._config))
+
+    def _canvas(self, due: Sequence[Waiting]) -> Float[Tensor, "K 2"]:
+        uv_px = np.array([w.query.uv_px for w in due], np.float32)
+        return torch.from_numpy(self._letterbox.to_canvas(uv_px) / self._network.config.encoder.image_size)
+
+    def _bind_slots(
+        self, frame: int, observed: Observation, frames: FrameBatch, following: Sequence[Following]
+    ) -> list[Following]:
+        looking = [w for w in self.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]
+        if not (looking or self.discover):
+            return []
+        config = self._config
+        slots = find_peaks(self._network, observed, radius_cells=config.slot_radius_cells)
+        existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
+        label = [LABELS[int(n)] for n in slots.label]
+        free = [i for i in range(len(label)) if not self._taken(slots.uv[i], frames, following)]
+        found: list[Following] = []
+        chosen: list[int] = []
+        if self.discover:
+            chosen = [i for i in free if existence[i] > config.slot_threshold]
+            for i in chosen:
+                number = self._next_number()
+                found.append(self._begin(Waiting(number, Query.slot(), frame), f"{label[i]} {number}", label[i]))
+            self.discover = False
+        for waiting in looking:
+            query = waiting.query
+            fits = [i for i in free if i not in chosen and query.label in (None, label[i])]
+            if fits and existence[fits[0]] > config.prompt_threshold:
+                chosen.append(fits[0])
+                name = query.name or f"{label[fits[0]]} {waiting.number}"
+                found.append(self._begin(waiting, name, label[fits[0]]))
+        if chosen:
+            self._join(observed, frames, slots.uv[chosen], slots.label[chosen])
+        return found
+
+    def _taken(self, uv: Tensor, frames: FrameBatch, following: Sequence[Following]) -> bool:
+        """Whether a query follows what is seen there."""
+        places = [f.place for f in following if f.place is not None]
+        if not places:
+            return False
+        size = self._network.config.encoder.image_size
+        at = torch.from_numpy(np.stack(places)).to(frames.depth_m)
+        gap_px = (frames.from_reference(at[None, None])[0, 0] - uv * size).norm(dim=-1)
+        return bool((gap_px < self._config.slot_radius_cells * self._network.config.cell_px).any())
+
+    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor) -> None:
+        """Bind more queries; the anchors of the others stay as they are."""
+        device = frames.depth_m.device
+        uv, label = uv[None].to(device), label[None].to(device)
+        uv_px = uv[:, None] * self._network.config.encoder.image_size
+        point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
+        valid = torch.ones(label.shape, dtype=torch.bool, device=device)
+        anchor = self._network.bind(observed, uv, point, label, valid)
+        self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)
+
+    def _bind_learned(self, frame: int, observed: Observation, frames: FrameBatch) -> list[Following]:
+        """Learned queries are there from the start; a point is answered by the slot nearest to it when it is asked."""
+        if self.anchor is None:
+            self.anchor = self._network.slots(1)
+        found: list[Following] = []
+        label = [LABELS[int(n)] for n in self._network.learned_label(self.anchor.content)[0].argmax(dim=-1)]
+        if self.discover:
+            for i, name in enumerate(label):
+                found.append(self._begin(Waiting(self._next_number(), Query.slot(), frame), f"slot {i}", name, i))
+            self.discover = False
+        for waiting in [w for w in self.waiting if w.query.kind != "point" and w.since <= frame]:
+            used = {f.slot for f in found}
+            fits = [i for i, k in enumerate(label) if i not in used and waiting.query.label in (None, k)]
+            if fits:
+                name = waiting.query.name or f"slot {fits[0]}"
+                found.append(self._begin(waiting, name, label[fits[0]], fits[0]))
+        due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
+        if due:
+            answered = self._network.decode(self.anchor, observed, frames).uv[0, -1]
+            for waiting, uv in zip(due, self._canvas(due), strict=True):
+                slot = int((answered - uv.to(answered)).norm(dim=-1).argmin())
+                name = waiting.query.name or f"point {waiting.number}"
+                found.append(self._begin(waiting, name, waiting.query.label, slot))
+        return found

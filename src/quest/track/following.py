@@ -1,0 +1,202 @@
+"""What a stream remembers of a query that has found its entity."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from quest.track.belief import Belief
+from quest.track.grounded import Ground
+from quest.track.settings import TrackerConfig
+from quest.types import State
+
+_SAFE_EVERY = 10
+_STATES = list(State)
+
+
+@dataclass(frozen=True)
+class Safe:
+    """What was known of a query while nothing spoke against it.
+
+    Attributes:
+        ground: a copy of its joint.
+        place: where it was, reference frame.
+    """
+
+    ground: Ground
+    place: Float[np.ndarray, "3"]
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is said of a query in a frame (see :class:`~quest.track.StreamState`)."""
+
+    uv_px: Float32[np.ndarray, "2"]
+    point_world: Float32[np.ndarray, "3"]
+    confidence: float
+    visible: bool
+    state: State
+    lost_p: float
+    signals: Float32[np.ndarray, " S"]
+
+
+@dataclass
+class Following:
+    """One query that has found its entity; everything in the reference frame of the stream.
+
+    Attributes:
+        query: its number.
+        name: what to call it.
+        label: its label, if known.
+        slot: index of its learned query, for networks that have them.
+        ground: its joint.
+        belief: over the cells of the newest frame (K = 1).
+        place: where it was at the newest frame.
+        held: whether that is where its joint holds it, unseen.
+        buried: whether it was hidden behind something that came before it, and has not been seen since.
+        refused: frames in a row in which it was said to be seen off its joint, and was held instead.
+        born: the query's embedding in its first frame.
+        safe: copies from before, the older one first.
+        since_safe: frames since the last copy.
+        doubted: whether an alarm is open, so that it is held and searched.
+        good: frames in a row in which the search has found what matches the anchor.
+        answer: what was said of it in the newest frame.
+    """
+
+    query: int
+    name: str
+    label: str | None
+    slot: int | None
+    ground: Ground
+    belief: Belief | None = None
+    place: Float[np.ndarray, "3"] | None = None
+    held: bool = False
+    buried: bool = False
+    refused: int = 0
+    born: Float[Tensor, " D"] | None = None
+    safe: deque[Safe] = field(default_factory=lambda: deque(maxlen=2))
+    since_safe: int = 0
+    doubted: bool = False
+    good: int = 0
+    answer: Answer | None = None
+
+    def forget_places(self, config: TrackerConfig) -> None:
+        """Begin anew in another reference frame."""
+        self.ground, self.belief, self.place, self.held = Ground(config), None, None, False
+        self.safe.clear()
+        self.since_safe = self.refused = 0
+        self.buried = False
+
+    def move(self, place: Float[np.ndarray, "3"], *, held: bool, embedding: Float[Tensor, " D"]) -> None:
+        """Be somewhere else in the next frame; a place that is not known changes nothing."""
+        if np.isfinite(place).all():
+            self.place = place
+        self.held = held
+        if self.born is None:
+            self.born = embedding.float().clone()
+
+    def keep(self) -> None:
+        """Keep a copy of what is known, now and then: nothing speaks against it."""
+        self.since_safe += 1
+        if self.place is not None and (self.since_safe >= _SAFE_EVERY or not self.safe):
+            self.safe.append(Safe(self.ground.copy(), self.place.copy()))
+            self.since_safe = 0
+
+    def doubt(self) -> None:
+        """Go back to what was known before things went wrong, and search everywhere."""
+        self.doubted, self.good, self.belief = True, 0, None
+        if self.safe:
+            self.ground, self.place = self.safe[0].ground.copy(), self.safe[0].place.copy()
+            self.held = True
+
+    def trust(self, place: Float[np.ndarray, "3"]) -> None:
+        """The search has found the entity."""
+        self.doubted, self.good, self.since_safe = False, 0, 0
+        self.place, self.held = place, False
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All but names, as numeric arrays."""
+        slot = -1 if self.slot is None else self.slot
+        counts = [slot, self.held, self.buried, self.refused, self.since_safe, self.doubted, self.good]
+        found: dict[str, np.ndarray] = {"counts": np.array(counts, np.int64)}
+        found |= {f"ground.{key}": value for key, value in self.ground.state().items()}
+        if self.belief is not None:
+            found["belief"] = self.belief.probability.cpu().numpy()
+            found["cell_point"] = self.belief.cell_point.cpu().numpy()
+        if self.place is not None:
+            found["place"] = self.place
+        if self.born is not None:
+            found["born"] = self.born.float().cpu().numpy()
+        if self.answer is not None:
+            answer = self.answer
+            found["answer.uv_px"], found["answer.point_world"] = answer.uv_px, answer.point_world
+            found["answer.signals"] = answer.signals
+            numbers = [answer.confidence, answer.visible, _STATES.index(answer.state), answer.lost_p]
+            found["answer.numbers"] = np.array(numbers, np.float64)
+        for i, safe in enumerate(self.safe):
+            found[f"safe{i}.place"] = safe.place
+            found |= {f"safe{i}.ground.{key}": value for key, value in safe.ground.state().items()}
+        return found
+
+    @classmethod
+    def restored(
+        cls,
+        query: int,
+        name: str,
+        label: str | None,
+        state: Mapping[str, np.ndarray],
+        *,
+        config: TrackerConfig,
+        device: torch.device,
+    ) -> Following:
+        """The query of which :meth:`state` was taken."""
+        slot, held, buried, refused, since_safe, doubted, good = state["counts"].tolist()
+        belief = None
+        if "belief" in state:
+            belief = Belief(*(torch.from_numpy(state[key]).to(device) for key in ("belief", "cell_point")))
+        answer = None
+        if "answer.numbers" in state:
+            confidence, visible, number, lost_p = state["answer.numbers"].tolist()
+            answer = Answer(
+                uv_px=state["answer.uv_px"],
+                point_world=state["answer.point_world"],
+                confidence=confidence,
+                visible=bool(visible),
+                state=_STATES[int(number)],
+                lost_p=lost_p,
+                signals=state["answer.signals"],
+            )
+        safe = [
+            Safe(Ground.restored(config, part(state, f"safe{i}.ground.")), state[f"safe{i}.place"])
+            for i in range(2)
+            if f"safe{i}.place" in state
+        ]
+        return cls(
+            query=query,
+            name=name,
+            label=label,
+            slot=None if slot < 0 else slot,
+            ground=Ground.restored(config, part(state, "ground.")),
+            belief=belief,
+            place=state.get("place"),
+            held=bool(held),
+            buried=bool(buried),
+            refused=refused,
+            born=torch.from_numpy(state["born"]).to(device) if "born" in state else None,
+            safe=deque(safe, maxlen=2),
+            since_safe=since_safe,
+            doubted=bool(doubted),
+            good=good,
+            answer=answer,
+        )
+
+
+def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays of a state whose names begin with a prefix, without it."""
+    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}

@@ -1,0 +1,206 @@
+"""What comes in: frames are checked, put in order, and made ready for the network."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+from torch import Tensor
+
+from quest.data.letterbox import Letterbox
+from quest.errors import InputError
+from quest.geometry import invert
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch, cell_depth, reference_of
+from quest.types import Camera
+
+_FRAMES_PER_S = 30.0
+_MOST_FRAMES = 10.0
+_CLOCK_RESTART_S = 5.0
+
+
+class Arrival(Enum):
+    """What a frame is to the stream."""
+
+    NEW = "new"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+
+
+@dataclass(frozen=True)
+class Reference:
+    """The reference frame of a stream (see :mod:`quest.model.observation`).
+
+    Attributes:
+        cam_from_world: pose of the camera at which it began.
+        center: its origin in that camera, metres.
+        scale: metres per unit.
+        has_depth: whether it was made from depth; without, units are metres by guess.
+    """
+
+    cam_from_world: Float[Tensor, "4 4"]
+    center: Float[Tensor, "1 3"]
+    scale: Float[Tensor, " 1"]
+    has_depth: bool
+
+
+class Intake:
+    """Checks the frames of one stream and prepares them.
+
+    Args:
+        network: whose input is prepared.
+        camera: intrinsics of the frames.
+        device: where the network runs.
+
+    Attributes:
+        letterbox: between the source image and the network's input.
+        reference: the reference frame; None before the first frame.
+        elapsed: time since the frame before in frames of 30 per second, within 1 to 10.
+        flags: degradations of the newest frame, in words.
+    """
+
+    def __init__(self, network: QuestNetwork, camera: Camera, *, device: torch.device) -> None:
+        self.letterbox = Letterbox(camera, network.config.encoder.image_size)
+        self.reference: Reference | None = None
+        self.elapsed = 1.0
+        self.flags: tuple[str, ...] = ()
+        self._network = network
+        self._device = device
+        self._stamp_s: float | None = None
+        self._pose: np.ndarray | None = None
+        self._digest = b""
+        self._features: Tensor | None = None
+
+    def check(
+        self,
+        frame: int,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+        stamp_s: float,
+        cam_from_world: Float[np.ndarray, "4 4"] | None,
+    ) -> None:
+        """Refuse what no camera sends.
+
+        Raises:
+            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
+        """
+        camera = self.letterbox.source
+        expected = (camera.height, camera.width, 3)
+        if rgb.shape != expected or rgb.dtype != np.uint8:
+            raise InputError(f"frame {frame}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
+        if depth_m is not None and (depth_m.shape != expected[:2] or not np.issubdtype(depth_m.dtype, np.floating)):
+            raise InputError(
+                f"frame {frame}: expected depth {expected[:2]} in metres as float, got {depth_m.shape} of "
+                f"{depth_m.dtype}; multiply raw units by their size in metres"
+            )
+        if not np.isfinite(stamp_s):
+            raise InputError(f"frame {frame}: expected a finite time stamp in seconds, got {stamp_s}")
+        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise InputError(f"frame {frame}: expected a finite 4 x 4 cam_from_world, got {pose.tolist()}")
+
+    def admit(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> Arrival:
+        """Whether a frame is the next one; what comes too late or twice changes nothing.
+
+        A stamp that lies more than five seconds back means that the clock began anew.
+        """
+        before = self._stamp_s
+        self.flags = ()
+        if before is not None and stamp_s < before:
+            if before - stamp_s <= _CLOCK_RESTART_S:
+                self.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
+                return Arrival.LATE
+            self.flags = (f"clock went back by {before - stamp_s:.1f} s",)
+        digest = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16).digest()
+        same = digest == self._digest
+        if same and stamp_s == before:
+            self.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
+            return Arrival.DUPLICATE
+        if not same:
+            self._features = None
+        since = 0.0 if before is None else stamp_s - before
+        # Rounded, because stamps are: a 30th of a second is one frame, however it was written down.
+        self.elapsed = float(np.clip(round(since * _FRAMES_PER_S, 3), 1.0, _MOST_FRAMES))
+        self._stamp_s, self._digest = stamp_s, digest
+        return Arrival.NEW
+
+    def prepare(
+        self,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+        cam_from_world: Float[np.ndarray, "4 4"] | None,
+    ) -> tuple[FrameBatch, bool]:
+        """The frame that was admitted last as the network takes it, and whether the reference frame is new with it.
+
+        The reference frame is made at the first frame, and again at the first that brings depth.
+        """
+        size = self._network.config.encoder.image_size
+        image = torch.from_numpy(np.ascontiguousarray(self.letterbox.rgb(rgb))).to(self._device)
+        raw = np.zeros((size, size), np.float32) if depth_m is None else self.letterbox.depth(depth_m)
+        depth = torch.from_numpy(raw).to(self._device)[None]
+        cells = cell_depth(depth, self._network.config.cell_px)
+        camera = self.letterbox.camera
+        intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=self._device)
+        # Poses stay on the CPU in double precision, which not every device has.
+        pose = torch.from_numpy(self._pose_of(cam_from_world))
+        has_depth = bool((depth > 0).any())
+        if not has_depth:
+            self.flags += ("no depth: pixels only, world points are NaN",)
+        renewed = self.reference is None or (has_depth and not self.reference.has_depth)
+        if renewed:
+            self.reference = Reference(pose, *reference_of(cells, intrinsics, size), has_depth)
+        reference = self.reference
+        assert reference is not None
+        if self._features is None:  # the same picture again is not looked at again
+            self._features = self._network.encode(image[None])[:, None].float()
+        frames = FrameBatch(
+            features=self._features,
+            rgb=image[None, None],
+            depth_m=depth[None],
+            cell_depth_m=cells[None],
+            intrinsics=intrinsics,
+            ref_from_cam=(reference.cam_from_world @ invert(pose)).float().to(self._device)[None, None],
+            center=reference.center,
+            scale=reference.scale,
+        )
+        return frames, renewed
+
+    def _pose_of(self, cam_from_world: np.ndarray | None) -> np.ndarray:
+        """The frame's pose; where a posed stream misses one, the last one."""
+        if cam_from_world is not None:
+            self._pose = np.array(cam_from_world, np.float64)
+        elif self._pose is not None:
+            self.flags += ("no pose: that of the frame before is used",)
+        return np.eye(4) if self._pose is None else self._pose
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the next frame depends on, as numeric arrays."""
+        found: dict[str, np.ndarray] = {"digest": np.frombuffer(self._digest, np.uint8)}
+        if self._stamp_s is not None:
+            found["stamp_s"] = np.array(self._stamp_s)
+        if self._pose is not None:
+            found["pose"] = self._pose
+        if self.reference is not None:
+            found["reference.cam_from_world"] = self.reference.cam_from_world.numpy()
+            found["reference.center"] = self.reference.center.cpu().numpy()
+            found["reference.scale"] = self.reference.scale.cpu().numpy()
+            found["reference.has_depth"] = np.array(self.reference.has_depth)
+        return found
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on where :meth:`state` was taken."""
+        self._digest, self._features = state["digest"].tobytes(), None
+        self._stamp_s = float(state["stamp_s"]) if "stamp_s" in state else None
+        self._pose = state.get("pose")
+        self.reference = None
+        if "reference.scale" in state:
+            self.reference = Reference(
+                torch.from_numpy(state["reference.cam_from_world"]),
+                torch.from_numpy(state["reference.center"]).to(self._device),
+                torch.from_numpy(state["reference.scale"]).to(self._device),
+                bool(state["reference.has_depth"]),
+            )

@@ -1,0 +1,99 @@
+"""The signals of a frame, from which the monitor judges whether identities are still right."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.network import QuestNetwork
+from quest.model.observation import Observation
+from quest.monitor import SIGNALS, Signals
+from quest.track.following import Following
+from quest.track.placing import Placed, as_array
+
+_AWAY_CELLS = 3
+
+
+def measure(
+    network: QuestNetwork,
+    anchor: Anchor,
+    newest: Observation,
+    prediction: Prediction,
+    placed: Placed,
+    uv: Float[Tensor, "K 2"],
+    following: Sequence[Following],
+) -> Signals:
+    """Signals of K queries in one frame (B = T = 1).
+
+    Args:
+        network: the network, with a heatmap.
+        anchor: what the queries are bound to.
+        newest: the frame.
+        prediction: answers of the network.
+        placed: where the queries are.
+        uv: the judged places in [0, 1]^2 of the input.
+        following: the queries before they moved there.
+    """
+    head = network.head
+    assert isinstance(head, HeatmapHead)
+    logits, embedding = prediction.logits[0, 0], prediction.embedding[0, 0].float()
+    before = np.stack([np.full(3, np.nan) if f.place is None else f.place for f in following])
+    born = torch.stack([embedding[k] if f.born is None else f.born for k, f in enumerate(following)])
+    best = as_array(newest.cell_point[0, 0, logits.argmax(dim=-1)])
+    values = {
+        "anchor_cosine": as_array(_likeness(anchor.template, head.look.template(newest, uv[None].nan_to_num(0.5)))),
+        "embedding_cosine": as_array(F.cosine_similarity(embedding, born, dim=-1)),
+        "right_logit": as_array(prediction.right_logit[0, 0]),
+        "visible_logit": as_array(prediction.visible_logit[0, 0]),
+        "peak_log_p": as_array(logits.log_softmax(dim=-1).amax(dim=-1)),
+        "margin": as_array(_margin(logits, prediction.peak[0, 0], network.config.cells)),
+        "disagreement": np.linalg.norm(best - placed.judged, axis=-1),
+        "joint_residual": placed.residual,
+        "depth_gap": placed.room,
+        "step": np.linalg.norm(placed.judged - before, axis=-1),
+        "spread": _spread(following),
+        "held": placed.held.astype(np.float64),
+    }
+    return Signals(np.stack([values[name] for name in SIGNALS], axis=-1).astype(np.float32))
+
+
+def no_signals(queries: int) -> Signals:
+    """Signals of a network that has no heatmap: all unknown."""
+    return Signals(np.full((queries, len(SIGNALS)), np.nan, np.float32))
+
+
+def _likeness(template: Float[Tensor, "1 K M F"], now: Float[Tensor, "1 K M F"]) -> Float[Tensor, " K"]:
+    """Mean over the anchor's surroundings of the cosine to what is most like it in the answer's."""
+    return (template[0] @ now[0].transpose(-1, -2)).amax(dim=-1).mean(dim=-1)
+
+
+def _margin(logits: Float[Tensor, "K C"], peak: Tensor, side: int) -> Float[Tensor, " K"]:
+    """Score around the answer's cell less the best score away from it."""
+    cell = torch.arange(side * side, device=logits.device)
+    across = (cell % side)[None] - (peak % side)[:, None]
+    down = cell.div(side, rounding_mode="floor")[None] - peak.div(side, rounding_mode="floor")[:, None]
+    gap = torch.maximum(across.abs(), down.abs())
+    near = torch.where(gap <= 1, logits, -torch.inf).amax(dim=-1)
+    return near - torch.where(gap > _AWAY_CELLS, logits, -torch.inf).amax(dim=-1)
+
+
+def _spread(following: Sequence[Following]) -> np.ndarray:
+    """Standard deviation of the beliefs in space; NaN without depth."""
+    found = np.full(len(following), np.nan)
+    for k, query in enumerate(following):
+        if query.belief is None:
+            continue
+        point = as_array(query.belief.cell_point)
+        known = np.isfinite(point).all(axis=1)
+        weight = as_array(query.belief.probability[0])[known]
+        if weight.sum() > 1e-6:
+            weight = weight / weight.sum()
+            mean = weight @ point[known]
+            found[k] = np.sqrt(weight @ np.square(point[known] - mean).sum(axis=1))
+    return found

@@ -1,0 +1,237 @@
+"""The monitor of one stream."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quest.errors import ConfigError, InputError
+from quest.evaluation.detectors import our_monitor, play
+from quest.monitor import SIGNALS, Alarm, Calibration, Monitor, Signals, Verdict
+from quest.monitor.conformal import spend
+from quest.monitor.statistic import Cusum
+from tests.monitor.calibrations import make_calibrator, watching
+from tests.monitor.streams import make_stream
+from tests.tiny import BAD_INPUT
+
+
+def signals(*values: float, name: str = "anchor_cosine") -> Signals:
+    """One row per value; every other signal is unknown."""
+    rows = np.full((len(values), len(SIGNALS)), np.nan, np.float32)
+    rows[:, SIGNALS.index(name)] = values
+    return Signals(rows)
+
+
+def run(monitor: Monitor, values: list[float], *, key: int = 0, first: int = 0) -> list[Verdict]:
+    return [monitor.step([key], signals(v), frame=first + t, stamp_s=0.1 * t) for t, v in enumerate(values)]
+
+
+def watched(calibration: Calibration, *keys: int, alpha: float = 0.1) -> Monitor:
+    monitor = Monitor(calibration, alpha=alpha)
+    for key in keys:
+        monitor.watch(key, f"handle {key}")
+    return monitor
+
+
+def test_an_alarm_is_raised_once_and_stays_open():
+    monitor = watched(watching("anchor_cosine"), 0)
+    verdicts = run(monitor, [1.0] * 8 + [-1.0] * 12)
+    raised = [t for t, v in enumerate(verdicts) if v.raised]
+    assert len(raised) == 1
+    (alarm,) = verdicts[raised[0]].raised
+    assert (alarm.name, alarm.query, alarm.frame) == ("handle 0", 0, raised[0])
+    assert alarm.stamp_s == pytest.approx(0.1 * raised[0])
+    assert alarm.statistic > alarm.threshold
+    assert alarm.alpha == spend(0.1, block=1, restart=0)
+    assert alarm.reason == "looks unlike its anchor (cosine -1.00) for 4 frames"
+    assert all(v.open == (None,) for v in verdicts[: raised[0]])
+    assert all(v.open == (alarm,) for v in verdicts[raised[0] :])
+    assert monitor.alarm(0) == alarm
+    assert (verdicts[-1].lost_p > 0.8).all()
+    assert (verdicts[0].lost_p < 0.2).all()
+
+
+def test_a_renamed_query_alarms_by_its_new_name():
+    monitor = watched(watching("anchor_cosine"), 0)
+    monitor.rename(0, "lid")
+    (alarm,) = [a for v in run(monitor, [-1.0] * 15) for a in v.raised]
+    assert alarm.name == "lid"
+
+
+def test_a_search_is_judged_by_what_it_finds():
+    """Wrong places are remembered for long, unless the tracker says that it has left them; the alarm stays."""
+    watcher = watching("anchor_cosine")
+    of_the_mean = np.roll(watcher.calibrator.direct, len(SIGNALS), axis=1)
+    watcher = replace(watcher, calibrator=replace(watcher.calibrator, direct=of_the_mean))
+    left, stayed = (watched(watcher, 0) for _ in range(2))
+    for monitor in (left, stayed):
+        run(monitor, [1.0] * 8 + [-1.0] * 12)
+    left.search(0)
+    found, doubtful = (run(m, [1.0])[0] for m in (left, stayed))
+    assert found.lost_p[0] < doubtful.lost_p[0]
+    assert found.open[0] is not None
+
+
+def test_clearing_ends_the_alarm_and_spends_less_each_time():
+    monitor = watched(watching("anchor_cosine", block_frames=1000), 0)
+    alarms: list[Alarm] = []
+    for j in range(3):
+        alarms += [a for v in run(monitor, [-1.0] * 15, first=15 * j) for a in v.raised]
+        monitor.clear(0)
+        assert monitor.alarm(0) is None
+    assert [a.alpha for a in alarms] == [spend(0.1, block=1, restart=j) for j in range(3)]
+    assert alarms[0].threshold < alarms[1].threshold < alarms[2].threshold
+    assert [a.extrapolated for a in alarms] == [False] * 3
+
+
+def test_restarts_are_counted_over_the_stream():
+    """Two queries that both alarm and are cleared spend alpha / 2 and alpha / 4, or their sum would exceed alpha."""
+    monitor = watched(watching("anchor_cosine", block_frames=1000), 0, 1)
+    for _ in range(2):
+        for t in range(15):
+            verdict = monitor.step([0, 1], signals(-1.0, -1.0), frame=t, stamp_s=0.0)
+        found = sorted(a.alpha for a in verdict.open if a is not None)
+        monitor.clear(0)
+        monitor.clear(1)
+    assert found == [spend(0.1, block=1, restart=2), spend(0.1, block=1, restart=1)]
+
+
+def test_clearing_without_an_alarm_spends_nothing():
+    monitor = watched(watching("anchor_cosine"), 0)
+    run(monitor, [-1.0] * 2)
+    monitor.clear(0)
+    verdicts = run(monitor, [0.0] * 2 + [-1.0] * 9)
+    assert verdicts[0].statistic == 0.0
+    assert next(a for v in verdicts for a in v.raised).alpha == spend(0.1, block=1, restart=0)
+
+
+def test_every_block_starts_from_nothing_and_spends_less():
+    calibration = watching("anchor_cosine", block_frames=6, maxima=np.linspace(0.0, 20.0, 1000))
+    monitor = watched(calibration, 0)
+    verdicts = run(monitor, [-0.5] * 24)
+    statistic = np.array([v.statistic[0] for v in verdicts]).reshape(4, 6)
+    np.testing.assert_array_equal(statistic, statistic[:1].repeat(4, axis=0))
+    assert (np.diff(statistic, axis=1) > 0).all()
+    late = watched(calibration, 0)
+    raised = [a for v in run(late, [1.0] * 12 + [-4.0] * 6) for a in v.raised]
+    assert [a.alpha for a in raised] == [spend(0.1, block=3, restart=0)]
+
+
+def test_too_few_streams_raise_no_alarm():
+    monitor = watched(watching("anchor_cosine", maxima=np.linspace(0.0, 1.0, 5)), 0, alpha=0.01)
+    assert not any(v.raised for v in run(monitor, [-5.0] * 50))
+
+
+def test_queries_come_and_go():
+    """Whatever the others do, a query's verdicts are those it would have alone."""
+    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 15, "")
+    record = make_stream(3, frames=40, queries=3)
+    together, alone = watched(calibration, 0, 2), watched(calibration, 2)
+    for t in range(40):
+        if t == 10:
+            together.watch(1, "late")
+        if t == 25:
+            together.forget(0)
+        keys = [k for k in (1, 0, 2) if (k != 1 or t >= 10) and (k != 0 or t < 25)]
+        all_of = together.step(keys, Signals(record.signals[t, keys]), frame=t, stamp_s=0.0)
+        one = alone.step([2], Signals(record.signals[t, [2]]), frame=t, stamp_s=0.0)
+        assert all_of.lost_p[-1] == pytest.approx(one.lost_p[0], abs=1e-6)
+        assert all_of.statistic[-1] == pytest.approx(one.statistic[0], rel=1e-6)
+    assert together.alarm(0) is None
+
+
+def test_a_query_that_is_not_answered_rests():
+    monitor, other = watched(watching("anchor_cosine"), 0, 1), watched(watching("anchor_cosine"), 0, 1)
+    for t in range(8):
+        monitor.step([0, 1] if t % 2 else [0], signals(*[-0.3] * (1 + t % 2)), frame=t, stamp_s=0.0)
+    for t in range(4):
+        last = other.step([1], signals(-0.3), frame=t, stamp_s=0.0)
+    np.testing.assert_array_equal(monitor.state()["memory"][1], other.state()["memory"][1])
+    assert monitor.state()["statistic"][1, 0] == pytest.approx(float(last.statistic[0]))
+
+
+def test_unknown_signals_are_no_alarm():
+    monitor = watched(watching("anchor_cosine"), 0)
+    for v in run(monitor, [np.nan] * 30):
+        assert (v.lost_p == 0.5).all()
+        assert not v.raised
+    assert np.isfinite(run(monitor, [np.inf, -np.inf])[-1].statistic).all()
+
+
+def test_no_queries():
+    verdict = Monitor(watching("step"), alpha=0.05).step([], signals(), frame=0, stamp_s=0.0)
+    assert verdict.lost_p.shape == (0,)
+    assert verdict.open == verdict.raised == ()
+
+
+def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
+    calibration = Calibration(make_calibrator(), Cusum(-1.5), np.linspace(0, 5, 100), 15, "")
+    record = make_stream(5, frames=60, queries=3)
+    monitor = watched(calibration, 0, 1, 2)
+    restored = None
+    for t in range(60):
+        if t == 20:
+            monitor.clear(1)
+        if t == 30:
+            state = monitor.state()
+            assert all(array.dtype.kind in "iuf" for array in state.values())
+            restored = Monitor(calibration, alpha=0.1)
+            restored.restore(state)
+            state["memory"][:] = 0.0  # a copy: what is saved and what goes on must not share memory
+        verdict = monitor.step([0, 1, 2], Signals(record.signals[t]), frame=t, stamp_s=0.1 * t)
+        if restored is not None:
+            again = restored.step([0, 1, 2], Signals(record.signals[t]), frame=t, stamp_s=0.1 * t)
+            np.testing.assert_array_equal(again.lost_p, verdict.lost_p)
+            np.testing.assert_array_equal(again.statistic, verdict.statistic)
+            assert (again.open, again.raised) == (verdict.open, verdict.raised)
+    assert restored is not None
+    assert any(verdict.open)
+    for name, array in monitor.state().items():
+        np.testing.assert_array_equal(restored.state()[name], array)
+
+
+def test_replaying_records_gives_what_the_monitor_gives():
+    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 25, "")
+    records = [make_stream(1, frames=60), make_stream(2, frames=30, queries=2), make_stream(3, frames=60)]
+    records[2] = replace(records[2], asked=np.array([0, 7, 0, 40]))
+    played = play(our_monitor(calibration), records)
+    for i, record in enumerate(records):
+        monitor = Monitor(calibration, alpha=0.05)
+        for t in range(len(record)):
+            for k in np.flatnonzero(record.asked == t):
+                monitor.watch(int(k), f"{k}")
+            keys = [int(k) for k in np.flatnonzero(record.asked <= t)]
+            verdict = monitor.step(keys, Signals(record.signals[t, keys]), frame=t, stamp_s=0.0)
+            np.testing.assert_allclose(played.score[i][t, keys], verdict.lost_p, atol=1e-5)
+            np.testing.assert_allclose(played.path[i][t, keys], verdict.statistic, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1])
+def test_alpha_is_a_probability(alpha: float):
+    with pytest.raises(ConfigError, match="alpha"):
+        Monitor(watching("step"), alpha=alpha)
+
+
+def test_misuse_is_named():
+    monitor = watched(watching("step"), 0)
+    with pytest.raises(InputError, match="already"):
+        monitor.watch(0, "again")
+    for call in (monitor.forget, monitor.clear, lambda key: monitor.rename(key, "x")):
+        with pytest.raises(InputError, match=r"watch\(7"):
+            call(7)
+    with pytest.raises(InputError, match="one row"):
+        monitor.step([0], signals(0.0, 0.0), frame=0, stamp_s=0.0)
+    monitor.watch(1, "other")
+    with pytest.raises(InputError, match="one row"):
+        monitor.step([0, 0], signals(0.0, 0.0), frame=0, stamp_s=0.0)
+    with pytest.raises(InputError, match="watch"):
+        monitor.step([5], signals(0.0), frame=0, stamp_s=0.0)
+    with pytest.raises(InputError, match="missing"):
+        monitor.restore({})
+    for torn in (np.zeros(3, np.uint8), np.zeros(0, np.uint8), Monitor(watching("step"), alpha=0.1).state()["texts"]):
+        with pytest.raises(InputError, match="texts"):
+            monitor.restore(monitor.state() | {"texts": torn})
+    with pytest.raises(BAD_INPUT):
+        monitor.restore(monitor.state() | {"memory": np.zeros((1, 2, 3))})

@@ -1,0 +1,251 @@
+"""Streams as they come from cameras: late, double and missing frames, queries that come and go, alarms, saved state."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from quest.errors import InputError
+from quest.monitor import SIGNALS, Alarm
+from quest.track import Stream, StreamState, Tracker
+from quest.types import Clip, Query, State
+from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
+
+POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    return make_clip(frames=8)
+
+
+def feed(stream: Stream, clip: Clip, frames: range, **changes) -> list[StreamState]:
+    return [stream.step(**{**vars(clip.frame(t)), **changes}) for t in frames]
+
+
+def assert_equal(got: StreamState, expected: StreamState) -> None:
+    for name in ("names", "labels", "state", "query", "alarm", "stamp_s"):
+        assert getattr(got, name) == getattr(expected, name), name
+    for name in ("uv_px", "point_world", "confidence", "visible", "lost_p"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), err_msg=name)
+    np.testing.assert_array_equal(got.signals.values, expected.signals.values)
+
+
+def watched(alarming: bool = False) -> Tracker:
+    """A tracker with a monitor, which finds everything or nothing suspicious."""
+    tracker = make_tracker()
+    tracker.calibration = make_calibration(alarming=alarming)
+    return tracker
+
+
+def test_late_frames_repeat_the_answer(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS)
+    last = feed(stream, clip, range(4))[-1]
+    late = feed(stream, clip, range(1, 2))[0]
+    assert "late" in late.flags[0]
+    assert_equal(late, last)
+    straight = make_tracker().stream(clip.camera, POINTS)
+    assert_equal(feed(stream, clip, range(4, 8))[-1], feed(straight, clip, range(8))[-1])
+
+
+def test_duplicates_repeat_the_answer(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS)
+    last = feed(stream, clip, range(4))[-1]
+    again = feed(stream, clip, range(3, 4))[0]
+    assert "duplicate" in again.flags[0]
+    assert_equal(again, last)
+    straight = make_tracker().stream(clip.camera, POINTS)
+    assert_equal(feed(stream, clip, range(4, 8))[-1], feed(straight, clip, range(8))[-1])
+
+
+def test_a_clock_that_begins_anew_is_followed(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS)
+    feed(stream, clip, range(2), stamp_s=1000.0)
+    state = feed(stream, clip, range(2, 3), stamp_s=0.0)[0]
+    assert "clock" in state.flags[0]
+    assert state.stamp_s == 0.0
+
+
+def test_dropped_frames_let_things_move_farther(clip: Clip):
+    tracker = make_tracker()
+    soon, later = (tracker.stream(clip.camera, POINTS) for _ in range(2))
+    for stream in (soon, later):
+        feed(stream, clip, range(1))
+    feed(soon, clip, range(4, 5), stamp_s=1 / 30)
+    feed(later, clip, range(4, 5), stamp_s=0.3)
+    spreads = [stream._intake.elapsed for stream in (soon, later)]
+    assert spreads == [1.0, pytest.approx(9.0)]
+
+
+def test_equal_pictures_at_other_times_are_looked_at_once(clip: Clip, monkeypatch: pytest.MonkeyPatch):
+    tracker = make_tracker()
+    looks = []
+    encode = tracker.network.encode
+    monkeypatch.setattr(tracker.network, "encode", lambda rgb: looks.append(1) or encode(rgb))
+    stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
+    for t in range(3):
+        stream.step(frame.rgb, frame.depth_m, t / 30)
+    assert len(looks) == 1
+
+
+def test_missing_depth_and_poses_are_flagged(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS)
+    assert feed(stream, clip, range(1))[0].flags == ()
+    assert "depth" in feed(stream, without_depth(clip, slice(1, 2)), range(1, 2))[0].flags[0]
+    assert "pose" in feed(stream, clip, range(2, 3), cam_from_world=None)[0].flags[0]
+    unposed = make_tracker().stream(clip.camera, POINTS)
+    assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
+
+
+def test_queries_come_and_go(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS[:1])
+    feed(stream, clip, range(2))
+    number = stream.add(Query.point(stream.frame, 40.5, 22.25, name="b"))
+    assert [q.name for q in stream.unbound] == ["b"]
+    both = feed(stream, clip, range(2, 4))[-1]
+    assert (both.query, both.names) == ((0, number), ("a", "b"))
+    stream.rename("b", "second")
+    stream.retire("a")
+    after = feed(stream, clip, range(4, 6))[-1]
+    assert (after.query, after.names) == ((number,), ("second",))
+    assert stream.add(Query.semantic("handle")) == 2
+    assert feed(stream, clip, range(6, 8))[-1].query == (1, 2)
+    stream.retire(1)
+    stream.retire(2)
+    assert feed(stream, clip, range(7, 8), stamp_s=9.0)[0].query == ()
+
+
+def test_retiring_leaves_the_others_alone():
+    """Queries see each other in the decoder, so only what does not pass through it is equal: anchors and beliefs."""
+    clip = make_clip(frames=4)
+    stream = make_tracker().stream(clip.camera, POINTS)
+    feed(stream, clip, range(3))
+    kept, anchor = stream._following[1], stream._binding.anchor
+    stream.retire("a")
+    assert stream._following == [kept]
+    assert stream._binding.anchor is not None
+    assert anchor is not None
+    np.testing.assert_array_equal(stream._binding.anchor.content[0, 0], anchor.content[0, 1])
+
+
+def test_queries_that_are_not_there(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS)
+    feed(stream, clip, range(2))
+    with pytest.raises(InputError, match="'c'"):
+        stream.retire("c")
+    with pytest.raises(InputError, match="called 'b' already"):
+        stream.rename("a", "b")
+    with pytest.raises(InputError, match="has passed"):
+        stream.add(Query.point(1, 3, 3))
+    with pytest.raises(InputError, match="99"):
+        stream.add(Query.point(5, 99, 3))
+
+
+def test_a_label_is_looked_for_in_several_frames(clip: Clip):
+    tracker = make_tracker(config=replace(EAGER, prompt_threshold=1.0))
+    stream = tracker.stream(clip.camera, [Query.semantic("handle")])
+    assert feed(stream, clip, range(2))[-1].query == ()
+    stream._binding._config = EAGER
+    assert feed(stream, clip, range(2, 3))[0].query == (0,)
+
+
+def test_signals_are_measured(clip: Clip):
+    states = feed(make_tracker().stream(clip.camera, POINTS), clip, range(3))
+    for state in states:
+        assert state.signals.values.shape == (2, len(SIGNALS))
+        assert np.isnan(state.lost_p).all()
+        assert state.alarm == (None, None)
+    values = states[-1].signals.named(0)
+    assert all(np.isfinite(v) for v in values.values()), values
+    assert -1 <= values["anchor_cosine"] <= 1
+    first = states[0].signals.named(0)
+    assert first["embedding_cosine"] == pytest.approx(1.0, abs=1e-5)
+    dark = feed(make_tracker().stream(clip.camera, POINTS), without_depth(clip, slice(None)), range(2))[-1]
+    assert np.isfinite(dark.signals.named(0)["right_logit"])
+
+
+def test_joints_are_in_the_world(clip: Clip):
+    """In another world frame they move along, like the points."""
+    motion = np.eye(4)
+    motion[:3, :3] = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    motion[:3, 3] = [3.0, -2.0, 0.5]
+    tracker = make_tracker()
+    here, there = (
+        feed(tracker.stream(c.camera, POINTS), c, range(8))[-1].joint for c in (clip, moved_world(clip, motion))
+    )
+    for one, other in zip(here, there, strict=True):
+        assert one is not None
+        assert other is not None
+        assert one.kind == other.kind
+        q = np.linspace(one.lower, one.upper, 5)
+        moved = one.at(q) @ motion[:3, :3].T + motion[:3, 3]
+        np.testing.assert_allclose(other.at(q), moved, atol=1e-3)
+
+
+def test_an_alarm_is_told_and_searched(clip: Clip):
+    told: list[Alarm] = []
+    stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=0.1)
+    stream.on_alarm(told.append)
+    states = feed(stream, clip, range(8))
+    assert [a.query for a in told] == [0, 1]
+    assert told[0].name == "a"
+    assert told[0].reason
+    assert states[-1].state == (State.LOST, State.LOST)
+    assert [a.query for a in states[-1].alarm if a is not None] == [0, 1]
+    assert not states[-1].visible.any()
+
+
+def test_without_alpha_there_are_no_alarms(clip: Clip):
+    stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=None)
+    assert stream.alpha is None
+    states = feed(stream, clip, range(8))
+    assert all(s.alarm == (None, None) for s in states)
+
+
+def test_what_is_found_again_ends_the_alarm(clip: Clip):
+    """The signals of a lost query turn good again: three such frames, and it is trusted."""
+    tracker = watched(alarming=True)
+    stream = tracker.stream(clip.camera, POINTS[:1], alpha=0.1)
+    states = feed(stream, clip, range(4))
+    assert states[-1].state == (State.LOST,)
+    assert stream._monitor is not None
+    stream._monitor.calibration = make_calibration(alarming=False)
+    after = feed(stream, clip, range(4, 8))
+    assert after[0].alarm[0] is not None
+    assert after[-1].alarm == (None,)
+    assert after[-1].state != (State.LOST,) or after[-1].confidence[0] < 0.3
+
+
+@pytest.mark.parametrize("alarming", [False, True])
+@pytest.mark.parametrize("after", [1, 3, 5])
+def test_a_saved_stream_goes_on_to_the_bit(after: int, alarming: bool, clip: Clip):
+    tracker = watched(alarming)
+    stream = tracker.stream(clip.camera, [*POINTS, Query.semantic("handle"), Query.point(6, 9, 9, name="late")])
+    feed(stream, clip, range(after))
+    data = tracker.save(stream)
+    again = tracker.restore(data)
+    assert tracker.save(again) == data
+    for got, expected in zip(feed(again, clip, range(after, 8)), feed(stream, clip, range(after, 8)), strict=True):
+        assert_equal(got, expected)
+    assert tracker.save(again) == tracker.save(stream)
+
+
+def test_a_stream_saved_before_its_first_frame(clip: Clip):
+    tracker = make_tracker()
+    again = tracker.restore(tracker.save(tracker.stream(clip.camera)))
+    assert_equal(feed(again, clip, range(2))[-1], feed(tracker.stream(clip.camera), clip, range(2))[-1])
+
+
+def test_what_is_no_saved_stream_is_refused(clip: Clip):
+    tracker = make_tracker()
+    stream = tracker.stream(clip.camera, POINTS)
+    feed(stream, clip, range(2))
+    data = tracker.save(stream)
+    for torn in (b"", b"abc", data[:-7], data[: len(data) // 2]):
+        with pytest.raises(InputError, match="saved stream"):
+            tracker.restore(torn)
+    other = make_tracker(config=replace(EAGER, jump=0.2))
+    with pytest.raises(InputError, match="other weights or settings"):
+        other.restore(data)
