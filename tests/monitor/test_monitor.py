@@ -60,20 +60,6 @@ def test_a_renamed_query_alarms_by_its_new_name():
     assert alarm.name == "lid"
 
 
-def test_a_search_is_judged_by_what_it_finds():
-    """Wrong places are remembered for long, unless the tracker says that it has left them; the alarm stays."""
-    watcher = watching("anchor_cosine")
-    of_the_mean = np.roll(watcher.calibrator.direct, len(SIGNALS), axis=1)
-    watcher = replace(watcher, calibrator=replace(watcher.calibrator, direct=of_the_mean))
-    left, stayed = (watched(watcher, 0) for _ in range(2))
-    for monitor in (left, stayed):
-        run(monitor, [1.0] * 8 + [-1.0] * 12)
-    left.search(0)
-    found, doubtful = (run(m, [1.0])[0] for m in (left, stayed))
-    assert found.lost_p[0] < doubtful.lost_p[0]
-    assert found.open[0] is not None
-
-
 def test_clearing_ends_the_alarm_and_spends_less_each_time():
     monitor = watched(watching("anchor_cosine", block_frames=1000), 0)
     alarms: list[Alarm] = []

@@ -96,17 +96,6 @@ class Monitor:
         """The open alarm of a query."""
         return self._open.get(key)
 
-    def search(self, key: int) -> None:
-        """The tracker looks for the entity elsewhere: what is remembered of wrong places no longer counts.
-
-        The alarm stays open; P(lost) is that of what the search finds.
-
-        Raises:
-            InputError: the query is not being watched.
-        """
-        row = self._find(key)
-        self._memory[row] = memories.forgive(self._memory[row])
-
     def clear(self, key: int) -> None:
         """The identity is right again: the alarm ends, and the statistic starts anew.
 

@@ -101,6 +101,22 @@ class Binding:
         self.waiting.append(Waiting(self._next_number(), query, max(frame, query.frame)))
         return self.numbered - 1
 
+    def names(self, following: Sequence[Following]) -> dict[int, str]:
+        """Names by number of all queries that are followed or wait; empty where a name is not made up yet."""
+        return {w.number: w.query.name for w in self.waiting} | {f.query: f.name for f in following}
+
+    def find(self, query: int | str, following: Sequence[Following]) -> int:
+        """The number of a query, by its number or name.
+
+        Raises:
+            InputError: no query of that number or name is followed or waits.
+        """
+        names = self.names(following)
+        found = [number for number, name in names.items() if query in (number, name) and query != ""]
+        if not found:
+            raise InputError(f"query {query!r}: no such number or name; there are {names}")
+        return found[0]
+
     def bind(
         self, frame: int, observed: Observation, frames: FrameBatch, following: Sequence[Following]
     ) -> list[Following]:

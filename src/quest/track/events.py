@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from quest.monitor import Alarm
 from quest.track.state import StreamState
 from quest.types import State
@@ -80,7 +82,14 @@ class Events:
         # With an alarm the query is lost and found by it; that is told already.
         was_lost, lost = self._lost.get(number, False), state.state[k] is State.LOST
         if before is None and lost and not was_lost:
-            told.append(("lost", f"lost: confidence {state.confidence[k]:.2f}"))
+            told.append(("lost", f"lost: {_doubt(state, k)}"))
         elif before is None and was_lost and not lost:
-            told.append(("found", f"found again: confidence {state.confidence[k]:.2f}"))
+            told.append(("found", f"found again: {_doubt(state, k)}"))
         return told
+
+
+def _doubt(state: StreamState, k: int) -> str:
+    """What a query's state goes by."""
+    if np.isfinite(state.lost_p[k]):
+        return f"P(lost) {state.lost_p[k]:.2f}"
+    return f"confidence {state.confidence[k]:.2f}"

@@ -64,8 +64,8 @@ class Following:
         born: the query's embedding in its first frame.
         safe: copies from before, the older one first.
         since_safe: frames since the last copy.
-        doubted: whether an alarm is open, so that it is held and searched.
-        good: frames in a row in which the search has found what matches the anchor.
+        doubted: whether it was seen in a wrong place when an alarm was raised, so that it is held and searched.
+        good: frames in a row, with an alarm open, in which what is seen matches the anchor.
         answer: what was said of it in the newest frame.
     """
 

@@ -32,6 +32,8 @@ from quest.track.sharing import SIGMA, share
 from quest.track.state import StreamState
 from quest.types import Camera, Query, State
 
+_LOST_ABOVE = 0.5
+
 
 class Stream:
     """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
@@ -110,7 +112,7 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits.
         """
-        number = self._number(query)
+        number = self._binding.find(query, self._following)
         rows = [i for i, f in enumerate(self._following) if f.query != number]
         if len(rows) < len(self._following):
             self._binding.keep(rows)
@@ -126,8 +128,8 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits, or another has the new name.
         """
-        number = self._number(query)
-        if name in self._names().values():
+        number = self._binding.find(query, self._following)
+        if name in self._binding.names(self._following).values():
             raise InputError(f"query {query!r}: another query is called {name!r} already; choose another name")
         for following in self._following:
             if following.query == number:
@@ -302,14 +304,16 @@ class Stream:
             self._recover(verdict, placed)
         for k, query in enumerate(following):
             visible = bool(placed.seen[k] > 0.5 and inside[k] and not query.doubted)
-            lost = query.doubted or bool(right[k] < LOST_BELOW)
+            lost_p = float("nan") if verdict is None else float(verdict.lost_p[k])
+            # The network's belief in a single frame only counts where nothing is calibrated.
+            lost = lost_p > _LOST_ABOVE or self._alarm(query) is not None or (verdict is None and right[k] < LOST_BELOW)
             query.answer = Answer(
                 uv_px=uv_px[k],
                 point_world=world[k],
                 confidence=float(right[k]),
                 visible=visible,
                 state=State.LOST if lost else State.TRACKING if visible else State.HELD,
-                lost_p=float("nan") if verdict is None else float(verdict.lost_p[k]),
+                lost_p=lost_p,
                 signals=signals.values[k],
             )
         for alarm in () if verdict is None else verdict.raised:
@@ -317,21 +321,30 @@ class Stream:
                 callback(alarm)
 
     def _recover(self, verdict: Verdict, placed: Placed) -> None:
-        """Search for what an alarm says is lost; end the alarm where the search holds what matches the anchor."""
+        """Search for what an alarm says is lost; end the alarm where what is seen matches the anchor again.
+
+        What is held on its joint, unseen, is held on; what is seen in a wrong place goes back to where it was right.
+        """
         assert self._monitor is not None
         for k, query in enumerate(self._following):
-            right = verdict.lost_p[k] < self._config.found_below
-            if not query.doubted:
-                if verdict.open[k] is not None:
-                    query.doubt()
-                    self._monitor.search(query.query)
-                elif right and not query.held:
+            right = bool(verdict.lost_p[k] < self._config.found_below) and not placed.held[k]
+            alarm = verdict.open[k]
+            if alarm is None:
+                if right:
                     query.keep()
+                continue
+            if alarm in verdict.raised:
+                query.good = 0
+                if not placed.held[k] and verdict.lost_p[k] > _LOST_ABOVE:
+                    query.doubt()
                 continue
             query.good = query.good + 1 if right and np.isfinite(placed.judged[k]).all() else 0
             if query.good >= self._config.found_frames:
                 query.trust(placed.judged[k])
                 self._monitor.clear(query.query)
+
+    def _alarm(self, query: Following) -> Alarm | None:
+        return None if self._monitor is None else self._monitor.alarm(query.query)
 
     def _to_world(self, point: Float[np.ndarray, "K 3"]) -> Float32[np.ndarray, "K 3"]:
         reference = self._intake.reference
@@ -363,7 +376,7 @@ class Stream:
             query=tuple(f.query for f, _ in rows),
             joint=tuple(self._world_joint(f) for f, _ in rows),
             lost_p=stacked("lost_p"),
-            alarm=tuple(None if self._monitor is None else self._monitor.alarm(f.query) for f, _ in rows),
+            alarm=tuple(self._alarm(f) for f, _ in rows),
             signals=Signals(stacked("signals", len(SIGNALS))),
             flags=flags,
         )
@@ -376,19 +389,6 @@ class Stream:
         rotation = world_from_cam[:3, :3]
         translation = rotation @ as_array(reference.center[0]) + world_from_cam[:3, 3]
         return joint.transformed(rotation, translation, float(reference.scale[0]))
-
-    def _names(self) -> dict[int, str]:
-        """Names by number of all queries that are followed or wait."""
-        waiting = {w.number: w.query.name for w in self._binding.waiting if w.query.name}
-        return waiting | {f.query: f.name for f in self._following}
-
-    def _number(self, query: int | str) -> int:
-        names = self._names()
-        numbers = [*names, *(w.number for w in self._binding.waiting)]
-        found = [n for n in numbers if n == query or names.get(n) == query]
-        if not found:
-            raise InputError(f"query {query!r}: no such number or name; there are {names}")
-        return found[0]
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:
