@@ -67,12 +67,23 @@ def test_python_example_runs(monkeypatch, capsys):
     assert "handle" in capsys.readouterr().out
 
 
-def test_figures_are_those_of_the_result_files():
-    spec = importlib.util.spec_from_file_location("update_readme", ROOT / "benchmarks" / "update_readme.py")
+def benchmark(name: str):
+    """A script of the folder of benchmarks as a module."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
+    return module
+
+
+def test_figures_are_those_of_the_result_files():
+    module = benchmark("update_readme")
     text = README.read_text(encoding="utf-8")
     assert text == module.with_figures(text, module.figures(ROOT / "benchmarks" / "results"))
+
+
+def test_the_page_of_results_is_that_of_the_reports():
+    page = ROOT / "docs" / "results.md"
+    assert page.read_text(encoding="utf-8") == benchmark("update_reports").page(ROOT / "benchmarks" / "results")

@@ -1,0 +1,222 @@
+"""Write docs/results.md out of the report files below benchmarks/results.
+
+    python benchmarks/update_reports.py            # rewrite docs/results.md
+    python benchmarks/update_reports.py --check    # fail if it would change
+
+What `quest eval` measures is in the README (`update_readme.py`); this page has the rest. Nothing in it is typed in.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of the page.
+
+    Attributes:
+        file: report, below the folder of results.
+        title: heading.
+        rows: key of the list of rows in the report.
+        columns: headings and where in a row the value is, as keys joined by dots; ``%`` before it for percent.
+        each: key of a list in a row of which every entry makes a line; its values come after ``each.``.
+    """
+
+    file: str
+    title: str
+    rows: str
+    columns: dict[str, str]
+    each: str = ""
+
+
+OBJECTS = {"objects": "source", "part": "part"}
+TABLES = (
+    Table(
+        "monitor/test.json",
+        "Drift per frame: the monitor beside plainer rules",
+        "rows",
+        OBJECTS
+        | {
+            "detector": "detector",
+            "streams": "streams",
+            "losses": "losses",
+            "AUROC": "auroc",
+            "AUGRC": "augrc",
+            "ECE": "ece",
+        },
+    ),
+    Table(
+        "monitor/test.json",
+        "Alarms per stream, at equal false alarms",
+        "rows",
+        OBJECTS
+        | {
+            "detector": "detector",
+            "alpha": "each.alpha",
+            "loss-free streams": "each.trials",
+            "false alarms": "each.false_alarms",
+            "95 % from": "%each.low",
+            "to": "%each.high",
+            "missed %": "%each.missed",
+            "delay median": "each.delay_median",
+            "p90": "each.delay_p90",
+        },
+        each="alarms",
+    ),
+    Table(
+        "grounding/standard_grounding.json",
+        "Grounding on against off, ordinary takes",
+        "rows",
+        OBJECTS
+        | {
+            "level": "level",
+            "objects/tracks": "objects/tracks",
+            "APE on": "ape.on",
+            "off": "ape.off",
+            "ratio": "ape.ratio",
+            "well seen: on": "well_seen.on",
+            "off ": "well_seen.off",
+            "difference": "well_seen.difference",
+        },
+    ),
+    Table(
+        "grounding/suites_grounding.json",
+        "Grounding on against off, suites",
+        "rows",
+        OBJECTS
+        | {
+            "suite": "suite",
+            "objects/tracks": "objects/tracks",
+            "APE on": "ape.on",
+            "off": "ape.off",
+            "ratio": "ape.ratio",
+            "well seen: on": "well_seen.on",
+            "off ": "well_seen.off",
+            "difference": "well_seen.difference",
+        },
+    ),
+    Table(
+        "grounding/reappearance.json",
+        "Suite occlusion: hidden for 60 frames while the joint moves on and stops",
+        "occlusion",
+        OBJECTS
+        | {
+            "beside": "beside",
+            "tracker": "tracker",
+            "n": "judged",
+            "right before %": "%held_before",
+            "APE hidden": "ape_hidden",
+            "right 5 frames after %": "%held_again",
+            "of those right before %": "%held_again_if_before",
+            "median then": "distance_again",
+        },
+    ),
+    Table(
+        "grounding/reappearance.json",
+        "Suite lockers: sixteen identical doors",
+        "lockers",
+        OBJECTS
+        | {
+            "reading": "reading",
+            "tracker": "tracker",
+            "objects/tracks": "objects/tracks",
+            "switches per 1,000 frames": "metrics.switches",
+            "Acc %": "%metrics.acc",
+        },
+    ),
+    Table(
+        "grounding/predicted_joints.json",
+        "Joints from predicted tracks",
+        "rows",
+        OBJECTS
+        | {
+            "joint": "kind",
+            "when": "moment",
+            "objects/answers": "objects/answers",
+            "kind right %": "%kind_right",
+            "axis error, degrees": "axis_error_deg",
+            "p90": "axis_p90_deg",
+        },
+    ),
+)
+
+
+@dataclass(frozen=True)
+class UpdateReports:
+    """Rewrite the page of results."""
+
+    out: Path = ROOT / "docs" / "results.md"
+    results: Path = ROOT / "benchmarks" / "results"
+    check: bool = False
+    """Change nothing; exit with 1 if the page is out of date."""
+
+    def run(self) -> int:
+        """Return 0, or 1 if --check finds the page out of date."""
+        text = page(self.results)
+        if self.check:
+            return int(not self.out.is_file() or self.out.read_text(encoding="utf-8") != text)
+        self.out.write_text(text, encoding="utf-8")
+        return 0
+
+
+def page(folder: Path) -> str:
+    """All reports of a folder as Markdown; those that are not there are left out."""
+    parts = [
+        "# Results of monitor, grounding and suites",
+        "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
+        "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
+        "Validation objects chose settings; test objects did not.",
+    ]
+    parts += [_section(table, folder / table.file) for table in TABLES if (folder / table.file).is_file()]
+    return "\n\n".join(parts) + "\n"
+
+
+def _section(table: Table, path: Path) -> str:
+    report = json.loads(path.read_text(encoding="utf-8"))
+    lines = [_line(table.columns), _line(["---"] * len(table.columns))]
+    for row in report[table.rows]:
+        for entry in row[table.each] if table.each else [{}]:
+            lines.append(_line([_cell(row | {"each": entry}, where) for where in table.columns.values()]))
+    run = report.get("run", report)
+    notes = [f"`{run['command']}`, commit {run['commit']}."]
+    if "calibration" in report:
+        notes.append(f"Calibration: {report['calibration']}.")
+    return "\n".join([f"## {table.title}", "", *lines, "", *notes])
+
+
+def _cell(row: dict[str, Any], where: str) -> str:
+    if "/" in where:
+        return "/".join(_cell(row, part) for part in where.split("/"))
+    percent, value = where.startswith("%"), row
+    for key in where.lstrip("%").split("."):
+        value = value.get(key) if isinstance(value, dict) else None
+    return _shown(value, 100 if percent else 1)
+
+
+def _shown(value: Any, factor: float) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, dict):
+        middle = _shown(value.get("share", value.get("mean")), factor)
+        low, high = (_shown(value.get(key), factor) for key in ("low", "high"))
+        return f"{middle} ({low}–{high})" if low and high else middle
+    if isinstance(value, float):
+        return f"{factor * value:.0f}" if factor == 100 else f"{value:.3g}"
+    return str(value)
+
+
+def _line(cells: Any) -> str:
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(UpdateReports).run())
