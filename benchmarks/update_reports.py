@@ -39,6 +39,15 @@ class Table:
 
 
 OBJECTS = {"objects": "source", "part": "part"}
+ON_OFF = {
+    "objects/tracks": "objects/tracks",
+    "APE on": "ape.on",
+    "off": "ape.off",
+    "ratio": "ape.ratio",
+    "well seen: on": "well_seen.on",
+    "off ": "well_seen.off",
+    "difference": "well_seen.difference",
+}
 TABLES = (
     Table(
         "monitor/test.json",
@@ -76,33 +85,13 @@ TABLES = (
         "grounding/standard_grounding.json",
         "Grounding on against off, ordinary takes",
         "rows",
-        OBJECTS
-        | {
-            "level": "level",
-            "objects/tracks": "objects/tracks",
-            "APE on": "ape.on",
-            "off": "ape.off",
-            "ratio": "ape.ratio",
-            "well seen: on": "well_seen.on",
-            "off ": "well_seen.off",
-            "difference": "well_seen.difference",
-        },
+        OBJECTS | {"level": "level"} | ON_OFF,
     ),
     Table(
         "grounding/suites_grounding.json",
         "Grounding on against off, suites",
         "rows",
-        OBJECTS
-        | {
-            "suite": "suite",
-            "objects/tracks": "objects/tracks",
-            "APE on": "ape.on",
-            "off": "ape.off",
-            "ratio": "ape.ratio",
-            "well seen: on": "well_seen.on",
-            "off ": "well_seen.off",
-            "difference": "well_seen.difference",
-        },
+        OBJECTS | {"suite": "suite"} | ON_OFF,
     ),
     Table(
         "grounding/reappearance.json",

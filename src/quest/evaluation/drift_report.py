@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
@@ -26,6 +24,7 @@ from quest.evaluation.drift import (
     quantile,
     ranked_auroc,
 )
+from quest.evaluation.report import write_report
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
 
@@ -253,13 +252,7 @@ def write_drift(rows: Sequence[DriftRow], run: Run, about: str, path: Path) -> N
         path: a file ending in ``.json``.
     """
     raw = {"format": FORMAT, "run": asdict(run), "calibration": about, "rows": [asdict(row) for row in rows]}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps(raw, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_report(raw, path)
 
 
 def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
