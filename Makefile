@@ -63,7 +63,7 @@ $(BASE): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(ALL): pyproject.toml constraints.txt $(BASE)
-	$(PIP) --editable ".[sim,train,dev]"
+	$(PIP) --editable ".[sim,train,viz,ros,scale,dev]"
 	@touch $@
 
 clean:

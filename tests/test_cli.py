@@ -126,9 +126,11 @@ def test_extras_are_those_of_the_distribution():
     from pathlib import Path
 
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
+    other_name = {"rerun": "rerun-sdk", "mcap_ros2": "mcap-ros2-support"}
     for module, extra in EXTRA_OF.items():
         names = [requirement.split(">")[0].split("=")[0] for requirement in project["optional-dependencies"][extra]]
-        assert module.replace("_", "-") in names, f"{module}: {install_command(extra)} does not install it"
+        package = other_name.get(module, module.replace("_", "-"))
+        assert package in names, f"{module}: {install_command(extra)} does not install it"
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,12 @@ EXTRA_OF = {
     "lightning_fabric": "train",
     "tensorboard": "train",
     "onnx": "train",
+    "rerun": "viz",
+    "mcap": "ros",
+    "mcap_ros2": "ros",
+    "rosbags": "ros",
+    "obstore": "scale",
+    "ray": "scale",
 }
 """Extra that brings each optional module."""
 

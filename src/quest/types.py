@@ -64,7 +64,8 @@ class Camera:
     def from_opencv(cls, matrix: Float[np.ndarray, "3 3"], *, width: int, height: int) -> Camera:
         """Camera from an OpenCV or ROS matrix, whose pixel centres lie at integers (0.5 is added)."""
         m = np.asarray(matrix, dtype=np.float64)
-        return cls(m[0, 0], m[1, 1], m[0, 2] + 0.5, m[1, 2] + 0.5, width, height)
+        fx, fy, cx, cy = (float(m[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        return cls(fx, fy, cx + 0.5, cy + 0.5, width, height)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -281,14 +282,25 @@ class Entity:
     Attributes:
         name: unique within the object, such as ``link_0/handle``.
         label: one of :data:`LABELS`, or ``hinge`` (reported apart, never scored).
-        link: index of its link in the take's link arrays.
-        joint: index of the joint that moves it in the take's joint arrays.
+        link: index of its link in the take's link arrays; 0 is the base, which never moves.
+        joint: index of the joint that moves it in the take's joint arrays; -1 if it is fixed in the base, such as the
+            rim of a laptop's base. Ask :attr:`fixed` before indexing with it.
     """
 
     name: str
     label: str
     link: int
     joint: int
+
+    @property
+    def fixed(self) -> bool:
+        """Whether it is fixed in the base, so that no joint moves it."""
+        return self.joint < 0
+
+    @property
+    def intent(self) -> Literal["open", "lift"]:
+        """What one takes hold of it for: ``open`` what a joint moves, ``lift`` the whole thing by its base."""
+        return "lift" if self.fixed else "open"
 
 
 @dataclass(frozen=True)
@@ -297,7 +309,7 @@ class TakeInfo:
 
     Attributes:
         name: unique in its store.
-        source: ``partnet-mobility`` or ``procedural``.
+        source: ``partnet-mobility``, ``procedural``, or ``own`` for a user's own object.
         object_id: folder name, or ``category-seed`` of a procedural object.
         category: such as ``StorageFurniture``.
         level: how many joints move one after the other.
@@ -312,7 +324,7 @@ class TakeInfo:
     """
 
     name: str
-    source: Literal["partnet-mobility", "procedural"]
+    source: Literal["partnet-mobility", "procedural", "own"]
     object_id: str
     category: str
     level: int
