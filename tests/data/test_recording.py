@@ -12,7 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from quest.data.recording import clean_depth, clip_from_arrays, read_recording, write_recording
+from quest.data.camera_file import CameraFile, read_camera, write_camera
+from quest.data.distortion import Distortion, Rectifier
+from quest.data.frame_source import Notes
+from quest.data.recording import clean_depth, clip_from_arrays, open_recording, read_recording, write_recording
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
@@ -284,3 +287,87 @@ def test_clean_depth_keeps_what_is_valid():
 def test_opencv_camera_has_its_centre_moved():
     camera = Camera.from_opencv(np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]), width=64, height=48)
     assert (camera.cx, camera.cy) == (32, 24)
+
+
+def test_frames_come_one_by_one(folder: Path, clip: Clip):
+    source = open_recording(folder)
+    assert (source.length, source.exact, source.name, source.camera) == (FRAMES, True, "recording", clip.camera)
+    (folder / "rgb" / "000009.png").unlink()
+    (folder / "rgb" / "000009.png").write_bytes(b"torn")
+    frames = iter(source)
+    for t in range(9):
+        frame = next(frames)
+        np.testing.assert_array_equal(frame.rgb, clip.rgb[t])
+        np.testing.assert_array_equal(frame.cam_from_world, clip.cam_from_world[t])
+        assert frame.stamp_s == clip.stamp_s[t]
+    with pytest.raises(RecordingError, match=r"000009\.png: not an image"):
+        next(frames)
+
+
+def test_a_video_streams_as_it_is_read_whole(tmp_path: Path, clip: Clip):
+    write_recording(clip, tmp_path / "video")
+    source = open_recording(tmp_path / "video")
+    assert (source.length, source.exact) == (FRAMES, False)
+    whole = read_recording(tmp_path / "video")
+    for _ in range(2):  # every pass begins anew
+        for t, frame in enumerate(source):
+            np.testing.assert_array_equal(frame.rgb, whole.rgb[t])
+
+
+def test_a_video_with_more_frames_than_depth(tmp_path: Path, clip: Clip):
+    write_recording(clip, tmp_path / "video")
+    (tmp_path / "video" / "depth" / "000011.png").unlink()
+    with pytest.raises(RecordingError, match="11 depth images for 12 colour frames"):
+        read_recording(tmp_path / "video")
+
+
+def test_depth_of_another_camera_is_registered(folder: Path):
+    half = {"fx": 36, "fy": 36, "cx": 16, "cy": 12, "width": 32, "height": 24}
+    shift = np.eye(4)
+    shift[0, 3] = 0.02
+    edit_camera(folder, depth_camera=half, colour_from_depth=shift.tolist(), depth_scale_m=0.001)
+    for path in (folder / "depth").iterdir():
+        cv2.imwrite(str(path), np.full((24, 32), 2000, np.uint16))
+    found = read_recording(folder)
+    assert found.depth_m is not None
+    assert (found.depth_m[:, 4:-4, 6:-6] == 2.0).all()
+    edit_camera(folder, depth_camera=None)
+    with pytest.raises(RecordingError, match="colour_from_depth is given without depth_camera"):
+        read_recording(folder)
+
+
+def test_distorted_frames_are_rectified(folder: Path, clip: Clip):
+    lens = Distortion("plumb_bob", (-0.2, 0.05, 0.0, 0.0))
+    edit_camera(folder, distortion_model=lens.model, distortion=list(lens.coefficients))
+    found = read_recording(folder)
+    rectifier = Rectifier(clip.camera, lens)
+    assert clip.depth_m is not None
+    assert found.depth_m is not None
+    np.testing.assert_array_equal(found.rgb[3], rectifier.rgb(clip.rgb[3]))
+    np.testing.assert_array_equal(found.depth_m[3], rectifier.depth(clip.depth_m[3]))
+    edit_camera(folder, distortion=[0.1])
+    with pytest.raises(RecordingError, match="expected 4 or 5 coefficients, got 1"):
+        read_recording(folder)
+
+
+def test_camera_files_come_back(tmp_path: Path, clip: Clip):
+    shift = np.eye(4)
+    shift[1, 3] = -0.01
+    small = Camera(30.0, 31.0, 15.5, 12.5, 32, 24)
+    lens, other = Distortion("equidistant", (0.1, 0.0, 0.0, 0.0)), Distortion("plumb_bob", (0.1, 0.2, 0.0, 0.0, 0.3))
+    written = CameraFile(clip.camera, 0.001, 30.0, None, None, lens, small, other, shift)
+    write_camera(written, tmp_path / "camera.json")
+    found = read_camera(tmp_path / "camera.json")
+    assert (found.distortion, found.depth_camera, found.depth_distortion) == (lens, small, other)
+    np.testing.assert_array_equal(found.colour_from_depth, shift)
+
+
+def test_notes_count_and_begin_anew():
+    notes = Notes()
+    notes.say("colours only")
+    notes.say("colours only")
+    notes.count("no depth", 3)
+    notes.count("no depth", 5)
+    assert notes.words == ("colours only", "no depth: 2 frames, first 3")
+    notes.restart()
+    assert notes.words == ("colours only",)

@@ -16,8 +16,8 @@ from rich.markup import escape
 from quest.cli.source import Source
 
 if TYPE_CHECKING:
+    from quest.data.frame_source import FrameSource
     from quest.track import Stream, StreamState
-    from quest.types import Clip
 
 EXIT_ALARM = 3
 
@@ -42,12 +42,13 @@ class Monitor(Source):
     """Play at the recording's own pace; no frame is left out, so a slow machine falls behind."""
 
     def run(self) -> int:
-        """Step through the clip, show, write.
+        """Step through the recording as it is read, show, write.
 
         Raises:
             ConfigError: alpha is no probability.
             InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
         """
+        from quest.data.frame_source import source_of_clip
         from quest.errors import ConfigError, InputError
         from quest.track.state_lines import StateLines
         from quest.viz.live import LiveView, query_words
@@ -55,21 +56,25 @@ class Monitor(Source):
         if not 0.0 < self.alpha < 1.0:
             raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
         console = self._console()
-        clip = self.read()
-        queries = self.queries(clip)
+        source = self.open()
+        if source.length is None:
+            source = source_of_clip(source.clip())
+        length = source.length
+        assert length is not None, "a clip in memory has a length"
+        queries = self.queries(source)
         tracker = self.tracker()
-        stream = tracker.stream(clip.camera, queries, alpha=self.alpha)
-        console.print(f"watching {escape(clip.name)}: {len(clip)} frames, {escape(self.weights)} on {tracker.device}")
+        stream = tracker.stream(source.camera, queries, alpha=self.alpha)
+        console.print(f"watching {escape(source.name)}: {length} frames, {escape(self.weights)} on {tracker.device}")
         if stream.alpha is None:
             console.print(
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
                 "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
             )
-        view = LiveView(console, name=clip.name, frames=len(clip), alpha=stream.alpha)
+        view = LiveView(console, name=source.name, frames=length, alpha=stream.alpha)
         state = None
         try:
             with contextlib.nullcontext() if self.jsonl is None else StateLines(self.jsonl) as lines, view:
-                for t, state, behind_s in self._play(stream, clip):
+                for t, state, behind_s in self._play(stream, source):
                     if lines is not None:
                         lines.write(state, frame=t)
                     view.show(t, state, waiting=stream.unbound, behind_s=behind_s)
@@ -79,9 +84,10 @@ class Monitor(Source):
             console.print(view.summary())
             raise
         if state is None or not state.names:
-            raise InputError(f"clip {clip.name!r}: {NOTHING_FOUND}")
+            raise InputError(f"clip {source.name!r}: {NOTHING_FOUND}")
         for query in stream.unbound:
             console.print(f"[yellow]note:[/] {escape(query_words(query))}: found no entity; ask for it by --point")
+        self.say_flags(source, console)
         console.print(view.summary())
         return EXIT_ALARM if any(alarm is not None for alarm in state.alarm) else 0
 
@@ -93,11 +99,12 @@ class Monitor(Source):
         console.soft_wrap = not console.is_interactive
         return console
 
-    def _play(self, stream: Stream, clip: Clip) -> Iterator[tuple[int, StreamState, float]]:
+    def _play(self, stream: Stream, source: FrameSource) -> Iterator[tuple[int, StreamState, float]]:
         """Index and answers of every frame, and how many seconds they come too late for the recording's pace."""
-        begun_s = time.monotonic() - clip.stamp_s[0]
-        for t in range(len(clip)):
-            frame = clip.frame(t)
+        begun_s = 0.0
+        for t, frame in enumerate(source):
+            if t == 0:
+                begun_s = time.monotonic() - frame.stamp_s
             if self.realtime:
                 time.sleep(max(0.0, begun_s + frame.stamp_s - time.monotonic()))
             state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)

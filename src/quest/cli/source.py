@@ -7,8 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
+from rich.console import Console
+from rich.markup import escape
 
 if TYPE_CHECKING:
+    from quest.data.frame_source import FrameSource
     from quest.track import Tracker
     from quest.types import Clip, Query
 
@@ -20,7 +23,8 @@ class Source:
     """What to follow, where, and with which weights."""
 
     clip: tyro.conf.Positional[str]
-    """A recording folder, a video, a take (STORE/NAME.zarr), or the word sample for the clip that ships."""
+    """A recording folder, a video, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take (STORE/NAME.zarr), or the word
+    sample for the clip that ships."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
     point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -32,40 +36,86 @@ class Source:
     depth: Path | None = None
     """Folder of 16-bit depth images; default: depth beside the colours."""
     camera: Path | None = None
-    """Camera file; default: camera.json beside the colours."""
+    """Camera file; default: camera.json beside the colours, or what a bag says."""
     depth_scale_m: float | None = None
-    """Metres per unit of the depth images; default: what the camera file says."""
+    """Metres per unit of 16-bit depth; default: what the camera file says, in bags millimetres."""
+    episode: int = 0
+    """Which episode of a LeRobot dataset."""
+    camera_key: str | None = None
+    """Which camera of a LeRobot dataset, such as observation.images.front or front; default: the first."""
+    topic_rgb: str | None = None
+    """Topic of the colours in a bag; default: found by its type and name."""
+    topic_depth: str | None = None
+    """Topic of the depth in a bag, or none; default: found likewise."""
+    topic_info: str | None = None
+    """Topic of the colours' camera_info; default: beside the colours."""
+    topic_depth_info: str | None = None
+    """Topic of the depth's camera_info; default: beside the depth."""
+    world_frame: str | None = None
+    """tf frame that is the world; default: the root of the camera's tf tree."""
+    sync_s: float = 0.02
+    """How far apart colour and depth of a bag may be, seconds."""
     device: str = "auto"
     """cpu, cuda, mps or auto."""
 
-    def read(self) -> Clip:
-        """The recording or the view of a take.
+    def open(self) -> FrameSource:
+        """The recording or the view of a take, to be read frame by frame.
 
         Raises:
             RecordingError: there is no such recording, or it is not as expected.
             TakeError: there is no such take, or it is torn.
+            MissingExtraError: bags need the extra ``ros``.
         """
-        from quest.data.recording import read_recording
+        from quest.data.frame_source import source_of_clip
+        from quest.data.recording import Parts, open_recording
         from quest.data.sample import sample_folder
         from quest.data.store import open_clip
 
         if self.clip.rstrip("/").endswith(".zarr"):
-            return open_clip(self.clip, view=self.view)
+            return source_of_clip(open_clip(self.clip, view=self.view))
         path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
-        return read_recording(path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m)
+        parts = Parts(
+            self.episode,
+            self.camera_key,
+            self.topic_rgb,
+            self.topic_depth,
+            self.topic_info,
+            self.topic_depth_info,
+            self.world_frame,
+            self.sync_s,
+        )
+        return open_recording(path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m, parts=parts)
 
-    def queries(self, clip: Clip) -> list[Query] | None:
+    def read(self) -> Clip:
+        """All frames in memory; what is less than it could be in them is said on standard error.
+
+        Raises:
+            RecordingError: as in :meth:`open`.
+            TakeError: likewise.
+        """
+        source = self.open()
+        clip = source.clip()
+        self.say_flags(source, Console(stderr=True, highlight=False, soft_wrap=True))
+        return clip
+
+    def say_flags(self, source: FrameSource, console: Console) -> None:
+        """Print what is less than it could be in a recording."""
+        for flag in source.flags:
+            console.print(f"[yellow]note:[/] {escape(source.name)}: {escape(flag)}")
+
+    def queries(self, clip: Clip | FrameSource) -> list[Query] | None:
         """What was asked; None where nothing was, and everything is to be discovered.
 
         Args:
-            clip: in which it was asked.
+            clip: in which it was asked; frames beyond its end are refused where its length is known.
 
         Raises:
             InputError: a point is not written as expected, or its frame is not in the clip.
         """
         from quest.errors import InputError
-        from quest.types import Query
+        from quest.types import Clip, Query
 
+        length = len(clip) if isinstance(clip, Clip) else clip.length
         queries = []
         for text in self.point:
             parts = text.split(",", 3)
@@ -75,8 +125,8 @@ class Source:
                 raise InputError(
                     f"--point {text!r}: expected FRAME,X,Y or FRAME,X,Y,NAME, such as 0,120.5,88"
                 ) from error
-            if frame >= len(clip):
-                raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {len(clip) - 1}, got {frame}")
+            if length is not None and frame >= length:
+                raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {length - 1}, got {frame}")
             queries.append(Query.point(frame, x, y, name=parts[3] if len(parts) > 3 else ""))
         queries += [Query.semantic(label) for label in self.label]
         return queries or None

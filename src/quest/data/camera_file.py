@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from quest.data.distortion import Distortion
+from quest.data.registration import Rig
 from quest.errors import InputError, RecordingError
 from quest.types import Camera
 
@@ -17,7 +19,17 @@ DEFAULT_DEPTH_SCALE_M = 1e-3
 EXAMPLE = '{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 480, "depth_scale_m": 0.001, "fps": 30}'
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
-_OPTIONAL = ("pixel_centre", "depth_scale_m", "fps", "stamp_s", "cam_from_world")
+_LENS = ("distortion_model", "distortion")
+_OPTIONAL = (
+    "pixel_centre",
+    "depth_scale_m",
+    "fps",
+    "stamp_s",
+    "cam_from_world",
+    *_LENS,
+    "depth_camera",
+    "colour_from_depth",
+)
 _RIGID_TOLERANCE = 1e-3
 
 
@@ -31,6 +43,10 @@ class CameraFile:
         frames_per_s: frame rate, or None if the file does not tell.
         stamp_s: time of every frame in seconds, or None.
         cam_from_world: one pose, or one per frame; None if unknown. Numbers of frames are checked by the reader.
+        distortion: lens of the colour frames.
+        depth_camera: intrinsics of the depth images where they are not aligned to the colours.
+        depth_distortion: their lens.
+        colour_from_depth: rigid transform from the depth camera's axes to the colour camera's, metres.
     """
 
     camera: Camera
@@ -38,17 +54,35 @@ class CameraFile:
     frames_per_s: float | None = None
     stamp_s: Float[np.ndarray, " S"] | None = None
     cam_from_world: Float[np.ndarray, "4 4"] | Float[np.ndarray, "P 4 4"] | None = None
+    distortion: Distortion = field(default_factory=Distortion)
+    depth_camera: Camera | None = None
+    depth_distortion: Distortion = field(default_factory=Distortion)
+    colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
 
-    def stamps(self, frames: int, *, fallback: np.ndarray) -> np.ndarray:
-        """Time of each of ``frames`` frames in seconds: the file's own, else from its rate, else ``fallback``."""
+    @property
+    def rig(self) -> Rig:
+        """What makes RGB-D frames of a pinhole camera from the pictures."""
+        return Rig(self.camera, self.distortion, self.depth_camera, self.depth_distortion, self.colour_from_depth)
+
+    @property
+    def lengths(self) -> list[tuple[str, int]]:
+        """Of which fields the file gives one value per frame, and for how many frames."""
+        found = [] if self.stamp_s is None else [("stamp_s", len(self.stamp_s))]
+        if self.cam_from_world is not None and self.cam_from_world.ndim == 3:
+            found.append(("cam_from_world", len(self.cam_from_world)))
+        return found
+
+    def stamp(self, t: int, *, fallback_s: float) -> float:
+        """Time of frame ``t`` in seconds: the file's own, else from its rate, else ``fallback_s``."""
         if self.stamp_s is not None:
-            return self.stamp_s
-        return fallback if self.frames_per_s is None else np.arange(frames) / self.frames_per_s
+            return float(self.stamp_s[t])
+        return fallback_s if self.frames_per_s is None else t / self.frames_per_s
 
-    def poses(self, frames: int) -> np.ndarray:
-        """``cam_from_world`` of each of ``frames`` frames; identities if unknown."""
-        pose = np.eye(4) if self.cam_from_world is None else self.cam_from_world
-        return np.tile(pose, (frames, 1, 1)) if pose.ndim == 2 else pose
+    def pose(self, t: int) -> np.ndarray:
+        """``cam_from_world`` of frame ``t``; the identity if unknown."""
+        if self.cam_from_world is None:
+            return np.eye(4)
+        return self.cam_from_world if self.cam_from_world.ndim == 2 else self.cam_from_world[t]
 
 
 def read_camera(path: Path) -> CameraFile:
@@ -96,7 +130,16 @@ def write_camera(file: CameraFile, path: Path) -> None:
         fields["stamp_s"] = file.stamp_s.tolist()
     if file.cam_from_world is not None:
         fields["cam_from_world"] = file.cam_from_world.tolist()
+    fields |= _lens_to_json(file.distortion)
+    if file.depth_camera is not None:
+        depth = {name: getattr(file.depth_camera, name) for name in _INTRINSICS}
+        fields["depth_camera"] = depth | _lens_to_json(file.depth_distortion)
+        fields["colour_from_depth"] = file.colour_from_depth.tolist()
     path.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
+
+
+def _lens_to_json(lens: Distortion) -> dict[str, Any]:
+    return {} if lens.none else {"distortion_model": lens.model, "distortion": list(lens.coefficients)}
 
 
 def _parse(fields: dict[str, Any]) -> CameraFile:
@@ -104,17 +147,47 @@ def _parse(fields: dict[str, Any]) -> CameraFile:
     if convention not in ("integer", "half-integer"):
         raise ValueError(f"pixel_centre is {convention!r}, expected 'integer' (OpenCV, ROS) or 'half-integer'")
     shift = 0.5 if convention == "integer" else 0.0
+    depth = fields.get("depth_camera")
+    if depth is not None:
+        _check_depth_camera(depth)
+    if depth is None and "colour_from_depth" in fields:
+        raise ValueError("colour_from_depth is given without depth_camera; give the intrinsics of the depth images too")
+    return CameraFile(
+        camera=_parse_intrinsics(fields, shift),
+        depth_scale_m=check_depth_scale(fields.get("depth_scale_m", DEFAULT_DEPTH_SCALE_M)),
+        frames_per_s=None if "fps" not in fields else _positive("fps", fields["fps"]),
+        stamp_s=None if "stamp_s" not in fields else _parse_stamps(fields["stamp_s"]),
+        cam_from_world=None
+        if "cam_from_world" not in fields
+        else _parse_poses("cam_from_world", fields["cam_from_world"]),
+        distortion=_parse_lens(fields),
+        depth_camera=None if depth is None else _parse_intrinsics(depth, shift),
+        depth_distortion=_parse_lens(depth or {}),
+        colour_from_depth=_parse_poses(
+            "colour_from_depth", fields.get("colour_from_depth", np.eye(4).tolist()), one=True
+        ),
+    )
+
+
+def _parse_intrinsics(fields: dict[str, Any], shift: float) -> Camera:
     fx, fy, cx, cy = (float(fields[name]) for name in _INTRINSICS[:4])
     width, height = fields["width"], fields["height"]
     if width != int(width) or height != int(height):
         raise ValueError(f"width and height are {width} and {height}, expected whole pixels")
-    return CameraFile(
-        camera=Camera(fx, fy, cx + shift, cy + shift, int(width), int(height)),
-        depth_scale_m=check_depth_scale(fields.get("depth_scale_m", DEFAULT_DEPTH_SCALE_M)),
-        frames_per_s=None if "fps" not in fields else _positive("fps", fields["fps"]),
-        stamp_s=None if "stamp_s" not in fields else _parse_stamps(fields["stamp_s"]),
-        cam_from_world=None if "cam_from_world" not in fields else _parse_poses(fields["cam_from_world"]),
-    )
+    return Camera(fx, fy, cx + shift, cy + shift, int(width), int(height))
+
+
+def _check_depth_camera(fields: Any) -> None:
+    known = {*_INTRINSICS, *_LENS}
+    if not isinstance(fields, dict) or not known >= set(fields) >= set(_INTRINSICS):
+        raise ValueError(f"depth_camera must be an object of {', '.join(_INTRINSICS)}, and may have {', '.join(_LENS)}")
+
+
+def _parse_lens(fields: dict[str, Any]) -> Distortion:
+    coefficients = np.asarray(fields.get("distortion", []), dtype=np.float64)
+    if coefficients.ndim != 1:
+        raise ValueError("distortion must be a list of coefficients, in the order of ROS and OpenCV")
+    return Distortion(str(fields.get("distortion_model", "plumb_bob")), tuple(coefficients.tolist()))
 
 
 def check_depth_scale(value: Any) -> float:
@@ -135,13 +208,14 @@ def _parse_stamps(value: Any) -> np.ndarray:
     return stamps
 
 
-def _parse_poses(value: Any) -> np.ndarray:
+def _parse_poses(name: str, value: Any, *, one: bool = False) -> np.ndarray:
     poses = np.asarray(value, dtype=np.float64)
-    if poses.shape[-2:] != (4, 4) or poses.ndim not in (2, 3):
-        raise ValueError(f"cam_from_world has shape {poses.shape}, expected one 4 x 4 matrix or one per frame")
+    if poses.shape[-2:] != (4, 4) or poses.ndim not in ((2,) if one else (2, 3)):
+        expected = "one 4 x 4 matrix" if one else "one 4 x 4 matrix or one per frame"
+        raise ValueError(f"{name} has shape {poses.shape}, expected {expected}")
     rotation = poses[..., :3, :3]
     off = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
     rigid = off < _RIGID_TOLERANCE and (np.linalg.det(rotation) > 0).all()  # a NaN compares false
     if not rigid or not np.isfinite(poses).all() or not np.allclose(poses[..., 3, :], [0, 0, 0, 1]):
-        raise ValueError("cam_from_world is not a rigid transform (rotation, translation in metres, last row 0 0 0 1)")
+        raise ValueError(f"{name} is not a rigid transform (rotation, translation in metres, last row 0 0 0 1)")
     return poses

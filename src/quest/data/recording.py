@@ -1,34 +1,84 @@
-"""Recordings of real cameras: a video or a folder of images, 16-bit depth images, and a camera file.
+"""Recordings of real cameras, whatever they are kept in: folders, videos, LeRobot datasets, MCAP files, ROS bags.
 
 A recording folder holds ``rgb/`` (images, in natural order of their names) or one video, optionally ``depth/`` (16-bit
-PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`).
+PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The others are as their makers describe them; what is
+read of them is in :mod:`quest.data.lerobot` and :mod:`quest.data.ros_frames`.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 import uuid
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Float32, Shaped, UInt8
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Float, Shaped, UInt8
 
-from quest.data.camera_file import CameraFile, check_depth_scale, read_camera, write_camera
-from quest.data.video import SUFFIXES, read_video, write_video
+from quest.data.camera_file import CameraFile, check_depth_scale, write_camera
+from quest.data.folder import open_folder
+from quest.data.frame_source import PLAUSIBLE_DEPTH_M, FrameSource, Parts, check_units, clean_depth
+from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
 
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-PLAUSIBLE_DEPTH_M = (0.05, 50.0)
-"""A clip whose median depth lies outside is taken to be in other units."""
+__all__ = [
+    "PLAUSIBLE_DEPTH_M",
+    "FrameSource",
+    "Parts",
+    "clean_depth",
+    "clip_from_arrays",
+    "open_recording",
+    "read_recording",
+    "write_recording",
+]
 
-_USUAL_SCALES_M = (1e-3, 1e-4, 2e-4, 1e-2, 1e-5, 1e-6, 0.1, 1.0)
-_USUAL_DEPTH_M = 1.5
+_BAG_SUFFIXES = (".bag", ".db3")
+
+
+def open_recording(
+    path: str | Path,
+    *,
+    depth: str | Path | None = None,
+    camera: str | Path | Camera | None = None,
+    depth_scale_m: float | int | None = None,
+    parts: Parts | None = None,
+) -> FrameSource:
+    """Open a recording; its frames are read when they are asked for.
+
+    Args:
+        path: a recording folder, a folder of images, a video, a LeRobot v3 dataset, an MCAP file, or a ROS bag (the
+            folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``).
+        depth: folder of 16-bit depth images, one per frame, for folders and videos; by default ``depth`` in the
+            recording folder (or beside a video), where there is one. Without it there are colours only.
+        camera: camera file, or the intrinsics themselves; by default ``camera.json`` in the recording folder (or beside
+            a video), or what the bag says.
+        depth_scale_m: metres per unit of 16-bit depth images; by default what the camera file says, else 0.001.
+        parts: what to read of datasets and bags; by default what there is.
+
+    Raises:
+        RecordingError: something is missing, empty, torn, inconsistent, or in the wrong units.
+        MissingExtraError: bags need the extra ``ros``.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise RecordingError(f"recording {source}: no such file or folder; check the path")
+    parts = Parts() if parts is None else parts
+    if source.is_dir() and (source / "meta" / "info.json").is_file():
+        from quest.data.lerobot import open_lerobot
+
+        return open_lerobot(
+            source,
+            episode=parts.episode,
+            camera_key=parts.camera_key,
+            camera=_as_path(camera),
+        )
+    if is_bag(source):
+        return _open_bag(source, _as_path(camera), depth_scale_m, parts)
+    return open_folder(
+        source, depth=None if depth is None else Path(depth), camera=_as_path(camera), depth_scale_m=depth_scale_m
+    )
 
 
 def read_recording(
@@ -37,48 +87,37 @@ def read_recording(
     depth: str | Path | None = None,
     camera: str | Path | Camera | None = None,
     depth_scale_m: float | int | None = None,
+    parts: Parts | None = None,
 ) -> Clip:
-    """Read a recording from disk.
+    """All frames of a recording in memory; arguments and errors as of :func:`open_recording`."""
+    return open_recording(path, depth=depth, camera=camera, depth_scale_m=depth_scale_m, parts=parts).clip()
 
-    Args:
-        path: a recording folder, a folder of images, or a video file.
-        depth: folder of 16-bit depth images, one per frame; by default ``depth`` in the recording folder (or beside a
-            video), where there is one. Without it the clip has colours only.
-        camera: camera file, or the intrinsics themselves; by default ``camera.json`` in the recording folder (or beside
-            a video).
-        depth_scale_m: metres per unit of the depth images; by default what the camera file says, else 0.001.
 
-    Raises:
-        RecordingError: something is missing, empty, torn, inconsistent, or in the wrong units.
-    """
-    source = Path(path)
-    if not source.exists():
-        raise RecordingError(f"recording {source}: no such file or folder; check the path")
-    root = source if source.is_dir() else source.parent
-    setup = CameraFile(camera) if isinstance(camera, Camera) else read_camera(Path(camera or root / "camera.json"))
-    if depth_scale_m is not None:
-        try:
-            setup = replace(setup, depth_scale_m=check_depth_scale(depth_scale_m))
-        except ValueError as error:
-            raise RecordingError(f"recording {source}: {error}") from error
+def is_bag(path: Path) -> bool:
+    """Whether a path is an MCAP file or a ROS bag, by its name or its ``metadata.yaml``."""
+    if path.is_dir():
+        return (path / "metadata.yaml").is_file()
+    return path.suffix.lower() in (".mcap", *_BAG_SUFFIXES)
 
-    rgb, stamp_s = _read_colours(source)
-    frames, height, width = rgb.shape[:3]
-    if (height, width) != (setup.camera.height, setup.camera.width):
-        raise RecordingError(
-            f"recording {source}: frames are {width} x {height} but the camera is for {setup.camera.width} x "
-            f"{setup.camera.height}; give the intrinsics of these frames in the camera file"
-        )
-    stamp_s, poses = setup.stamps(frames, fallback=stamp_s), setup.poses(frames)
-    for what, number in (("stamp_s", len(stamp_s)), ("cam_from_world", len(poses))):
-        if number != frames:
-            raise RecordingError(f"recording {source}: {what} of the camera is for {number} frames, expected {frames}")
-    depth_folder = root / "depth" if depth is None else Path(depth)
-    depth_m = None
-    if depth is not None or depth_folder.exists():
-        depth_m = _read_depth(depth_folder, frames, (width, height), setup.depth_scale_m)
-        _check_units(depth_m, depth_folder, setup.depth_scale_m)
-    return Clip(source.stem if source.is_file() else source.resolve().name, setup.camera, rgb, depth_m, stamp_s, poses)
+
+def _open_bag(source: Path, camera: Path | Camera | None, depth_scale_m: float | None, parts: Parts) -> FrameSource:
+    from quest.data.folder import read_setup
+    from quest.data.ros_frames import open_messages
+
+    if source.suffix.lower() == ".mcap":
+        from quest.data.mcap_file import McapMessages
+
+        messages = McapMessages(source)
+    else:
+        from quest.data.rosbag import BagMessages
+
+        messages = BagMessages(source)
+    setup = None if camera is None else read_setup(source, camera, None)
+    return open_messages(messages, parts, setup=setup, depth_scale_m=depth_scale_m)
+
+
+def _as_path(camera: str | Path | Camera | None) -> Path | Camera | None:
+    return Path(camera) if isinstance(camera, str) else camera
 
 
 def clip_from_arrays(
@@ -114,14 +153,8 @@ def clip_from_arrays(
     if (np.diff(stamps) < 0).any():
         raise InputError(f"clip {name!r}: time stamps decrease; sort the frames by time")
     if clean is not None:
-        _check_units(clean, f"clip {name!r}", 1.0)
+        check_units(clean, f"clip {name!r}", 1.0)
     return clip
-
-
-def clean_depth(depth_m: Shaped[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
-    """Depth as float32 in which 0 stands for whatever was not finite or not positive."""
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
 
 
 def write_recording(
@@ -183,107 +216,3 @@ def _write_png(path: Path, image: np.ndarray) -> None:
     done, data = cv2.imencode(".png", image)
     assert done, "OpenCV encodes 8-bit colour and 16-bit grey as PNG"
     path.write_bytes(data.tobytes())  # not imwrite: it fails silently, and on some platforms on non-ASCII paths
-
-
-def _read_colours(source: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Frames and their times; times of images follow a nominal rate of 30 a second."""
-    if source.is_file():
-        return read_video(source)
-    if (source / "rgb").is_dir():
-        folder = source / "rgb"
-    else:
-        videos = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
-        if len(videos) == 1:
-            return read_video(videos[0])
-        if len(videos) > 1:
-            found = ", ".join(video.name for video in videos)
-            raise RecordingError(f"recording {source}: expected one video, got {found}; name the video itself")
-        folder = source
-    paths = _list_images(folder, IMAGE_SUFFIXES)
-    if not paths:
-        raise RecordingError(
-            f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
-        )
-    images = [np.asarray(_open_image(path).convert("RGB")) for path in paths]
-    _check_sizes(paths, images)
-    return np.stack(images), np.arange(len(images)) / 30.0
-
-
-def _read_depth(folder: Path, frames: int, size: tuple[int, int], scale_m: float) -> np.ndarray:
-    """Depth in metres of all frames, float32, 0 where missing."""
-    if not folder.is_dir():
-        raise RecordingError(f"depth {folder}: no such folder; expected one 16-bit PNG per colour frame")
-    paths = _list_images(folder, (".png",))
-    if len(paths) != frames:
-        raise RecordingError(
-            f"depth {folder}: {len(paths)} depth images for {frames} colour frames; expected one for each, "
-            "cut the longer one or drop frames without a partner"
-        )
-    depth_m = np.empty((frames, size[1], size[0]), dtype=np.float32)
-    for t, path in enumerate(paths):
-        image = _open_image(path)
-        if image.mode not in ("I;16", "I;16B", "I"):
-            raise RecordingError(
-                f"depth image {path}: expected 16-bit grey, got mode {image.mode}; "
-                "write depth as 16-bit PNGs (millimetres, say), not as a coloured or 8-bit picture"
-            )
-        if image.size != size:
-            raise RecordingError(
-                f"depth image {path}: {image.width} x {image.height}, but colour frames are {size[0]} x {size[1]}; "
-                "align the depth to the colour camera first"
-            )
-        depth_m[t] = np.asarray(image).astype(np.float32) * np.float32(scale_m)
-    return depth_m
-
-
-def _check_units(depth_m: np.ndarray, where: Path | str, scale_m: float) -> None:
-    """Raise RecordingError if the median depth is not one that a camera sees."""
-    step = max(1, len(depth_m) // 16)
-    sample = depth_m[::step, ::2, ::2] if depth_m[0].size > 64 else depth_m
-    valid = sample[sample > 0]
-    if valid.size == 0:
-        valid = depth_m[depth_m > 0]
-    if valid.size == 0:
-        raise RecordingError(f"depth of {where}: every pixel is missing; leave the depth out to use colours only")
-    median_m = float(np.median(valid))
-    low, high = PLAUSIBLE_DEPTH_M
-    if low <= median_m <= high:
-        return
-    likely = min(_USUAL_SCALES_M, key=lambda scale: abs(np.log(median_m / scale_m * scale / _USUAL_DEPTH_M)))
-    raise RecordingError(
-        f"depth of {where}: the median is {median_m:.3g} m with depth_scale_m = {scale_m:g}, expected {low:g} to "
-        f"{high:g} m; the units are wrong, depth_scale_m = {likely:g} would give {median_m / scale_m * likely:.2f} m"
-    )
-
-
-def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
-    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
-    return sorted(paths, key=_natural)
-
-
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts frame 2 before frame 10."""
-    parts = re.split(r"(\d+)", path.stem)
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts] + [(0, 0, path.suffix)]
-
-
-def _open_image(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except UnidentifiedImageError:
-        raise RecordingError(f"image {path}: not an image; the file is torn, copy or record it again") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise RecordingError(
-            f"image {path}: cannot be decoded ({error}); the file is torn, copy or record it again"
-        ) from error
-
-
-def _check_sizes(paths: list[Path], images: list[np.ndarray]) -> None:
-    for path, image in zip(paths, images, strict=True):
-        if image.shape != images[0].shape:
-            raise RecordingError(
-                f"image {path}: {image.shape[1]} x {image.shape[0]}, but {paths[0].name} is {images[0].shape[1]} x "
-                f"{images[0].shape[0]}; all frames must be of one size"
-            )

@@ -52,7 +52,7 @@ def split_of(info: TakeInfo) -> Part:
         for part in PARTS:
             if info.object_id in split.partnet_mobility[part]:
                 return part
-    else:
+    elif info.source == "procedural":
         match = re.fullmatch(r".+-(\d+)", info.object_id)
         if match is None:
             raise ObjectError(

@@ -1,33 +1,32 @@
-"""The take store: a folder with one Zarr v3 group per take, written once and never appended to.
+"""The take store: one Zarr v3 group per take, written once and never appended to, in a folder or an object store.
 
 Chunks hold a few frames, so that a window can be read alone; shards hold up to sixty, so that a take is a few dozen
-files. Writing is atomic: everything goes to a hidden folder beside, and a rename makes it a take.
+files. Writing is atomic: a take is there as a whole or not at all (:mod:`quest.data.store_location` says how).
 """
 
 from __future__ import annotations
 
-import os
-import shutil
-import socket
-import time
-import uuid
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from quest.data.store_location import SUFFIX, Draft, LocalFolder, Location, StoreError, open_location
 from quest.data.take_format import (
+    HEADER_FILE,
     TAKE_ARRAYS,
     VIEW_ARRAYS,
     TakeHash,
     TakeHeader,
+    check_files,
     check_take,
     decode_depth,
-    list_files,
-    read_header,
+    hash_take,
+    parse_header,
     take_arrays,
 )
 from quest.errors import QuestError, TakeError
@@ -42,48 +41,65 @@ FRAMES_PER_CHUNK = 4
 FRAMES_PER_SHARD = 60
 PIXEL_ARRAYS = ("rgb", "depth", "link_id", "entity_id")
 
-_TEMPORARY = ".tmp-"
-_ABANDONED_AFTER_S = 24 * 3600.0
-
 
 class TakeStore:
-    """Takes in a folder, one ``<name>.zarr`` group each.
+    """Takes in a folder or an object store, one ``<name>.zarr`` group each.
 
     Args:
-        root: the folder; made by the first :meth:`write`.
+        root: the folder, made by the first :meth:`write`; or a URL such as ``s3://bucket/takes``, as a string.
+
+    Raises:
+        ConfigError: it is a URL that cannot be used.
+        MissingExtraError: it is in an object store and the extra ``scale`` is not installed.
     """
 
     def __init__(self, root: str | Path) -> None:
-        self.root = Path(root)
+        self._location: Location = open_location(root)
 
     def __repr__(self) -> str:
-        return f"TakeStore({str(self.root)!r})"
+        return f"TakeStore({self.url!r})"
 
     def __len__(self) -> int:
         return len(self.names())
 
     def __contains__(self, name: object) -> bool:
-        if not isinstance(name, str):
-            return False
-        try:
-            self.header(name)
-        except TakeError:
-            return False
-        return True
+        return isinstance(name, str) and isinstance(self._try_header(name), TakeHeader)
+
+    @property
+    def url(self) -> str:
+        """The folder or URL, as it was given."""
+        return self._location.url
+
+    @property
+    def root(self) -> Path:
+        """The folder; see :attr:`is_folder`.
+
+        Raises:
+            TakeError: the takes are in an object store.
+        """
+        return self._folder().folder
+
+    @property
+    def is_folder(self) -> bool:
+        """Whether the takes are in a folder, and not in an object store."""
+        return isinstance(self._location, LocalFolder)
+
+    def exists(self) -> bool:
+        """Whether the folder exists, or the object store has any take under the URL."""
+        return self._location.exists()
 
     def names(self) -> list[str]:
         """Names of the whole takes, sorted; empty if the folder does not exist. See :meth:`problems` for the others."""
-        return [name for name in self._folder_names() if name in self]
+        return list(self.headers())
+
+    def present(self, names: Iterable[str]) -> set[str]:
+        """Those of some names that are whole takes of this store."""
+        return {name for name, found in self._headers(names) if isinstance(found, TakeHeader)}
 
     def problems(self) -> dict[str, str]:
-        """What is wrong with each folder that looks like a take but cannot be read, by name."""
-        found = {}
-        for name in self._folder_names():
-            try:
-                self.header(name)
-            except TakeError as error:
-                found[name] = str(error)
-        return found
+        """What is wrong with each group that looks like a take but cannot be read, by name."""
+        found = self._headers(self._location.names())
+        return {name: str(error) for name, error in found if isinstance(error, TakeError)}
 
     def infos(self) -> dict[str, TakeInfo]:
         """Descriptions of all whole takes by name; reads no pixels."""
@@ -91,13 +107,8 @@ class TakeStore:
 
     def headers(self) -> dict[str, TakeHeader]:
         """Headers (description, number of frames, cameras, hash) of all whole takes by name; reads no pixels."""
-        found = {}
-        for name in self._folder_names():
-            try:
-                found[name] = self.header(name)
-            except TakeError:
-                continue  # reported by problems() and by read()
-        return found
+        found = self._headers(self._location.names())
+        return {name: header for name, header in found if isinstance(header, TakeHeader)}
 
     def header(self, name: str) -> TakeHeader:
         """Description, number of frames, cameras and hash of one take; reads no pixels.
@@ -105,13 +116,22 @@ class TakeStore:
         Raises:
             TakeError: the take is missing, torn, or of another format version.
         """
-        return read_header(self.path(name))
+        _check_name(name)
+        where, data = self._location.describe(name), self._location.header(name)
+        if data is None and not self._location.is_there(name):
+            raise TakeError(f"take {name!r}: no folder {where}; check the name, or generate the take")
+        header = parse_header(name, where, data)
+        check_files(name, where, header.files, self._location.sizes(name, header.files))
+        return header
 
     def path(self, name: str) -> Path:
-        """Folder of a take, there or not."""
-        if not name or name.startswith(".") or "/" in name or "\\" in name:
-            raise TakeError(f"take {name!r}: a name must not be empty, start with a dot or contain a slash")
-        return self.root / f"{name}.zarr"
+        """Folder of a take, there or not.
+
+        Raises:
+            TakeError: the name cannot be one, or the takes are in an object store.
+        """
+        _check_name(name)
+        return self._folder().path(name)
 
     def data_hash(self, name: str) -> str:
         """SHA-256 over the take's arrays and its description without provenance, as recorded when it was written."""
@@ -130,7 +150,7 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with _opened(self.path(name)) as group:
+        with self._opened(name, header) as group:
             arrays = {
                 key: _read_array(group, key, rows).astype(dtype, copy=False) for key, dtype in TAKE_ARRAYS.items()
             }
@@ -146,7 +166,7 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with _opened(self.path(name)) as group:
+        with self._opened(name, header) as group:
             return _read_view(group, name, header, view, rows, _read_array(group, "stamp_s", rows))
 
     def read_clip(self, name: str, view: int = 0, *, frames: slice | None = None) -> Clip:
@@ -157,7 +177,7 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with _opened(self.path(name)) as group:
+        with self._opened(name, header) as group:
             return _read_clip(group, name, header, view, rows, _read_array(group, "stamp_s", rows))
 
     def verify(self, name: str) -> None:
@@ -168,7 +188,7 @@ class TakeStore:
         """
         take = self.read(name)
         recorded = self.data_hash(name)
-        found = _hash(take)
+        found = hash_take(take)
         if found != recorded:
             raise TakeError(
                 f"take {name!r}: its arrays have hash {found[:12]}, recorded is {recorded[:12]}; a file was altered, "
@@ -185,45 +205,82 @@ class TakeStore:
             TakeError: the store has a take of that name.
         """
         check_take(take)
-        target = self.path(take.info.name)
-        if target.exists():
+        name = take.info.name
+        _check_name(name)
+        if not self._location.may_write(name):
             raise TakeError(
-                f"take {take.info.name!r}: {target} exists and takes are written once; delete it or choose another name"
+                f"take {name!r}: {self._location.describe(name)} exists and takes are written once; delete it or "
+                "choose another name"
             )
-        self.root.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(self.root)
-        temporary = self.root / f"{_TEMPORARY}{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
-        try:
-            _write_group(take, temporary)
-            _sync(temporary)
-            try:
-                temporary.rename(target)
-            except OSError as error:
-                if target.exists():  # another process was faster
-                    raise TakeError(
-                        f"take {take.info.name!r}: {target} was written by another process meanwhile"
-                    ) from error
-                raise
-            _sync_folder(self.root)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
+        with self._location.draft(name) as draft:
+            _write_take(take, draft)
 
-    def _folder_names(self) -> list[str]:
-        if not self.root.is_dir():
-            return []
-        return sorted(p.name.removesuffix(".zarr") for p in self.root.glob("*.zarr") if p.is_dir() and p.name[0] != ".")
+    def _folder(self) -> LocalFolder:
+        if not isinstance(self._location, LocalFolder):
+            raise TakeError(f"store {self.url}: expected a folder of takes, and this is an object store")
+        return self._location
+
+    def _headers(self, names: Iterable[str]) -> list[tuple[str, TakeHeader | TakeError]]:
+        chosen = list(names)
+        if self._location.parallel == 1 or len(chosen) < 2:
+            return [(name, self._try_header(name)) for name in chosen]
+        with ThreadPoolExecutor(self._location.parallel) as pool:
+            return list(zip(chosen, pool.map(self._try_header, chosen), strict=True))
+
+    def _try_header(self, name: str) -> TakeHeader | TakeError:
+        try:
+            return self.header(name)
+        except StoreError:
+            raise
+        except TakeError as error:
+            return error
+
+    @contextmanager
+    def _opened(self, name: str, header: TakeHeader) -> Iterator[zarr.Group]:
+        """The open group; damage that only decoding shows becomes a TakeError."""
+        import zarr
+
+        where = self._location.describe(name)
+        with self._location.reaching():
+            store, path = self._location.zarr_group(name, header.arrays_at)
+            try:
+                yield zarr.open_group(store, path=path, mode="r", zarr_format=3, use_consolidated=False)
+            except (QuestError, PermissionError):
+                raise
+            except (KeyError, ValueError, RuntimeError, OSError, TypeError, zlib.error) as error:
+                raise TakeError(
+                    f"take {name!r}: {where} is torn, an array cannot be decoded ({type(error).__name__}: {error}); "
+                    "delete its folder and generate it again"
+                ) from error
+
+
+def locate_take(path: str | Path) -> tuple[TakeStore, str]:
+    """Store and name of the take that a folder or URL (``STORE/NAME.zarr``) names, there or not.
+
+    Raises:
+        TakeError: it does not end like the folder of a take.
+    """
+    parent, _, last = str(path).replace("\\", "/").rstrip("/").rpartition("/")
+    if not last.endswith(SUFFIX):
+        raise TakeError(f"take {last!r}: expected a folder <name>{SUFFIX}, got {path}")
+    if isinstance(path, Path) or "://" not in parent:
+        return TakeStore(Path(path).parent), last.removesuffix(SUFFIX)
+    return TakeStore(parent), last.removesuffix(SUFFIX)
 
 
 def open_clip(path: str | Path, *, view: int = 0, frames: slice | None = None) -> Clip:
-    """The clip of one view of a take, by the take's folder (``store/take.zarr``).
+    """The clip of one view of a take, by the take's folder or URL (``store/take.zarr``).
 
     Raises:
         TakeError: the take is missing, torn or of another format version, or has no such view or frame.
     """
-    folder = Path(path)
-    if folder.suffix != ".zarr":
-        raise TakeError(f"take {folder.name!r}: expected a folder <name>.zarr, got {folder}")
-    return TakeStore(folder.parent).read_clip(folder.name.removesuffix(".zarr"), view, frames=frames)
+    store, name = locate_take(path)
+    return store.read_clip(name, view, frames=frames)
+
+
+def _check_name(name: str) -> None:
+    if not name or name.startswith(".") or "/" in name or "\\" in name:
+        raise TakeError(f"take {name!r}: a name must not be empty, start with a dot or contain a slash")
 
 
 def _frames(name: str, header: TakeHeader, frames: slice | None) -> slice:
@@ -234,22 +291,6 @@ def _frames(name: str, header: TakeHeader, frames: slice | None) -> slice:
             f"take {name!r}: {rows} picks no frame, or runs backwards; it has frames 0 to {header.frames - 1}"
         )
     return slice(picked.start, picked.stop, picked.step)
-
-
-@contextmanager
-def _opened(folder: Path) -> Iterator[zarr.Group]:
-    """The open group; damage that only decoding shows becomes a TakeError."""
-    import zarr
-
-    try:
-        yield zarr.open_group(str(folder), mode="r", zarr_format=3, use_consolidated=False)
-    except QuestError:
-        raise
-    except (KeyError, ValueError, RuntimeError, OSError, TypeError, zlib.error) as error:
-        raise TakeError(
-            f"take {folder.stem!r}: {folder} is torn, an array cannot be decoded ({type(error).__name__}: {error}); "
-            "delete its folder and generate it again"
-        ) from error
 
 
 def _read_array(group: zarr.Group, path: str, rows: slice) -> np.ndarray:
@@ -275,37 +316,43 @@ def _read_view(group: zarr.Group, name: str, header: TakeHeader, view: int, rows
     return View(clip=clip, **{key: _read_array(group, f"view_{view}/{key}", rows) for key in VIEW_ARRAYS})
 
 
-def _hash(take: Take) -> str:
-    digest = TakeHash(take.info, tuple(view.clip.camera for view in take.views))
+def _write_take(take: Take, draft: Draft) -> None:
+    """Write all files of a take, the header last."""
+    cameras = tuple(view.clip.camera for view in take.views)
+    digest = TakeHash(take.info, cameras)
+    files: dict[str, int] = {}
+
+    def add(path: str, data: bytes | memoryview) -> None:
+        place = f"{draft.arrays_at}/{path}" if draft.arrays_at else path
+        if place != HEADER_FILE and place not in files:  # every array brings the groups that it lies in
+            files[place] = len(data)
+            draft.add(place, data)
+
     for path, array in take_arrays(take):
         digest.add(path, array)
-    return digest.hexdigest()
-
-
-def _write_group(take: Take, folder: Path) -> None:
-    import zarr
-
-    digest = TakeHash(take.info, tuple(view.clip.camera for view in take.views))
-    group = zarr.create_group(str(folder), zarr_format=3)
-    for path, array in take_arrays(take):
-        digest.add(path, array)
-        _write_array(group, path, array)
+        for file, data in _encode_array(path, array):
+            add(file, data)
     header = TakeHeader(
         info=take.info,
         frames=len(take),
-        cameras=tuple(view.clip.camera for view in take.views),
+        cameras=cameras,
         clip_names=tuple(view.clip.name for view in take.views),
         has_depth=tuple(view.clip.depth_m is not None for view in take.views),
         data_hash=digest.hexdigest(),
-        files=list_files(folder),
+        files=dict(sorted(files.items())),
+        arrays_at=draft.arrays_at,
     )
-    group.update_attributes(header.to_attributes())
+    draft.commit(header.to_json())
 
 
-def _write_array(group: zarr.Group, path: str, array: np.ndarray) -> None:
+def _encode_array(path: str, array: np.ndarray) -> Iterator[tuple[str, memoryview]]:
+    """Files of an array by path in the group, a shard at a time."""
+    import zarr
     from zarr.codecs import BloscCodec, Crc32cCodec
+    from zarr.storage import MemoryStore
 
     frames = len(array)
+    shard = frames
     options: dict[str, Any] = {"chunks": array.shape}
     if path.rpartition("/")[2] in PIXEL_ARRAYS:
         chunk = min(FRAMES_PER_CHUNK, frames)
@@ -313,8 +360,10 @@ def _write_array(group: zarr.Group, path: str, array: np.ndarray) -> None:
         options = {"chunks": (chunk, *array.shape[1:]), "shards": (shard, *array.shape[1:])}
     options["chunks"] = tuple(max(1, n) for n in options["chunks"])  # a take without joints has empty arrays
     compressor = BloscCodec(cname="zstd", clevel=1, shuffle="shuffle", typesize=array.itemsize)
-    stored = group.create_array(
-        path,
+    files: dict[str, Any] = {}
+    stored = zarr.create_array(
+        MemoryStore(files),
+        name=path,
         shape=array.shape,
         dtype=array.dtype,
         compressors=[compressor, Crc32cCodec()],
@@ -322,51 +371,8 @@ def _write_array(group: zarr.Group, path: str, array: np.ndarray) -> None:
         config={"write_empty_chunks": True},
         **options,
     )
-    stored[...] = array
-
-
-def _remove_abandoned(root: Path) -> None:
-    """Remove what killed writers left behind, but not what living ones are writing."""
-    for folder in root.glob(f"{_TEMPORARY}*"):
-        host, _, rest = folder.name.removeprefix(_TEMPORARY).rpartition("-")[0].rpartition("-")
-        ours = host == socket.gethostname() and rest.isdecimal()
-        try:
-            age_s = time.time() - folder.stat().st_mtime
-        except FileNotFoundError:  # its writer has just finished
-            continue
-        if (ours and not _is_running(int(rest))) or age_s > _ABANDONED_AFTER_S:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
-def _is_running(pid: int) -> bool:
-    if os.name != "posix":  # signal 0 would be delivered as an interrupt there; age decides instead
-        return True
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _sync(folder: Path) -> None:
-    """Force every file and folder under ``folder`` to the disk, so that the rename cannot come first."""
-    for parent, _, files in os.walk(folder):
-        for file in files:
-            descriptor = os.open(Path(parent) / file, os.O_RDWR)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        _sync_folder(Path(parent))
-
-
-def _sync_folder(folder: Path) -> None:
-    if os.name != "posix":  # folders cannot be opened there
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    for start in range(0, frames, shard):
+        rows = slice(start, start + shard)
+        stored[rows] = array[rows]
+        for file in list(files):
+            yield file, memoryview(files.pop(file).as_numpy_array())

@@ -1,7 +1,8 @@
 """What a take looks like on disk: its description as JSON, its arrays, and how to tell that it is whole.
 
 A take is one Zarr v3 group. The group's attributes (:class:`TakeHeader`) are written last and list every file of the
-group with its size, so that a missing or truncated file is noticed without reading any pixel.
+group with its size, so that a missing or truncated file is noticed without reading any pixel. In a folder the arrays
+lie directly in the group; in an object store they lie in a subgroup that the attribute ``arrays_at`` names.
 """
 
 from __future__ import annotations
@@ -10,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,8 @@ from quest.errors import InputError, TakeError
 from quest.types import Camera, Entity, Joint, Take, TakeInfo
 
 FORMAT = "quest-take"
-VERSION = 1
+VERSIONS = (1, 2)
+"""Versions that are read: 1 has its arrays directly in the group, 2 in a subgroup."""
 DEPTH_SCALE_M = 1e-4
 """Metres per stored unit of depth; 16 bits reach 6.5535 m."""
 
@@ -50,6 +51,7 @@ class TakeHeader:
         has_depth: whether each view carries depth.
         data_hash: digest of arrays and description, see :func:`hash_take`.
         files: size in bytes of every file of the group but the header itself, by relative path.
+        arrays_at: subgroup that holds the arrays; empty where they lie directly in the group.
     """
 
     info: TakeInfo
@@ -59,12 +61,13 @@ class TakeHeader:
     has_depth: tuple[bool, ...]
     data_hash: str
     files: Mapping[str, int]
+    arrays_at: str = ""
 
     def to_attributes(self) -> dict[str, Any]:
         """JSON-serialisable attributes of the group."""
         return {
             "format": FORMAT,
-            "version": VERSION,
+            "version": 2 if self.arrays_at else 1,
             "depth_scale_m": DEPTH_SCALE_M,
             "info": asdict(self.info),
             "frames": self.frames,
@@ -74,7 +77,13 @@ class TakeHeader:
             ],
             "data_hash": self.data_hash,
             "files": dict(self.files),
+            **({"arrays_at": self.arrays_at} if self.arrays_at else {}),
         }
+
+    def to_json(self) -> bytes:
+        """The file :data:`HEADER_FILE` of the group."""
+        group = {"attributes": self.to_attributes(), "zarr_format": 3, "node_type": "group"}
+        return json.dumps(group, indent=2).encode()
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any]) -> TakeHeader:
@@ -87,7 +96,8 @@ class TakeHeader:
             clip_names=tuple(view["name"] for view in views),
             has_depth=tuple(bool(view["has_depth"]) for view in views),
             data_hash=attributes["data_hash"],
-            files=attributes["files"],
+            files={str(path): int(size) for path, size in attributes["files"].items()},
+            arrays_at=attributes.get("arrays_at", ""),
         )
 
 
@@ -103,57 +113,52 @@ def info_from_json(fields: Mapping[str, Any]) -> TakeInfo:
     )
 
 
-def read_header(folder: Path) -> TakeHeader:
-    """Header of the take in ``folder``, after checking that every file it lists is there in full.
+def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
+    """Header of a take from its file.
+
+    Args:
+        name: name of the take.
+        where: the take's folder or URL, for messages.
+        data: content of :data:`HEADER_FILE`; None if there is no such file.
 
     Raises:
-        TakeError: there is no take, it is of another format version, or it is torn.
+        TakeError: the file is missing or damaged, or is that of another group or format version.
     """
-    name = folder.name.removesuffix(".zarr")
-    if not folder.is_dir():
-        raise TakeError(f"take {name!r}: no folder {folder}; check the name, or generate the take")
+    if data is None:
+        raise TakeError(f"take {name!r}: {where} holds no {HEADER_FILE}, so it is torn or not a take; {REMEDY}")
     try:
-        attributes = json.loads((folder / HEADER_FILE).read_text(encoding="utf-8"))["attributes"]
-    except FileNotFoundError:
-        raise TakeError(
-            f"take {name!r}: {folder} holds no {HEADER_FILE}, so it is torn or not a take; {REMEDY}"
-        ) from None
+        attributes = json.loads(data)["attributes"]
     except (ValueError, KeyError, TypeError) as error:
-        raise TakeError(f"take {name!r}: {folder / HEADER_FILE} cannot be read ({error}); {REMEDY}") from error
+        raise TakeError(f"take {name!r}: {where}/{HEADER_FILE} cannot be read ({error}); {REMEDY}") from error
     if not isinstance(attributes, dict) or attributes.get("format") != FORMAT:
         raise TakeError(
-            f"take {name!r}: {folder} is a Zarr group but not a take (no format {FORMAT!r}); give a take's folder"
+            f"take {name!r}: {where} is a Zarr group but not a take (no format {FORMAT!r}); give a take's folder"
         )
-    if attributes.get("version") != VERSION:
+    if attributes.get("version") not in VERSIONS:
         raise TakeError(
-            f"take {name!r}: {folder} has format version {attributes.get('version')!r}, expected {VERSION}; "
-            "generate it again, or use the version of quest that wrote it"
+            f"take {name!r}: {where} has format version {attributes.get('version')!r}, expected "
+            f"{' or '.join(map(str, VERSIONS))}; generate it again, or use the version of quest that wrote it"
         )
     try:
-        header = TakeHeader.from_attributes(attributes)
-    except (KeyError, TypeError, ValueError) as error:
-        raise TakeError(f"take {name!r}: {folder / HEADER_FILE} is damaged ({error!r}); {REMEDY}") from error
-    check_files(folder, header.files)
-    return header
+        return TakeHeader.from_attributes(attributes)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise TakeError(f"take {name!r}: {where}/{HEADER_FILE} is damaged ({error!r}); {REMEDY}") from error
 
 
-def list_files(folder: Path) -> dict[str, int]:
-    """Size in bytes of every file under ``folder`` but the group's own header, by relative path."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file() and path != folder / HEADER_FILE)
-    return {path.relative_to(folder).as_posix(): path.stat().st_size for path in paths}
+def check_files(name: str, where: str, files: Mapping[str, int], found: Mapping[str, int]) -> None:
+    """Raise TakeError unless every listed file is there with its listed size.
 
-
-def check_files(folder: Path, files: Mapping[str, int]) -> None:
-    """Raise TakeError unless every listed file is in ``folder`` with its listed size."""
+    Args:
+        name: name of the take.
+        where: the take's folder or URL, for messages.
+        files: sizes that the header lists, by relative path.
+        found: sizes of the files that are there.
+    """
     for path, size in files.items():
-        try:
-            found = (folder / path).stat().st_size
-        except (FileNotFoundError, NotADirectoryError):
-            raise TakeError(f"take {folder.stem!r} is torn: {folder / path} is missing; {REMEDY}") from None
-        if found != size:
-            raise TakeError(
-                f"take {folder.stem!r} is torn: {folder / path} has {found} bytes, expected {size}; {REMEDY}"
-            )
+        if path not in found:
+            raise TakeError(f"take {name!r} is torn: {where}/{path} is missing; {REMEDY}")
+        if found[path] != size:
+            raise TakeError(f"take {name!r} is torn: {where}/{path} has {found[path]} bytes, expected {size}; {REMEDY}")
 
 
 def encode_depth(depth_m: np.ndarray) -> np.ndarray:
@@ -205,6 +210,14 @@ class TakeHash:
     def hexdigest(self) -> str:
         """The digest of what was added so far."""
         return self._digest.hexdigest()
+
+
+def hash_take(take: Take) -> str:
+    """Digest of a take as it is stored."""
+    digest = TakeHash(take.info, tuple(view.clip.camera for view in take.views))
+    for path, array in take_arrays(take):
+        digest.add(path, array)
+    return digest.hexdigest()
 
 
 def check_take(take: Take) -> None:

@@ -1,15 +1,19 @@
-"""Video files: decoding to RGB frames, and writing H.264."""
+"""Video files: decoding frame by frame, and writing H.264."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 
 import av
 import av.error
 import numpy as np
-from jaxtyping import Float, UInt8
+from av.container import InputContainer
+from av.video.stream import VideoStream
+from jaxtyping import Float, Shaped, UInt8, UInt16
 
 from quest.errors import InputError, RecordingError
 
@@ -17,49 +21,114 @@ SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v")
 """Suffixes by which a video is recognised in a folder; any other that FFmpeg knows can be named explicitly."""
 
 
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's header says.
+
+    Attributes:
+        width: pixels.
+        height: pixels.
+        frames: number of frames that it declares; 0 where it does not tell.
+        frames_per_s: nominal frame rate.
+    """
+
+    width: int
+    height: int
+    frames: int
+    frames_per_s: float
+
+
+def probe_video(path: Path) -> VideoInfo:
+    """The header of a video.
+
+    Raises:
+        RecordingError: there is no such file, or it is not a video.
+    """
+    with _open(path) as container:
+        stream = container.streams.video[0]
+        return VideoInfo(stream.width, stream.height, stream.frames, float(stream.average_rate or 30))
+
+
+def play_video(
+    path: Path, *, pixel_format: str = "rgb24", start_s: float = 0.0, end_s: float | None = None
+) -> Iterator[tuple[Shaped[np.ndarray, "H W *C"], float]]:
+    """Frames of a video one by one, with their time in seconds from the first frame of the file.
+
+    Args:
+        path: the file.
+        pixel_format: what FFmpeg calls the format to convert to: ``rgb24``, or ``gray12le`` for 12 bits in 16.
+        start_s: frames before are left out.
+        end_s: frames from there on are left out; None plays to the end, which must be where the file says.
+
+    Raises:
+        RecordingError: there is no such file, it cannot be decoded, has no frames, changes its size, or ends early.
+    """
+    number, shape, before = 0, None, -np.inf
+    with _open(path) as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "AUTO"
+        rate = float(stream.average_rate or 30)
+        origin = float((stream.start_time or 0) * stream.time_base) if stream.time_base else 0.0
+        if start_s > 0 and stream.time_base:
+            container.seek(int((origin + start_s) / stream.time_base), stream=stream, backward=True)
+        try:
+            for frame in container.decode(stream):
+                # Some containers keep no times, or times that run backwards: the nominal rate goes on instead.
+                time_s = frame.time - origin if frame.time is not None else before + 1 / rate
+                if time_s < before or time_s == -np.inf:
+                    time_s = 0.0 if before == -np.inf else before + 1 / rate
+                before = time_s
+                if time_s < start_s:
+                    continue
+                if end_s is not None and time_s >= end_s:
+                    return
+                image = frame.to_ndarray(format=pixel_format)
+                if shape is not None and image.shape != shape:
+                    raise RecordingError(
+                        f"video {path}: the frame size changes within the video; split it or scale it to one size"
+                    )
+                shape, number = image.shape, number + 1
+                yield image, time_s
+        except av.error.FFmpegError as error:
+            where = f"after {number} frames" if number else "at all"
+            raise RecordingError(
+                f"video {path}: cannot be decoded {where} ({error.strerror}); "
+                "the file is torn or not a video, copy or record it again"
+            ) from error
+        if number == 0:
+            raise RecordingError(f"video {path}: expected at least one frame, got none; record it again")
+        if start_s == 0 and end_s is None and number < stream.frames - 2:  # a frame or two may never be shown
+            raise RecordingError(
+                f"video {path}: ends after {number} of {stream.frames} frames; the file is torn, "
+                "copy or record it again"
+            )
+
+
 def read_video(path: Path) -> tuple[UInt8[np.ndarray, "T H W 3"], Float[np.ndarray, " T"]]:
     """All frames of a video as RGB, and their times in seconds from the first.
 
     Raises:
-        RecordingError: there is no such file, it cannot be decoded, has no frames, or ends early.
+        RecordingError: as :func:`play_video`.
     """
+    frames, stamps = zip(*play_video(path), strict=True)
+    return np.stack(frames), np.array(stamps, dtype=np.float64) - stamps[0]
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[InputContainer]:
     if not path.is_file():
         raise RecordingError(f"video {path}: no such file; check the path")
-    frames, stamps = [], []
     try:
-        with av.open(str(path)) as container:
-            if not container.streams.video:
-                raise RecordingError(f"video {path}: the file has no video stream; give a video of RGB frames")
-            stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            declared, rate = stream.frames, stream.average_rate
-            for frame in container.decode(stream):
-                frames.append(frame.to_ndarray(format="rgb24"))
-                stamps.append(frame.time)
+        container = av.open(str(path))
     except av.error.FFmpegError as error:
-        where = f"after {len(frames)} frames" if frames else "at all"
         raise RecordingError(
-            f"video {path}: cannot be decoded {where} ({error.strerror}); "
+            f"video {path}: cannot be decoded at all ({error.strerror}); "
             "the file is torn or not a video, copy or record it again"
         ) from error
-    if not frames:
-        raise RecordingError(f"video {path}: expected at least one frame, got none; record it again")
-    if len(frames) < declared - 2:  # containers may count a frame or two that are never shown
-        raise RecordingError(
-            f"video {path}: ends after {len(frames)} of {declared} frames; the file is torn, copy or record it again"
-        )
-    if len({frame.shape for frame in frames}) > 1:
-        raise RecordingError(f"video {path}: the frame size changes within the video; split it or scale it to one size")
-    return np.stack(frames), _stamps(stamps, rate)
-
-
-def _stamps(stamps: list[float | None], rate: Fraction | None) -> np.ndarray:
-    """Presentation times from the first frame; the nominal rate where there are none or they run backwards."""
-    if None not in stamps:
-        seconds = np.array(stamps, dtype=np.float64)
-        if (np.diff(seconds) >= 0).all():
-            return seconds - seconds[0]
-    return np.arange(len(stamps)) / float(rate or 30)
+    with container:
+        if not container.streams.video:
+            raise RecordingError(f"video {path}: the file has no video stream; give a video of RGB frames")
+        yield container
 
 
 def write_video(
@@ -69,6 +138,7 @@ def write_video(
     frames_per_s: float | int,
     crf: int = 18,
     preset: str = "veryfast",
+    keyframe_every: int | None = None,
 ) -> int:
     """Write RGB frames as H.264 (yuv420p, or yuv444p where a side is odd), all or nothing; returns their number.
 
@@ -78,28 +148,71 @@ def write_video(
         frames_per_s: frame rate.
         crf: x264's constant rate factor: 18 looks lossless, 23 is small.
         preset: x264's speed preset.
+        keyframe_every: frames from one that stands alone to the next; few make random access fast and the file large.
 
     Raises:
         InputError: no frames came, or frames of different sizes.
     """
+    options = {"crf": str(crf), "preset": preset}
+    options |= {} if keyframe_every is None else {"g": str(keyframe_every)}
+    return _encode(path, frames, frames_per_s, _Codec("libx264", options, "rgb24", "yuv420p", "yuv444p"))
+
+
+def write_depth_video(
+    path: Path, codes: Iterable[UInt16[np.ndarray, "H W"]], *, frames_per_s: float | int, preset: str = "ultrafast"
+) -> int:
+    """Write pictures of twelve bits as HEVC without loss, all or nothing; returns their number.
+
+    Args:
+        path: file to write; replaced if it exists.
+        codes: pictures of one size, 0 to 4095.
+        frames_per_s: frame rate.
+        preset: x265's speed preset.
+
+    Raises:
+        InputError: no pictures came, or pictures of different sizes.
+    """
+    options = {"x265-params": "lossless=1:log-level=error", "preset": preset}
+    return _encode(path, codes, frames_per_s, _Codec("libx265", options, "gray12le", "gray12le", "gray12le"))
+
+
+@dataclass(frozen=True)
+class _Codec:
+    """How pictures become a video.
+
+    Attributes:
+        encoder: FFmpeg's name.
+        options: of the encoder.
+        source: format of the pictures as they come.
+        even: format in the file.
+        odd: format in the file where a side is odd.
+    """
+
+    encoder: str
+    options: dict[str, str]
+    source: str
+    even: str
+    odd: str
+
+
+def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec: _Codec) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     written, size = 0, None
     try:
         with av.open(str(partial), "w") as container:
-            stream = container.add_stream(
-                "libx264",
-                rate=Fraction(float(frames_per_s)).limit_denominator(1001),
-                options={"crf": str(crf), "preset": preset},
-            )
+            rate = Fraction(float(frames_per_s)).limit_denominator(1001)
+            stream = container.add_stream(codec.encoder, rate=rate, options=codec.options)
+            assert isinstance(stream, VideoStream), codec.encoder
             for frame in frames:
                 if size is None:
                     size = frame.shape
                     stream.height, stream.width = size[:2]
-                    stream.pix_fmt = "yuv444p" if size[0] % 2 or size[1] % 2 else "yuv420p"
+                    stream.pix_fmt = codec.odd if size[0] % 2 or size[1] % 2 else codec.even
                 if frame.shape != size:
                     raise InputError(f"video {path}: frame {written} is of shape {frame.shape}, the first was {size}")
-                container.mux(stream.encode(av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")))
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=codec.source)
+                container.mux(stream.encode(picture))
                 written += 1
             if written:
                 container.mux(stream.encode(None))

@@ -1,0 +1,203 @@
+"""Recordings as folders: images or a video, 16-bit depth images, and a camera file; read frame by frame."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from PIL import Image, UnidentifiedImageError
+
+from quest.data.camera_file import CameraFile, check_depth_scale, read_camera
+from quest.data.frame_source import FrameSource
+from quest.data.registration import Rig
+from quest.data.video import SUFFIXES, play_video, probe_video
+from quest.errors import RecordingError
+from quest.types import Camera, Frame
+
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+
+
+@dataclass(frozen=True)
+class _Colours:
+    """Where the colours come from: images in order, or a video.
+
+    Attributes:
+        images: paths; empty for a video.
+        video: its path; None for images.
+        number: of frames; for a video what its header says.
+        size: width and height.
+    """
+
+    images: tuple[Path, ...]
+    video: Path | None
+    number: int | None
+    size: tuple[int, int]
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, float]]:
+        """Pictures and their times; those of images follow a nominal rate of 30 a second."""
+        if self.video is not None:
+            yield from play_video(self.video)
+            return
+        for t, path in enumerate(self.images):
+            image = _open_image(path)
+            if image.size != self.size:
+                raise RecordingError(
+                    f"image {path}: {image.width} x {image.height}, but {self.images[0].name} is {self.size[0]} x "
+                    f"{self.size[1]}; all frames must be of one size"
+                )
+            yield np.asarray(image.convert("RGB")), t / 30.0
+
+
+def open_folder(
+    source: Path,
+    *,
+    depth: Path | None = None,
+    camera: Path | Camera | None = None,
+    depth_scale_m: float | int | None = None,
+) -> FrameSource:
+    """A recording folder, a folder of images or a video, as :func:`quest.data.recording.open_recording` describes it.
+
+    Raises:
+        RecordingError: something is missing, empty or inconsistent.
+    """
+    root = source if source.is_dir() else source.parent
+    setup = read_setup(source, camera or root / "camera.json", depth_scale_m)
+    colours = _find_colours(source)
+    if colours.size != (setup.camera.width, setup.camera.height):
+        raise RecordingError(
+            f"recording {source}: frames are {colours.size[0]} x {colours.size[1]} but the camera is for "
+            f"{setup.camera.width} x {setup.camera.height}; give the intrinsics of these frames in the camera file"
+        )
+    if colours.video is None:
+        assert colours.number is not None
+        _check_numbers(source, setup, colours.number)
+    folder = root / "depth" if depth is None else depth
+    depths = None
+    if depth is not None or folder.exists():
+        depths = _list_depth(folder)
+        if colours.video is None:
+            _check_depth_number(folder, len(depths), len(colours.images))
+        if not depths:
+            _check_depth_number(folder, 0, colours.number or 0)
+    return FrameSource(
+        source.stem if source.is_file() else source.resolve().name,
+        setup.camera,
+        lambda: _frames(source, setup, colours, depths, folder),
+        length=colours.number,
+        exact=colours.video is None,
+        units=(str(folder), setup.depth_scale_m),
+    )
+
+
+def read_setup(source: Path, camera: Path | Camera, depth_scale_m: float | int | None) -> CameraFile:
+    """The camera of a recording, from its file or from intrinsics, and with another depth scale if one is given.
+
+    Raises:
+        RecordingError: the file is missing or makes no sense, or the scale is no positive number.
+    """
+    setup = CameraFile(camera) if isinstance(camera, Camera) else read_camera(Path(camera))
+    if depth_scale_m is None:
+        return setup
+    try:
+        return replace(setup, depth_scale_m=check_depth_scale(depth_scale_m))
+    except ValueError as error:
+        raise RecordingError(f"recording {source}: {error}") from error
+
+
+def _find_colours(source: Path) -> _Colours:
+    videos = [source] if source.is_file() else []
+    if not videos and not (source / "rgb").is_dir():
+        videos = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        if len(videos) > 1:
+            found = ", ".join(video.name for video in videos)
+            raise RecordingError(f"recording {source}: expected one video, got {found}; name the video itself")
+    if videos:
+        info = probe_video(videos[0])
+        return _Colours((), videos[0], info.frames or None, (info.width, info.height))
+    folder = source / "rgb" if (source / "rgb").is_dir() else source
+    paths = _list_images(folder, IMAGE_SUFFIXES)
+    if not paths:
+        raise RecordingError(
+            f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
+        )
+    return _Colours(tuple(paths), None, len(paths), _open_image(paths[0]).size)
+
+
+def _frames(
+    source: Path, setup: CameraFile, colours: _Colours, depths: list[Path] | None, folder: Path
+) -> Iterator[Frame]:
+    rig, number, first_s = setup.rig, 0, 0.0
+    known = [length for _, length in setup.lengths] + ([] if depths is None else [len(depths)])
+    for t, (rgb, time_s) in enumerate(colours):
+        number, first_s = t + 1, time_s if t == 0 else first_s
+        if known and t >= min(known):
+            continue  # only counted, so that the message can say how many there are
+        depth_m = None if depths is None else rig.depth(_read_depth(depths[t], rig, setup.depth_scale_m))
+        yield Frame(rig.rgb(rgb), depth_m, setup.stamp(t, fallback_s=time_s - first_s), setup.pose(t))
+    _check_numbers(source, setup, number)
+    if depths is not None:
+        _check_depth_number(folder, len(depths), number)
+
+
+def _check_numbers(source: Path, setup: CameraFile, frames: int) -> None:
+    for what, number in setup.lengths:
+        if number != frames:
+            raise RecordingError(f"recording {source}: {what} of the camera is for {number} frames, expected {frames}")
+
+
+def _check_depth_number(folder: Path, depths: int, frames: int) -> None:
+    if depths != frames:
+        raise RecordingError(
+            f"depth {folder}: {depths} depth images for {frames} colour frames; expected one for each, "
+            "cut the longer one or drop frames without a partner"
+        )
+
+
+def _list_depth(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise RecordingError(f"depth {folder}: no such folder; expected one 16-bit PNG per colour frame")
+    return _list_images(folder, (".png",))
+
+
+def _read_depth(path: Path, rig: Rig, scale_m: float) -> np.ndarray:
+    """Depth in metres of one image, float32, 0 where missing."""
+    image = _open_image(path)
+    if image.mode not in ("I;16", "I;16B", "I"):
+        raise RecordingError(
+            f"depth image {path}: expected 16-bit grey, got mode {image.mode}; "
+            "write depth as 16-bit PNGs (millimetres, say), not as a coloured or 8-bit picture"
+        )
+    size, whose = rig.depth_grid, "colour frames are" if rig.depth_camera is None else "depth_camera is for"
+    if image.size != (size.width, size.height):
+        raise RecordingError(
+            f"depth image {path}: {image.width} x {image.height}, but {whose} {size.width} x {size.height}; align "
+            "the depth to the colour camera first, or give depth_camera and colour_from_depth in the camera file"
+        )
+    return np.asarray(image).astype(np.float32) * np.float32(scale_m)
+
+
+def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
+    return sorted(paths, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, int, str]]:
+    """Sorts frame 2 before frame 10."""
+    parts = re.split(r"(\d+)", path.stem)
+    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts] + [(0, 0, path.suffix)]
+
+
+def _open_image(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except UnidentifiedImageError:
+        raise RecordingError(f"image {path}: not an image; the file is torn, copy or record it again") from None
+    except (OSError, SyntaxError, ValueError) as error:
+        raise RecordingError(
+            f"image {path}: cannot be decoded ({error}); the file is torn, copy or record it again"
+        ) from error

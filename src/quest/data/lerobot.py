@@ -1,0 +1,340 @@
+"""Episodes of LeRobot v3 datasets as RGB-D recordings.
+
+A dataset is a folder of ``meta/info.json`` (features and where files lie), ``meta/episodes/`` (which file and which
+seconds of a video belong to an episode), ``data/`` (one row per frame) and ``videos/``. It has no place for
+intrinsics: give a camera file, or read what :mod:`quest.data.lerobot_export` wrote.
+
+Reference: lerobot 0.6.2, ``lerobot/datasets`` (``dataset_metadata.py``, ``dataset_reader.py``, ``depth_utils.py``).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from jaxtyping import Float32, UInt16
+from PIL import Image, UnidentifiedImageError
+
+from quest.data.camera_file import CameraFile
+from quest.data.folder import read_setup
+from quest.data.frame_source import FrameSource, Notes, clean_depth
+from quest.data.video import play_video
+from quest.errors import InputError, RecordingError
+from quest.types import Camera, Frame
+
+VERSION = "v3.0"
+CAMERA_KEY = "quest.camera"
+"""Where in a feature's ``info`` this project keeps intrinsics; other readers pass over it."""
+POSE, STAMP = "observation.cam_from_world", "observation.stamp_s"
+DEPTH_CODES = 4095
+"""Depth videos have twelve bits."""
+
+_VISUAL = ("video", "image")
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """How depth is quantised to twelve bits: evenly, or evenly in the logarithm of depth plus a shift.
+
+    Attributes:
+        depth_min: metres of code 0, which also stands for missing.
+        depth_max: metres of the highest code.
+        shift: metres added before the logarithm.
+        use_log: whether the logarithm is taken.
+    """
+
+    depth_min: float = 0.01
+    depth_max: float = 10.0
+    shift: float = 3.5
+    use_log: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0 < self.depth_min < self.depth_max or self.depth_min + self.shift <= 0:
+            raise InputError(
+                f"depth range {self.depth_min} to {self.depth_max} m with shift {self.shift}: expected 0 < min < max "
+                "and min + shift > 0"
+            )
+
+    def codes(self, depth_m: Float32[np.ndarray, "*S"]) -> UInt16[np.ndarray, "*S"]:
+        """Twelve-bit codes; missing depth, and what lies outside the range, is code 0."""
+        low, high = self._scaled(self.depth_min), self._scaled(self.depth_max)
+        valid = (depth_m > 0) & (depth_m <= self.depth_max)
+        share = (self._scaled(np.where(valid, depth_m, self.depth_min)) - low) / (high - low)
+        return np.where(valid, np.rint(share * DEPTH_CODES), 0).clip(0, DEPTH_CODES).astype(np.uint16)
+
+    def depth(self, codes: UInt16[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
+        """Metres of twelve-bit codes; 0, missing, for code 0."""
+        low, high = self._scaled(self.depth_min), self._scaled(self.depth_max)
+        scaled = low + codes.astype(np.float64) / DEPTH_CODES * (high - low)
+        depth_m = np.exp(scaled) - self.shift if self.use_log else scaled
+        return np.where(codes > 0, depth_m, 0).astype(np.float32)
+
+    def _scaled(self, depth_m: Any) -> Any:
+        return np.log(depth_m + self.shift) if self.use_log else depth_m
+
+
+@dataclass(frozen=True)
+class _Episode:
+    """One episode of a dataset.
+
+    Attributes:
+        root: of the dataset.
+        info: its ``meta/info.json``.
+        index: of the episode.
+        row: its row of ``meta/episodes``.
+    """
+
+    root: Path
+    info: dict[str, Any]
+    index: int
+    row: dict[str, Any]
+
+    def feature(self, key: str) -> dict[str, Any]:
+        return self.info["features"][key]
+
+    @property
+    def visual(self) -> list[str]:
+        return [key for key, feature in self.info["features"].items() if feature.get("dtype") in _VISUAL]
+
+    @property
+    def data_path(self) -> Path:
+        return self.root / self.info["data_path"].format(
+            chunk_index=self.row["data/chunk_index"], file_index=self.row["data/file_index"]
+        )
+
+    def video_path(self, key: str) -> Path:
+        chunk, file = (self.row[f"videos/{key}/{part}_index"] for part in ("chunk", "file"))
+        return self.root / self.info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
+
+
+def open_lerobot(
+    root: Path,
+    *,
+    episode: int = 0,
+    camera_key: str | None = None,
+    camera: Path | Camera | None = None,
+) -> FrameSource:
+    """One camera of an episode.
+
+    Args:
+        root: folder of the dataset.
+        episode: index of the episode.
+        camera_key: feature of the colours, such as ``observation.images.front``; the first by default.
+        camera: camera file or intrinsics; by default those that this project wrote into the dataset.
+
+    Raises:
+        RecordingError: not a v3 dataset, no such episode or camera, no intrinsics, or files are torn.
+    """
+    notes = Notes()
+    found = _read_episode(root, episode)
+    key = _colour_key(found, camera_key, notes)
+    depth_key = _depth_key(found, key)
+    if depth_key is None:
+        notes.say(f"no depth feature beside {key}: colours only")
+    setup = _setup(found, key, camera)
+    rows = _Rows(found, key)
+    if not rows.posed and setup.cam_from_world is None:
+        notes.say("the dataset has no camera poses: the world is the camera")
+    for what, number in setup.lengths:
+        if number != rows.number:
+            raise RecordingError(
+                f"dataset {root}: {what} of the camera is for {number} frames, expected {rows.number} of "
+                f"episode {episode}"
+            )
+    return FrameSource(
+        f"{root.resolve().name}-{episode:06d}-{key.rpartition('.')[2]}",
+        setup.camera,
+        lambda: _frames(found, rows, setup, key, depth_key),
+        length=rows.number,
+        notes=notes,
+        units=(f"{root} {depth_key}", 1.0),
+    )
+
+
+def _read_episode(root: Path, episode: int) -> _Episode:
+    info = _read_info(root)
+    seen = 0
+    for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
+        table = _read_table(file, [name for name in _columns(file) if not name.startswith("stats/")])
+        index = table["episode_index"].to_numpy()
+        seen += len(index)
+        if episode in index:
+            row = table.slice(int(np.flatnonzero(index == episode)[0]), 1).to_pylist()[0]
+            return _Episode(root, info, episode, row)
+    raise RecordingError(f"dataset {root}: no episode {episode}; it has {seen}, counted from 0")
+
+
+def _read_info(root: Path) -> dict[str, Any]:
+    path = root / "meta" / "info.json"
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+        missing = [name for name in ("codebase_version", "features", "data_path", "fps") if name not in info]
+    except (OSError, ValueError, TypeError) as error:
+        raise RecordingError(f"dataset {root}: {path.name} cannot be read ({error}); expected JSON") from error
+    if missing:
+        raise RecordingError(f"dataset {root}: {path.name} lacks {', '.join(missing)}; expected a LeRobot v3 dataset")
+    if not str(info["codebase_version"]).startswith("v3."):
+        raise RecordingError(
+            f"dataset {root}: format {info['codebase_version']}, expected {VERSION}; convert it with lerobot's "
+            "convert_dataset_v21_to_v30"
+        )
+    return info
+
+
+def _colour_key(episode: _Episode, camera_key: str | None, notes: Notes) -> str:
+    keys = [key for key in episode.visual if not _is_depth(episode.feature(key))]
+    if camera_key is not None:
+        full = [key for key in keys if camera_key in (key, key.rpartition(".")[2])]
+        if not full:
+            raise RecordingError(f"dataset {episode.root}: no camera {camera_key!r}; its cameras are {', '.join(keys)}")
+        return full[0]
+    if not keys:
+        raise RecordingError(
+            f"dataset {episode.root}: no feature of images; its features are {', '.join(episode.info['features'])}"
+        )
+    if len(keys) > 1:
+        notes.say(f"camera {keys[0]} of {', '.join(keys)}; choose another with --camera-key")
+    return keys[0]
+
+
+def _depth_key(episode: _Episode, key: str) -> str | None:
+    """The depth of a camera: named like it, or the only one of a dataset with one camera."""
+    depths = [name for name in episode.visual if _is_depth(episode.feature(name))]
+    for name in (f"{key}_depth", key.replace("images.", "depth."), f"{key}.depth"):
+        if name in depths:
+            return name
+    return depths[0] if len(depths) == 1 and len(episode.visual) == 2 else None
+
+
+def _is_depth(feature: dict[str, Any]) -> bool:
+    info, older = feature.get("info") or {}, feature.get("video_info") or {}
+    return bool(info.get("is_depth_map") or info.get("video.is_depth_map") or older.get("video.is_depth_map"))
+
+
+def _setup(episode: _Episode, key: str, camera: Path | Camera | None) -> CameraFile:
+    if camera is not None:
+        return read_setup(episode.root, camera, None)
+    kept = (episode.feature(key).get("info") or {}).get(CAMERA_KEY)
+    if kept is None:
+        raise RecordingError(
+            f"dataset {episode.root}: LeRobot keeps no intrinsics; give those of {key} with --camera FILE "
+            "(docs/recordings.md describes the file)"
+        )
+    try:
+        return CameraFile(Camera(**kept))
+    except (TypeError, InputError) as error:
+        raise RecordingError(f"dataset {episode.root}: {CAMERA_KEY} of {key} makes no sense ({error})") from error
+
+
+class _Rows:
+    """The rows of one episode, without its pictures."""
+
+    def __init__(self, episode: _Episode, key: str) -> None:
+        path = episode.data_path
+        present = _columns(path)
+        pose = f"{POSE}.{key.rpartition('.')[2]}"
+        wanted = [name for name in ("episode_index", "timestamp", STAMP, pose) if name in present]
+        table = _read_table(path, wanted, filters=[("episode_index", "=", episode.index)])
+        self.number = table.num_rows
+        if self.number == 0:
+            raise RecordingError(f"dataset {episode.root}: {path.name} has no rows of episode {episode.index}")
+        length = episode.row.get("length", self.number)
+        if length != self.number:
+            raise RecordingError(
+                f"dataset {episode.root}: {path.name} has {self.number} rows of episode {episode.index}, expected "
+                f"{length}; the file is torn, copy it again"
+            )
+        self.timestamp = table["timestamp"].to_numpy().astype(np.float64)
+        self.stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else self.timestamp
+        self.posed = pose in wanted
+        self.pose = np.tile(np.eye(4), (self.number, 1, 1))
+        if self.posed:
+            self.pose = np.array(table[pose].to_pylist(), dtype=np.float64).reshape(-1, 4, 4)
+
+
+def _frames(episode: _Episode, rows: _Rows, setup: CameraFile, key: str, depth_key: str | None) -> Iterator[Frame]:
+    rig = setup.rig
+    colours = _pictures(episode, rows, key)
+    depths = None if depth_key is None else _pictures(episode, rows, depth_key)
+    try:
+        for t, picture in enumerate(colours):
+            depth_m = None if depths is None else rig.depth(next(depths))
+            pose = rows.pose[t] if setup.cam_from_world is None else setup.pose(t)
+            yield Frame(rig.rgb(picture), depth_m, setup.stamp(t, fallback_s=float(rows.stamp_s[t])), pose)
+    except RecordingError:
+        raise
+    except InputError as error:
+        raise RecordingError(f"dataset {episode.root}: episode {episode.index}: {error}") from error
+
+
+def _pictures(episode: _Episode, rows: _Rows, key: str) -> Iterator[np.ndarray]:
+    """Colours of uint8, or depth in metres, one per row."""
+    feature = episode.feature(key)
+    if feature["dtype"] == "image":
+        yield from _stored_images(episode, key)
+        return
+    info = (feature.get("info") or {}) | (feature.get("video_info") or {})
+    path = episode.video_path(key)
+    begin_s = float(episode.row[f"videos/{key}/from_timestamp"])
+    half_s = 0.5 / float(episode.info["fps"])
+    times = begin_s + rows.timestamp
+    if _is_depth(feature):
+        named = {name: info[f"video.{name}"] for name in DepthRange.__dataclass_fields__ if f"video.{name}" in info}
+        scale, video = DepthRange(**named), play_video(path, pixel_format="gray12le", start_s=times[0] - half_s)
+    else:
+        scale, video = None, play_video(path, start_s=times[0] - half_s)
+    number = 0
+    for picture, time_s in video:
+        if number < len(times) and abs(time_s - times[number]) < half_s:
+            yield picture if scale is None else scale.depth(picture)
+            number += 1
+        if number == len(times):
+            return
+    raise RecordingError(
+        f"dataset {episode.root}: {path.name} of {key} has {number} of the {len(times)} frames of episode "
+        f"{episode.index}; the file is torn, copy it again"
+    )
+
+
+def _stored_images(episode: _Episode, key: str) -> Iterator[np.ndarray]:
+    """Pictures in the rows themselves, a few rows in memory at a time."""
+    feature, path = episode.feature(key), episode.data_path
+    in_metres = (feature.get("info") or {}).get("depth_unit") == "m"
+    with pq.ParquetFile(path) as file:
+        for batch in file.iter_batches(batch_size=8, columns=["episode_index", key]):
+            for row in batch.to_pylist():
+                if row["episode_index"] != episode.index:
+                    continue
+                try:
+                    with Image.open(io.BytesIO(row[key]["bytes"])) as image:
+                        pixels = np.asarray(image if _is_depth(feature) else image.convert("RGB"))
+                except (UnidentifiedImageError, OSError, TypeError, KeyError) as error:
+                    raise RecordingError(
+                        f"dataset {episode.root}: a picture of {key} in {path.name} cannot be decoded ({error})"
+                    ) from error
+                if not _is_depth(feature):
+                    yield pixels
+                else:
+                    floating = np.issubdtype(pixels.dtype, np.floating)
+                    yield clean_depth(pixels.astype(np.float32) * np.float32(1.0 if in_metres or floating else 1e-3))
+
+
+def _columns(path: Path) -> list[str]:
+    try:
+        return list(pq.read_schema(path).names)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again") from error
+
+
+def _read_table(path: Path, columns: list[str], *, filters: list[tuple[str, str, int]] | None = None) -> pa.Table:
+    try:
+        return pq.read_table(path, columns=columns, filters=filters)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again") from error

@@ -1,0 +1,230 @@
+"""Clips, takes and tracks as a LeRobot v3 dataset that lerobot's own loader reads.
+
+Each episode has its own data file and one video per view, which the format allows. Every episode of a dataset has the
+same features, so joints and entities have numbered places: an episode with fewer leaves the last ones empty, and which
+is which stands in the columns ``quest/joints`` and ``quest/entities`` of ``meta/episodes``.
+
+Reference: lerobot 0.6.2, ``lerobot/datasets`` (``utils.py``, ``dataset_metadata.py``, ``compute_stats.py``).
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import uuid
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from quest.data.frame_source import clean_depth
+from quest.data.lerobot import POSE, STAMP, VERSION, DepthRange
+from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, depth_key, image_key
+from quest.data.lerobot_stats import feature_stats, image_stats, merge_stats
+from quest.data.video import write_depth_video, write_video
+from quest.errors import InputError
+from quest.types import Clip
+
+__all__ = ["Episode", "export_lerobot"]
+
+CHUNK_FILES = 1000
+DATA_PATH = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+
+_CRF = 18
+_KEYFRAME_EVERY = 2
+
+
+def export_lerobot(
+    episodes: Iterable[Episode],
+    folder: str | Path,
+    *,
+    fps: int | None = None,
+    joints: int | None = None,
+    entities: int | None = None,
+    depth_range: DepthRange | None = None,
+    robot_type: str | None = None,
+) -> int:
+    """Write a LeRobot v3.0 dataset, all or nothing; returns the number of episodes.
+
+    Features: ``observation.images.VIEW`` (H.264), ``observation.images.VIEW_depth`` (HEVC, twelve bits),
+    ``observation.state`` (joint positions), ``observation.tracks.VIEW.uv_px``, ``.point_world``, ``.visible`` and
+    ``.confidence``, ``observation.cam_from_world.VIEW``, ``observation.stamp_s``, and those that LeRobot always has.
+    Its ``timestamp`` is the frame's index over ``fps``, as LeRobot requires; the true time is ``observation.stamp_s``.
+
+    Args:
+        episodes: read one after the other; all have the same views, sizes and kinds of content.
+        folder: where to; must not exist, or be empty.
+        fps: frames per second; by default that of the first clip, rounded.
+        joints: places for joints; by default as many as the first episode has.
+        entities: places for tracks; likewise.
+        depth_range: how depth is quantised; by default as lerobot does, which ends at 10 m.
+        robot_type: for ``meta/info.json``.
+
+    Raises:
+        InputError: the folder has something in it, there are no episodes, or an episode is unlike the first.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"dataset {target}: exists and is not an empty folder; choose another one")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
+    writer = None
+    try:
+        for episode in episodes:
+            if writer is None:
+                layout = Layout.of(episode, fps, joints, entities, depth_range or DepthRange())
+                writer = _Writer(partial, layout)
+            writer.add(episode)
+        if writer is None:
+            raise InputError(f"dataset {target}: expected at least one episode, got none")
+        writer.finish(robot_type)
+        if target.exists():
+            target.rmdir()
+        partial.rename(target)
+        return len(writer.rows)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+class _Writer:
+    """Writes episodes one after the other, and what describes them at the end."""
+
+    def __init__(self, root: Path, layout: Layout) -> None:
+        self.rows: list[dict[str, Any]] = []
+        self._root, self._layout = root, layout
+        self._tasks: dict[str, int] = {}
+        self._frames = 0
+        self._stats: dict[str, dict[str, np.ndarray]] = {}
+
+    def add(self, episode: Episode) -> None:
+        index, layout = len(self.rows), self._layout
+        frames = layout.check(episode, index)
+        task = self._tasks.setdefault(episode.task, len(self._tasks))
+        place = {"chunk_index": index // CHUNK_FILES, "file_index": index % CHUNK_FILES}
+        values = _values(episode, layout, frames)
+        counters = {"episode_index": index, "task_index": task}
+        values |= {name: np.full(frames, value, np.int64) for name, value in counters.items()}
+        values |= {"frame_index": np.arange(frames), "index": self._frames + np.arange(frames)}
+        stats = {key: feature_stats(value) for key, value in values.items()}
+        self._write_rows(values, self._root / DATA_PATH.format(**place))
+        row: dict[str, Any] = {"episode_index": index, "tasks": [episode.task], "length": frames}
+        row |= {f"data/{name}": value for name, value in place.items()}
+        row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + frames}
+        for view, clip in episode.views.items():
+            self._write_videos(clip, view, place)
+            stats[image_key(view)] = image_stats(clip.rgb, 255.0)
+            if clip.depth_m is not None:
+                stats[depth_key(view)] = image_stats(clip.depth_m, 1.0)
+            for key in (image_key(view), depth_key(view)) if view in layout.deep else (image_key(view),):
+                row |= {f"videos/{key}/{name}": value for name, value in place.items()}
+                row |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": frames / layout.fps}
+        row |= {"quest/joints": list(episode.joint_names), "quest/entities": _names(episode)}
+        row |= {f"stats/{key}/{name}": v.tolist() for key, found in stats.items() for name, v in found.items()}
+        row |= {"meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0}
+        self._stats = {key: merge_stats(self._stats.get(key), found) for key, found in stats.items()}
+        self.rows.append(row)
+        self._frames += frames
+
+    def finish(self, robot_type: str | None) -> None:
+        meta = self._root / "meta"
+        episodes = meta / "episodes" / "chunk-000" / "file-000.parquet"
+        episodes.parent.mkdir(parents=True)
+        pq.write_table(pa.Table.from_pylist(self.rows), episodes)
+        _write_tasks(self._tasks, meta / "tasks.parquet")
+        info = {
+            "codebase_version": VERSION,
+            "fps": self._layout.fps,
+            "features": self._layout.features(),
+            "total_episodes": len(self.rows),
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": CHUNK_FILES,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "data_path": DATA_PATH,
+            "video_path": VIDEO_PATH,
+            "robot_type": robot_type,
+            "splits": {"train": f"0:{len(self.rows)}"},
+        }
+        stats = {key: {name: v.tolist() for name, v in found.items()} for key, found in self._stats.items()}
+        for name, content in (("info.json", info), ("stats.json", stats)):
+            (meta / name).write_text(json.dumps(content, indent=4) + "\n", encoding="utf-8")
+
+    def _write_rows(self, values: dict[str, np.ndarray], path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        arrays = {}
+        for key, (dtype, names) in self._layout.columns().items():
+            kind = pa.bool_() if dtype == "bool" else pa.type_for_alias(dtype)
+            flat = pa.array(values[key].ravel(), kind)
+            single = names is None or len(names) == 1  # LeRobot keeps features of one number as numbers
+            arrays[key] = flat if single else pa.FixedSizeListArray.from_arrays(flat, len(names or ()))
+        pq.write_table(pa.table(arrays), path)
+
+    def _write_videos(self, clip: Clip, view: str, place: dict[str, int]) -> None:
+        fps = self._layout.fps
+        path = self._root / VIDEO_PATH.format(video_key=image_key(view), **place)
+        write_video(path, clip.rgb, frames_per_s=fps, crf=_CRF, keyframe_every=_KEYFRAME_EVERY)
+        if clip.depth_m is not None:
+            path = self._root / VIDEO_PATH.format(video_key=depth_key(view), **place)
+            codes = (self._layout.depth_range.codes(clean_depth(depth_m)) for depth_m in clip.depth_m)
+            write_depth_video(path, codes, frames_per_s=fps)
+
+
+def _names(episode: Episode) -> list[str]:
+    return list(next((tracks.names for tracks in episode.tracks.values()), ()))
+
+
+def _values(episode: Episode, layout: Layout, frames: int) -> dict[str, np.ndarray]:
+    """What the data file holds of an episode, by column, [T] or [T, n]; empty places are 0, NaN or False."""
+    clips = list(episode.views.items())
+    found = {STAMP: clips[0][1].stamp_s, "timestamp": (np.arange(frames) / layout.fps).astype(np.float32)}
+    if episode.joint_position is not None and layout.joints:
+        found[STATE] = _filled(episode.joint_position, layout.joints, 0.0)
+    for view, clip in clips:
+        found[f"{POSE}.{view}"] = clip.cam_from_world.reshape(frames, 16)
+    for view, tracks in episode.tracks.items() if layout.entities else ():
+        for what, value, empty in (
+            ("uv_px", tracks.uv_px, np.nan),
+            ("point_world", tracks.point_world, np.nan),
+            ("visible", tracks.visible, False),
+            ("confidence", tracks.confidence, 0.0),
+        ):
+            found[f"{TRACKS}.{view}.{what}"] = _filled(value, layout.entities, empty).reshape(frames, -1)
+    return found
+
+
+def _filled(value: np.ndarray, places: int, empty: float) -> np.ndarray:
+    """The second axis at full length."""
+    pad = [(0, 0)] * value.ndim
+    pad[1] = (0, places - value.shape[1])
+    return np.pad(value, pad, constant_values=empty)
+
+
+def _write_tasks(tasks: dict[str, int], path: Path) -> None:
+    """The table of tasks, indexed by their words, which lerobot learns by pandas from the metadata."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+
+    def column(name: str, kind: str, numpy_kind: str) -> dict[str, Any]:
+        return {"name": name, "field_name": name, "pandas_type": kind, "numpy_type": numpy_kind, "metadata": None}
+
+    words = {
+        "index_columns": ["task"],
+        "column_indexes": [
+            {
+                "name": None,
+                "field_name": None,
+                "pandas_type": "unicode",
+                "numpy_type": "object",
+                "metadata": {"encoding": "UTF-8"},
+            }
+        ],
+        "columns": [column("task_index", "int64", "int64"), column("task", "unicode", "object")],
+        "creator": {"library": "pyarrow", "version": pa.__version__},
+        "pandas_version": "2.2.0",
+    }
+    table = pa.table({"task_index": pa.array(list(tasks.values()), pa.int64()), "task": pa.array(list(tasks))})
+    pq.write_table(table.replace_schema_metadata({b"pandas": json.dumps(words).encode()}), path)

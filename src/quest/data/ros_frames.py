@@ -1,0 +1,307 @@
+"""ROS messages as RGB-D frames: colour and depth paired by time, rectified, registered, and posed by tf.
+
+Times are those of the messages' headers, or of logging where nobody set them. A frame waits for its depth and its pose
+until they have come or half a second has passed, so that memory stays bounded however long the bag is.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Any
+
+import numpy as np
+
+from quest.data.camera_file import CameraFile
+from quest.data.distortion import Distortion
+from quest.data.frame_source import FrameSource, Notes, Parts
+from quest.data.registration import Rig
+from quest.data.ros_images import depth_of, header_ns, rgb_of, unit_of
+from quest.data.ros_topics import Chosen, Messages, base_of, choose
+from quest.data.transforms import Transforms, frame_name
+from quest.errors import InputError, RecordingError
+from quest.types import Camera, Frame
+
+_PATIENCE_NS = 500_000_000
+_SCAN_NS = 2_000_000_000
+_LATE_NS = 1_000_000_000
+_STALE_S = 0.5
+
+NO_POSE = "no tf joins the camera to another frame: the world is the camera"
+NO_DEPTH = "no topic of depth: colours only"
+STALE = f"tf has nothing within {_STALE_S} s: the nearest pose is used"
+LATE = "colours out of order: left out"
+NO_STAMP = "headers have no time: that of logging is used"
+CAMERA_CHANGED = "camera_info changes on the way: the first is used"
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What holds for all frames of a bag.
+
+    Attributes:
+        messages: the bag.
+        chosen: its topics.
+        rig: cameras.
+        parts: what was asked for.
+        colour_frame: tf frame of the colours.
+        world: tf frame that is the world; None without tf.
+        scale_m: metres per unit of depth; None for what ROS has it in.
+        pose: of every frame, where the camera file gives one.
+        by_log: whether times are those of logging, because nobody set those of the headers.
+    """
+
+    messages: Messages
+    chosen: Chosen
+    rig: Rig
+    parts: Parts
+    colour_frame: str
+    world: str | None
+    scale_m: float | None
+    pose: np.ndarray | None
+    by_log: bool
+
+    def where(self, topic: str, number: int) -> str:
+        return f"bag {self.messages.path}: message {number} of {topic}"
+
+
+def open_messages(
+    messages: Messages, parts: Parts, *, setup: CameraFile | None = None, depth_scale_m: float | None = None
+) -> FrameSource:
+    """The RGB-D frames of a bag.
+
+    Args:
+        messages: the bag.
+        parts: which topics, frames and tolerance; what is not said is found.
+        setup: camera file that overrules what the bag says of the colour camera (and of the depth camera, if it has
+            one).
+        depth_scale_m: metres per unit of depth; by default millimetres in 16 bits, metres in floats.
+
+    Raises:
+        RecordingError: no colours, no intrinsics, unknown lens, or depth of a camera whose place is unknown.
+    """
+    chosen = choose(messages, parts)
+    where = f"bag {messages.path}"
+    notes = Notes()
+    transforms, now_ns = _scan_transforms(messages, chosen)
+    colour_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
+    world = transforms.root(colour_frame)
+    if parts.world_frame is not None:
+        world = frame_name(parts.world_frame)
+        if transforms.lookup(colour_frame, world, now_ns) is None:
+            raise RecordingError(
+                f"{where}: no tf joins the camera's frame {colour_frame!r} to {world!r} (--world-frame); it hangs on "
+                f"{transforms.root(colour_frame)!r}"
+            )
+    if world == colour_frame:
+        world = None
+    pose = None if setup is None else setup.cam_from_world
+    if pose is not None and pose.ndim == 3:
+        raise RecordingError(f"{where}: the camera file has a pose per frame; give one pose, or none to use tf")
+    if world is None and pose is None:
+        notes.say(NO_POSE)
+    if chosen.depth is None:
+        notes.say(NO_DEPTH)
+    try:
+        rig = _rig(messages, chosen, setup, transforms, now_ns)
+    except RecordingError:
+        raise
+    except InputError as error:
+        raise RecordingError(f"{where}: {error}") from error
+    # A clock of a simulator may begin at 0, but does not stay there.
+    by_log = all(header_ns(message) == 0 for _, _, message in islice(messages.read([chosen.rgb]), 2))
+    if by_log:
+        notes.say(NO_STAMP)
+    unit_m = 1.0 if chosen.depth is None else depth_scale_m or unit_of(chosen.first[chosen.depth])
+    setting = _Setting(messages, chosen, rig, parts, colour_frame, world, depth_scale_m, pose, by_log)
+    return FrameSource(
+        messages.path.stem if messages.path.is_file() else messages.path.resolve().name,
+        rig.camera,
+        lambda: _Play(setting, notes).frames(),
+        length=messages.topics[chosen.rgb].number,
+        exact=False,
+        notes=notes,
+        units=(f"{messages.path}, {chosen.depth}", unit_m),
+    )
+
+
+def _scan_transforms(messages: Messages, chosen: Chosen) -> tuple[Transforms, int]:
+    """Transforms that hold throughout and the first seconds of those that change; the time of the first colours."""
+    transforms, begun_ns = Transforms(), None
+    for _, _, message in messages.read(chosen.static):
+        transforms.add(message, static=True)
+    for _, log_ns, message in messages.read(chosen.moving):
+        begun_ns = log_ns if begun_ns is None else begun_ns
+        if log_ns - begun_ns > _SCAN_NS:
+            break
+        transforms.add(message, static=False)
+    return transforms, header_ns(chosen.first[chosen.rgb])
+
+
+def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transforms: Transforms, now_ns: int) -> Rig:
+    where = f"bag {messages.path}"
+    rgb_size = rgb_of(chosen.first[chosen.rgb], f"{where}: first message of {chosen.rgb}").shape[:2]
+    if setup is not None:
+        camera, lens = setup.camera, setup.distortion
+    elif chosen.info is None:
+        raise RecordingError(
+            f"{where}: no camera_info for {chosen.rgb}; name its topic with --topic-info, or give the intrinsics with "
+            "--camera FILE"
+        )
+    else:
+        camera, lens = _camera_of(chosen.first[chosen.info], chosen.rgb, rgb_size, where)
+    if (camera.height, camera.width) != rgb_size:
+        raise RecordingError(
+            f"{where}: {chosen.rgb} is {rgb_size[1]} x {rgb_size[0]} but its camera is for {camera.width} x "
+            f"{camera.height}; give the intrinsics of these images with --camera FILE"
+        )
+    if setup is not None and setup.depth_camera is not None:
+        return setup.rig
+    if chosen.depth is None:
+        return Rig(camera, lens)
+    depth = chosen.first[chosen.depth]
+    depth_size = depth_of(depth, f"{where}: first message of {chosen.depth}").shape
+    rgb_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
+    depth_frame = frame_name(depth.header.frame_id)
+    if chosen.depth_info is None:
+        if depth_frame == rgb_frame and depth_size == rgb_size:
+            return Rig(camera, lens)
+        raise RecordingError(
+            f"{where}: no camera_info for {chosen.depth}; name its topic with --topic-depth-info, give depth_camera in "
+            "--camera FILE, or leave the depth out with --topic-depth none"
+        )
+    depth_camera, depth_lens = _camera_of(chosen.first[chosen.depth_info], chosen.depth, depth_size, where)
+    colour_from_depth = transforms.lookup(rgb_frame, depth_frame, now_ns)
+    if colour_from_depth is None:
+        raise RecordingError(
+            f"{where}: no tf joins the depth's frame {depth_frame!r} to the colours' {rgb_frame!r}, so depth cannot be "
+            "registered; record /tf_static too, give depth_camera and colour_from_depth in --camera FILE, or leave the "
+            "depth out with --topic-depth none"
+        )
+    return Rig(camera, lens, depth_camera, depth_lens, colour_from_depth)
+
+
+def _camera_of(info: Any, topic: str, size: tuple[int, ...], where: str) -> tuple[Camera, Distortion]:
+    """Intrinsics and lens of a CameraInfo; of the rectified camera where the topic says that its images are."""
+    k, d, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), ())), dtype=np.float64) for name in "kdp")
+    rectified = "rect" in base_of(topic).rpartition("/")[2]
+    matrix = p.reshape(3, 4)[:, :3] if rectified and p.size == 12 and p[0] > 0 else k.reshape(3, 3)
+    if not matrix[0, 0] > 0:
+        raise RecordingError(
+            f"{where}: camera_info of {topic} is of a camera that was never calibrated (fx = {matrix[0, 0]:g}); give "
+            "the intrinsics with --camera FILE"
+        )
+    height, width = (info.height, info.width) if info.width and info.height else size
+    lens = Distortion() if rectified else Distortion(str(info.distortion_model) or "plumb_bob", tuple(d.tolist()))
+    fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    return Camera(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height)), lens  # ROS has centres at integers
+
+
+class _Play:
+    """One pass over a bag."""
+
+    def __init__(self, setting: _Setting, notes: Notes) -> None:
+        self._it, self._notes = setting, notes
+        self._transforms = _scan_transforms(setting.messages, setting.chosen)[0]
+        self._colours: deque[tuple[int, int, Any]] = deque()
+        self._depths: deque[tuple[int, int, Any]] = deque()
+        self._newest_ns = 0
+        self._emitted_ns: int | None = None
+        self._frame = 0
+        self._numbers = {name: 0 for name in (setting.chosen.rgb, setting.chosen.depth) if name is not None}
+
+    def frames(self) -> Iterator[Frame]:
+        chosen = self._it.chosen
+        wanted = {*self._numbers, *chosen.moving, *([chosen.info] if chosen.info else [])}
+        for topic, log_ns, message in self._it.messages.read(sorted(wanted)):
+            if topic in self._numbers:
+                self._take(topic, log_ns, message)
+            elif topic == chosen.info:
+                self._compare(message)
+            else:
+                self._transforms.add(message, static=False)
+            while self._colours and self._ready(self._colours[0][0]):
+                yield self._frame_of(*self._colours.popleft())
+        while self._colours:
+            yield self._frame_of(*self._colours.popleft())
+
+    def _take(self, topic: str, log_ns: int, message: Any) -> None:
+        number = self._numbers[topic]
+        self._numbers[topic] += 1
+        at_ns = log_ns if self._it.by_log else header_ns(message)
+        if topic == self._it.chosen.depth:
+            self._depths.append((at_ns, number, message))
+        else:
+            last_ns = self._colours[-1][0] if self._colours else self._emitted_ns
+            if last_ns is not None and at_ns < last_ns:
+                if last_ns - at_ns > _LATE_NS:
+                    raise RecordingError(
+                        f"{self._it.where(topic, number)}: time goes back by {(last_ns - at_ns) * 1e-9:.3f} s; cut the "
+                        "bag there"
+                    )
+                self._notes.count(LATE, number)
+                return
+            self._colours.append((at_ns, number, message))
+        self._newest_ns = max(self._newest_ns, at_ns)
+
+    def _ready(self, at_ns: int) -> bool:
+        """Whether nothing better can come for colours of a time."""
+        if self._newest_ns - at_ns > _PATIENCE_NS:
+            return True
+        depth = self._it.chosen.depth is None or (bool(self._depths) and self._depths[-1][0] >= at_ns)
+        return depth and (self._it.world is None or self._gap(at_ns) == 0)
+
+    def _gap(self, at_ns: int) -> float:
+        assert self._it.world is not None
+        return self._transforms.gap(self._it.colour_frame, self._it.world, at_ns)
+
+    def _frame_of(self, at_ns: int, number: int, message: Any) -> Frame:
+        setting, t = self._it, self._frame
+        self._frame, self._emitted_ns = t + 1, at_ns
+        where = setting.where(setting.chosen.rgb, number)
+        try:
+            rgb = setting.rig.rgb(rgb_of(message, where))
+        except RecordingError:
+            raise
+        except InputError as error:
+            raise RecordingError(f"{where}: {error}") from error
+        return Frame(rgb, self._depth_of(at_ns, t), at_ns * 1e-9, self._pose_of(at_ns, t))
+
+    def _depth_of(self, at_ns: int, t: int) -> np.ndarray | None:
+        setting = self._it
+        if setting.chosen.depth is None:
+            return None
+        tolerance_ns = round(setting.parts.sync_s * 1e9)
+        while self._depths and self._depths[0][0] < at_ns - tolerance_ns:
+            self._depths.popleft()
+        nearest = min(self._depths, key=lambda depth: abs(depth[0] - at_ns), default=None)
+        if nearest is None or abs(nearest[0] - at_ns) > tolerance_ns:
+            self._notes.count(f"no depth within {setting.parts.sync_s:g} s of the colours", t)
+            return None
+        where = setting.where(setting.chosen.depth, nearest[1])
+        try:
+            return setting.rig.depth(depth_of(nearest[2], where, scale_m=setting.scale_m))
+        except RecordingError:
+            raise
+        except InputError as error:
+            raise RecordingError(f"{where}: {error}") from error
+
+    def _pose_of(self, at_ns: int, t: int) -> np.ndarray:
+        setting = self._it
+        if setting.pose is not None:
+            return setting.pose
+        if setting.world is None:
+            return np.eye(4)
+        if self._gap(at_ns) > _STALE_S:
+            self._notes.count(STALE, t)
+        pose = self._transforms.lookup(setting.colour_frame, setting.world, at_ns)
+        self._transforms.forget(at_ns)
+        return np.eye(4) if pose is None else pose
+
+    def _compare(self, info: Any) -> None:
+        first = self._it.chosen.first[self._it.chosen.info or ""]
+        here, there = (np.asarray(getattr(message, "k", getattr(message, "K", ()))) for message in (info, first))
+        if not np.allclose(here, there):
+            self._notes.say(CAMERA_CHANGED)

@@ -1,0 +1,78 @@
+"""ROS bags, read by the rosbags library: folders of ROS 2 (sqlite3 or MCAP inside), ``.db3`` and ROS 1 ``.bag``."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from quest.data.ros_topics import Topic
+from quest.errors import RecordingError
+from quest.extras import require
+
+
+class BagMessages:
+    """The messages of a ROS bag. Bags that do not carry their message definitions are taken to be of ROS 2 Humble.
+
+    Args:
+        path: the folder or file.
+
+    Raises:
+        RecordingError: the bag is torn, or holds no messages.
+        MissingExtraError: the extra ``ros`` is not installed.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        require("rosbags")
+        self.topics = self._find_topics()
+        if not self.topics:
+            raise RecordingError(f"bag {path}: it has no topics; record it again")
+
+    def _find_topics(self) -> dict[str, Topic]:
+        with self._reader() as reader:
+            return {
+                name: Topic((info.msgtype or "").replace("/msg/", "/"), info.msgcount)
+                for name, info in reader.topics.items()
+            }
+
+    def read(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """Topic, time of logging in nanoseconds and message; as :class:`quest.data.ros_topics.Messages` says."""
+        with self._reader() as reader:
+            wanted = [connection for connection in reader.connections if connection.topic in topics]
+            if not wanted:
+                return
+            for connection, log_ns, raw in reader.messages(connections=wanted):
+                yield connection.topic, log_ns, reader.deserialize(raw, connection.msgtype)
+
+    @contextmanager
+    def _reader(self) -> Iterator[Any]:
+        """An open reader; what goes wrong with the bag becomes an error that says so."""
+        highlevel, typesys = require("rosbags.highlevel"), require("rosbags.typesys")
+        serde, rosbag2 = require("rosbags.serde"), require("rosbags.rosbag2")
+        torn = (
+            highlevel.AnyReaderError,
+            serde.SerdeError,
+            rosbag2.ReaderError,
+            typesys.TypesysError,
+            sqlite3.Error,
+            AssertionError,
+            EOFError,
+            KeyError,
+            ValueError,
+        )
+        store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+        try:
+            with highlevel.AnyReader([self.path], default_typestore=store) as reader:
+                yield reader
+        except RecordingError:
+            raise
+        except torn as error:
+            raise RecordingError(
+                f"bag {self.path}: cannot be read ({type(error).__name__}: {error}); the bag is torn, copy it again, "
+                "or rebuild it with `ros2 bag reindex`"
+            ) from error
+        except OSError as error:
+            raise RecordingError(f"bag {self.path}: cannot be read ({error}); check the files in it") from error

@@ -1,0 +1,123 @@
+"""Transforms between named frames over time, as ROS publishes them on ``/tf`` and ``/tf_static``.
+
+Reference: Foote, "tf: the transform library", 2013.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from quest.data.ros_images import header_ns
+
+_KEEP_NS = 30_000_000_000
+"""How long what moved is remembered."""
+
+
+@dataclass
+class _Edge:
+    """One frame in another over time."""
+
+    parent: str
+    static: bool
+    stamp_ns: list[int] = field(default_factory=list)
+    position: list[np.ndarray] = field(default_factory=list)
+    quaternion: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, stamp_ns: int, position: np.ndarray, quaternion: np.ndarray) -> None:
+        if self.static:
+            self.stamp_ns, self.position, self.quaternion = [stamp_ns], [position], [quaternion]
+            return
+        at = bisect_left(self.stamp_ns, stamp_ns)
+        self.stamp_ns.insert(at, stamp_ns)
+        self.position.insert(at, position)
+        self.quaternion.insert(at, quaternion)
+
+    def at(self, stamp_ns: int) -> np.ndarray:
+        """``parent_from_child``: between two samples on the line and the shortest arc, outside that of the nearest."""
+        after = min(bisect_left(self.stamp_ns, stamp_ns), len(self.stamp_ns) - 1)
+        before = max(after - 1, 0) if self.stamp_ns[after] > stamp_ns else after
+        first_ns, last_ns = self.stamp_ns[before], self.stamp_ns[after]
+        share = 0.0 if last_ns == first_ns else (stamp_ns - first_ns) / (last_ns - first_ns)
+        rotations = Rotation.from_quat(np.stack((self.quaternion[before], self.quaternion[after])))
+        matrix = np.eye(4)
+        matrix[:3, :3] = Slerp([0.0, 1.0], rotations)(share).as_matrix()
+        matrix[:3, 3] = (1 - share) * self.position[before] + share * self.position[after]
+        return matrix
+
+    def gap(self, stamp_ns: int) -> float:
+        """Seconds to the nearest sample if ``stamp_ns`` lies outside of them, else 0."""
+        return 0.0 if self.static else max(self.stamp_ns[0] - stamp_ns, stamp_ns - self.stamp_ns[-1], 0) * 1e-9
+
+    def forget(self, before_ns: int) -> None:
+        old = bisect_left(self.stamp_ns, before_ns) - 1
+        if old > 0 and not self.static:
+            del self.stamp_ns[:old], self.position[:old], self.quaternion[:old]
+
+
+class Transforms:
+    """A tree of frames, fed as messages come; of what moves, the last half minute is kept."""
+
+    def __init__(self) -> None:
+        self._edges: dict[str, _Edge] = {}
+
+    def add(self, message: Any, *, static: bool) -> None:
+        """Take the transforms of one TFMessage; those that are no transforms (a quaternion of zeros) are left out."""
+        for stamped in message.transforms:
+            moved, turned = stamped.transform.translation, stamped.transform.rotation
+            quaternion = np.array([turned.x, turned.y, turned.z, turned.w], dtype=np.float64)
+            position = np.array([moved.x, moved.y, moved.z], dtype=np.float64)
+            norm = np.linalg.norm(quaternion)
+            if not np.isfinite(position).all() or not np.isfinite(norm) or norm < 1e-6:
+                continue
+            parent, child = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
+            edge = self._edges.get(child)
+            if edge is None or edge.parent != parent or edge.static != static:
+                edge = self._edges[child] = _Edge(parent, static)
+            edge.add(header_ns(stamped), position, quaternion / norm)
+
+    def root(self, frame: str) -> str:
+        """The frame that everything around ``frame`` hangs on; itself if nothing is known of it."""
+        return self._line(frame)[-1]
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> Float[np.ndarray, "4 4"] | None:
+        """``target_from_source`` at a time in nanoseconds; None where no chain joins them."""
+        ups, downs = self._line(source), self._line(target)
+        shared = next((name for name in ups if name in downs), None)
+        if shared is None:
+            return None
+        return np.linalg.inv(self._up(downs, shared, stamp_ns)) @ self._up(ups, shared, stamp_ns)
+
+    def gap(self, target: str, source: str, stamp_ns: int) -> float:
+        """How far outside of what was published a lookup reaches, seconds; 0 where every step is known or static."""
+        ups, downs = self._line(source), self._line(target)
+        steps = set(ups) ^ set(downs)  # what is above both cancels
+        return max((self._edges[name].gap(stamp_ns) for name in steps if name in self._edges), default=0.0)
+
+    def forget(self, stamp_ns: int) -> None:
+        """Drop what is not needed for times from ``stamp_ns`` on, but for half a minute."""
+        for edge in self._edges.values():
+            edge.forget(stamp_ns - _KEEP_NS)
+
+    def _line(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root."""
+        line = [frame_name(frame)]
+        while (edge := self._edges.get(line[-1])) is not None and edge.parent not in line:
+            line.append(edge.parent)
+        return line
+
+    def _up(self, line: list[str], top: str, stamp_ns: int) -> np.ndarray:
+        matrix = np.eye(4)
+        for name in line[: line.index(top)]:
+            matrix = self._edges[name].at(stamp_ns) @ matrix
+        return matrix
+
+
+def frame_name(name: str) -> str:
+    """A frame's name without the leading slash of ROS 1."""
+    return name.removeprefix("/")

@@ -1,0 +1,121 @@
+"""``quest track`` and ``quest monitor`` on every kind of recording: the same frames give the same tracks."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quest.cli.main import main
+from quest.cli.source import Source
+from quest.data.frame_source import FrameSource
+from quest.data.lerobot_export import Episode, export_lerobot
+from quest.data.mcap_export import export_mcap
+from quest.data.recording import write_recording
+from quest.data.tracks_file import read_tracks
+from quest.errors import RecordingError
+from quest.model.weights import save_network
+from quest.track import Stream, TrackerConfig
+from quest.types import Clip
+from tests.synthetic import make_take
+from tests.tiny import make_network
+
+FRAMES = 6
+
+
+@pytest.fixture(scope="module")
+def clip() -> Clip:
+    clip = make_take(frames=FRAMES, views=1, entities=2, size=(64, 48), seed=3).views[0].clip
+    assert clip.depth_m is not None
+    return replace(clip, name="clip", depth_m=np.rint(clip.depth_m * 1000).astype(np.float32) / np.float32(1000))
+
+
+@pytest.fixture(scope="module")
+def sources(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    root = tmp_path_factory.mktemp("sources")
+    write_recording(clip, root / "folder", rgb="png", depth_scale_m=0.001)
+    export_mcap(clip, root / "clip.mcap", rgb="raw")
+    export_lerobot([Episode({"front": clip}, "look"), Episode({"front": clip}, "look again")], root / "lerobot")
+    return {name: str(root / name) for name in ("folder", "clip.mcap", "lerobot")}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
+    path = tmp_path_factory.mktemp("weights") / "plain.safetensors"
+    eager = TrackerConfig(slot_threshold=0.0, prompt_threshold=0.0).to_json()
+    save_network(path, make_network(), settings=eager, about="a test")
+    return str(path)
+
+
+def track(source: str, weights: str, out: Path, *arguments: str) -> np.ndarray:
+    command = ["track", source, "--weights", weights, "--point", "0,20,30", "--out", str(out), "--no-overlay"]
+    assert main([*command, *arguments]) == 0
+    return read_tracks(out / "tracks.parquet").uv_px
+
+
+def test_the_same_frames_give_the_same_tracks(sources: dict[str, str], weights: str, tmp_path: Path):
+    folder = track(sources["folder"], weights, tmp_path / "folder")
+    np.testing.assert_array_equal(track(sources["clip.mcap"], weights, tmp_path / "mcap"), folder)
+    dataset = track(sources["lerobot"], weights, tmp_path / "lerobot", "--episode", "1", "--camera-key", "front")
+    assert dataset.shape == folder.shape
+
+
+def test_notes_are_said(sources: dict[str, str], weights: str, tmp_path: Path, capsys):
+    track(sources["clip.mcap"], weights, tmp_path / "out", "--topic-depth", "none")
+    assert "note: clip: no topic of depth: colours only" in capsys.readouterr().err
+
+
+def test_wrong_topics_are_explained(sources: dict[str, str], weights: str, capsys):
+    assert main(["track", sources["clip.mcap"], "--weights", weights, "--topic-rgb", "/front"]) != 0
+    error = " ".join(capsys.readouterr().err.split())
+    assert "no topic /front (--topic-rgb); topics found: /camera/aligned_depth_to_color/camera_info" in error
+
+
+def test_monitor_reads_frame_by_frame(
+    sources: dict[str, str], weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    def refuse(self: FrameSource) -> Clip:
+        raise AssertionError("the whole clip was read")
+
+    monkeypatch.setattr(FrameSource, "clip", refuse)
+    lines = tmp_path / "frames.jsonl"
+    for source in sources.values():
+        command = ["monitor", source, "--weights", weights, "--point", "0,20,30", "--jsonl", str(lines)]
+        assert main(command) == 0
+        assert len([json.loads(line) for line in lines.read_text().splitlines()]) == FRAMES
+    assert "the dataset has no camera poses" not in capsys.readouterr().out
+
+
+def test_monitor_stops_where_the_recording_is_torn(
+    sources: dict[str, str], weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    steps, step = [], Stream.step
+
+    def counted(self: Stream, *arguments, **named):
+        steps.append(1)
+        return step(self, *arguments, **named)
+
+    monkeypatch.setattr(Stream, "step", counted)
+    frames = sorted((Path(sources["folder"]) / "rgb").iterdir())
+    kept = frames[4].read_bytes()
+    frames[4].write_bytes(kept[:50])
+    try:
+        assert main(["monitor", sources["folder"], "--weights", weights, "--point", "0,20,30"]) != 0
+    finally:
+        frames[4].write_bytes(kept)
+    assert len(steps) == 4
+    assert "000004.png" in capsys.readouterr().err
+
+
+def test_points_beyond_the_end(sources: dict[str, str]):
+    source = Source(sources["clip.mcap"], point=(f"{FRAMES},1,1",))
+    with pytest.raises(ValueError, match=f"0 to {FRAMES - 1}, got {FRAMES}"):
+        source.queries(source.open())
+
+
+def test_no_such_recording():
+    with pytest.raises(RecordingError, match="no such file or folder"):
+        Source("nowhere.mcap").open()

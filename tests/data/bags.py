@@ -1,0 +1,167 @@
+"""Small bags for the tests: ROS 2 messages as dictionaries, written as MCAP or as a rosbag2 folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from quest.types import Camera
+
+SECOND = 1_000_000_000
+COLOUR, DEPTH = "/camera/color/image_raw", "/camera/depth/image_rect_raw"
+COLOUR_INFO, DEPTH_INFO = "/camera/color/camera_info", "/camera/depth/camera_info"
+COLOUR_FRAME, DEPTH_FRAME = "camera_color_optical_frame", "camera_depth_optical_frame"
+
+Sent = tuple[str, str, dict[str, Any], int]
+"""Topic, type such as sensor_msgs/msg/Image, fields, and time of logging in nanoseconds."""
+
+
+def header(frame: str, stamp_ns: int) -> dict[str, Any]:
+    return {"stamp": {"sec": stamp_ns // SECOND, "nanosec": stamp_ns % SECOND}, "frame_id": frame}
+
+
+def image(
+    pixels: np.ndarray,
+    encoding: str,
+    stamp_ns: int,
+    *,
+    frame: str = COLOUR_FRAME,
+    pad: int = 0,
+    big_endian: bool = False,
+) -> dict[str, Any]:
+    """An Image whose rows may end in bytes that mean nothing."""
+    order = pixels.astype(pixels.dtype.newbyteorder(">" if big_endian else "<"))
+    rows = np.ascontiguousarray(order).reshape(pixels.shape[0], -1).view(np.uint8)
+    padded = np.pad(rows, ((0, 0), (0, pad)), constant_values=170)
+    return {
+        "header": header(frame, stamp_ns),
+        "height": pixels.shape[0],
+        "width": pixels.shape[1],
+        "encoding": encoding,
+        "is_bigendian": int(big_endian),
+        "step": padded.shape[1],
+        "data": padded.tobytes(),
+    }
+
+
+def compressed(data: bytes, kind: str, stamp_ns: int, *, frame: str = COLOUR_FRAME) -> dict[str, Any]:
+    return {"header": header(frame, stamp_ns), "format": kind, "data": data}
+
+
+def png(pixels: np.ndarray) -> bytes:
+    return cv2.imencode(".png", pixels)[1].tobytes()
+
+
+def camera_info(
+    camera: Camera,
+    stamp_ns: int,
+    *,
+    frame: str = COLOUR_FRAME,
+    model: str = "plumb_bob",
+    d: Sequence[float] = (0.0,) * 5,
+) -> dict[str, Any]:
+    k = [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
+    return {
+        "header": header(frame, stamp_ns),
+        "height": camera.height,
+        "width": camera.width,
+        "distortion_model": model,
+        "d": list(d),
+        "k": k,
+        "r": np.eye(3).ravel().tolist(),
+        "p": [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
+    }
+
+
+def transform(parent: str, child: str, parent_from_child: np.ndarray, stamp_ns: int) -> dict[str, Any]:
+    """A TFMessage of one transform."""
+    x, y, z = parent_from_child[:3, 3].tolist()
+    qx, qy, qz, qw = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat().tolist()
+    stamped = {
+        "header": header(parent, stamp_ns),
+        "child_frame_id": child,
+        "transform": {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}},
+    }
+    return {"transforms": [stamped]}
+
+
+def write_mcap(path: Path, sent: Sequence[Sent], **options: Any) -> Path:
+    """An MCAP file, by the writer of the format's makers."""
+    from mcap_ros2.writer import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, schemas = get_typestore(Stores.ROS2_HUMBLE), {}
+    with path.open("wb") as file, Writer(file, **options) as writer:
+        for topic, kind, fields, log_ns in sent:
+            if kind not in schemas:
+                schemas[kind] = writer.register_msgdef(kind, store.generate_msgdef(kind, ros_version=2)[0])
+            writer.write_message(topic, schemas[kind], fields, log_time=log_ns)
+    return path
+
+
+def write_bag(path: Path, sent: Sequence[Sent], *, storage: str = "sqlite3") -> Path:
+    """A rosbag2 folder, by the writer of the rosbags library."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, connections = get_typestore(Stores.ROS2_HUMBLE), {}
+    with Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()]) as writer:
+        for topic, kind, fields, log_ns in sent:
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            writer.write(connections[topic], log_ns, store.serialize_cdr(_message(store, kind, fields), kind))
+    return path
+
+
+def write_ros1(path: Path, sent: Sequence[Sent]) -> Path:
+    """A ROS 1 bag, by the writer of the rosbags library."""
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store, connections = get_typestore(Stores.ROS1_NOETIC), {}
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+    with Writer(path) as writer:
+        for number, (topic, kind, fields, log_ns) in enumerate(sent):
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=store)
+            message = _message(store, kind, _as_ros1(kind, fields, number))
+            writer.write(connections[topic], log_ns, store.serialize_ros1(message, kind))
+    return path
+
+
+def _as_ros1(kind: str, fields: dict[str, Any], number: int) -> dict[str, Any]:
+    """The fields by their names in ROS 1."""
+    if kind.endswith("TFMessage"):
+        stamped = [{**one, "header": {**one["header"], "seq": number}} for one in fields["transforms"]]
+        return {"transforms": stamped}
+    named = {name.upper() if name in "dkrp" else name: value for name, value in fields.items()}
+    return {**named, "header": {**fields["header"], "seq": number}}
+
+
+def _message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
+    """An object of the typestore from nested dictionaries."""
+    from rosbags.interfaces import Nodetype
+
+    values = {}
+    for name, (node, what) in store.fielddefs[kind][1]:
+        value = fields[name]
+        if node == Nodetype.NAME:
+            value = _message(store, what, value)
+        elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, element), _ = what
+            if inner == Nodetype.NAME:
+                value = [_message(store, element, one) for one in value]
+            elif isinstance(value, bytes):
+                value = np.frombuffer(value, np.uint8)
+            else:
+                value = np.array(value, {"float64": np.float64, "float32": np.float32}[element[0]])
+        values[name] = value
+    return store.types[kind](**values)

@@ -1,0 +1,482 @@
+"""ROS bags: the same frames however they are stored; encodings, pairing in time, tf, lenses, and what is refused."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from quest.data.frame_source import Parts
+from quest.data.recording import open_recording, read_recording
+from quest.data.ros_frames import CAMERA_CHANGED, LATE, NO_DEPTH, NO_POSE, NO_STAMP
+from quest.errors import RecordingError
+from quest.types import Camera, Frame
+from tests.data.bags import (
+    COLOUR,
+    COLOUR_FRAME,
+    COLOUR_INFO,
+    DEPTH,
+    DEPTH_FRAME,
+    DEPTH_INFO,
+    SECOND,
+    Sent,
+    camera_info,
+    compressed,
+    image,
+    png,
+    transform,
+    write_bag,
+    write_mcap,
+    write_ros1,
+)
+
+CAMERA = Camera(40.0, 41.0, 16.2, 12.1, 32, 24)
+IMAGE, INFO, TF = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+FRAMES = 8
+BEGIN = 1_700_000_000 * SECOND
+STEP = SECOND // 20
+RNG = np.random.default_rng(0)
+RGB = RNG.integers(0, 256, (FRAMES, 24, 32, 3)).astype(np.uint8)
+DEPTH_MM = RNG.integers(500, 3000, (FRAMES, 24, 32)).astype(np.uint16)
+OPTICAL = np.eye(4)
+OPTICAL[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+
+WRITERS: dict[str, Callable[[Path, Sequence[Sent]], Path]] = {
+    "mcap": lambda folder, sent: write_mcap(folder / "bag.mcap", sent),
+    "sqlite3 folder": lambda folder, sent: write_bag(folder / "bag", sent),
+    "mcap folder": lambda folder, sent: write_bag(folder / "bag", sent, storage="mcap"),
+    "ros1": lambda folder, sent: write_ros1(folder / "bag.bag", sent),
+}
+
+
+def base_at(seconds: float) -> np.ndarray:
+    """Where the robot is: it drives and turns evenly."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", 0.4 * seconds).as_matrix()
+    pose[:3, 3] = [0.5 * seconds, 0.1, 0.3]
+    return pose
+
+
+def colours(t: int, *, at_ns: int | None = None, **changes: Any) -> Sent:
+    stamp = BEGIN + t * STEP if at_ns is None else at_ns
+    return COLOUR, IMAGE, image(RGB[t], "rgb8", stamp) | changes, stamp
+
+
+def depths(t: int, *, at_ns: int | None = None, topic: str = DEPTH) -> Sent:
+    stamp = BEGIN + t * STEP if at_ns is None else at_ns
+    return topic, IMAGE, image(DEPTH_MM[t], "16UC1", stamp), stamp
+
+
+def info(t: int = 0, camera: Camera = CAMERA, **changes: Any) -> Sent:
+    return COLOUR_INFO, INFO, camera_info(camera, BEGIN + t * STEP, **changes), BEGIN + t * STEP
+
+
+def recording() -> list[Sent]:
+    """A driving robot: colours, aligned depth a little later, cameras, and transforms between the frames' times."""
+    mount = np.eye(4)
+    mount[:3, 3] = [0.1, 0.02, 0.5]
+    sent: list[Sent] = [
+        ("/tf_static", TF, transform("base", "camera_link", mount, BEGIN), BEGIN),
+        ("/tf_static", TF, transform("camera_link", COLOUR_FRAME, OPTICAL, BEGIN), BEGIN),
+    ]
+    for t in range(FRAMES):
+        sent += [info(t), colours(t), depths(t, at_ns=BEGIN + t * STEP + STEP // 10)]
+    for k in range(-2, 4 * FRAMES):
+        at = BEGIN + k * STEP // 3
+        sent.append(("/tf", TF, transform("odom", "base", base_at((at - BEGIN) / SECOND), at), at))
+    return sorted(sent, key=lambda one: one[3])
+
+
+def frames_of(path: Path, **parts: Any) -> tuple[list[Frame], tuple[str, ...]]:
+    source = open_recording(path, parts=Parts(**parts))
+    frames = list(source)
+    return frames, source.flags
+
+
+@pytest.mark.parametrize("writer", WRITERS.values(), ids=WRITERS.keys())
+def test_every_storage_gives_the_same_frames(writer: Callable[[Path, Sequence[Sent]], Path], tmp_path: Path):
+    source = open_recording(writer(tmp_path, recording()))
+    assert (source.name, source.length) == ("bag", FRAMES)
+    clip = source.clip()
+    assert source.flags == ()
+    assert clip.camera == CAMERA
+    np.testing.assert_array_equal(clip.rgb, RGB)
+    assert clip.depth_m is not None
+    np.testing.assert_allclose(clip.depth_m, DEPTH_MM / 1000, atol=1e-6)
+    np.testing.assert_allclose(clip.stamp_s, [(BEGIN + t * STEP) * 1e-9 for t in range(FRAMES)], atol=1e-6)
+    for t in range(FRAMES):
+        world_from_cam = base_at(t * STEP / SECOND)
+        world_from_cam[:3, 3] += world_from_cam[:3, :3] @ [0.1, 0.02, 0.5]
+        world_from_cam[:3, :3] = world_from_cam[:3, :3] @ OPTICAL[:3, :3]
+        np.testing.assert_allclose(clip.cam_from_world[t], np.linalg.inv(world_from_cam), atol=2e-4)
+
+
+def test_frames_come_before_the_bag_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    from quest.data.mcap_file import McapMessages
+
+    path = write_mcap(tmp_path / "bag.mcap", recording(), chunk_size=4096)
+    read, original = [], McapMessages.read
+
+    def counted(self: McapMessages, topics: Any) -> Any:
+        for found in original(self, topics):
+            read.append(found[0])
+            yield found
+
+    source = open_recording(path)
+    monkeypatch.setattr(McapMessages, "read", counted)
+    iterator = iter(source)
+    next(iterator)
+    assert read.count(COLOUR) <= 3
+    assert len(list(iterator)) == FRAMES - 1
+    assert len(list(source)) == FRAMES, "a second pass begins anew"
+
+
+BAYER = {"rggb": ((0, 1), (1, 2)), "bggr": ((2, 1), (1, 0)), "gbrg": ((1, 2), (0, 1)), "grbg": ((1, 0), (2, 1))}
+
+
+def mosaic(rgb: np.ndarray, pattern: str) -> np.ndarray:
+    y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]]
+    channel = np.array(BAYER[pattern])[y % 2, x % 2]
+    return np.take_along_axis(rgb, channel[..., None], axis=-1)[..., 0]
+
+
+FLAT = np.tile(np.array([200, 100, 40], np.uint8), (24, 32, 1))
+ALPHA = np.full((24, 32, 1), 77, np.uint8)
+PICTURES: dict[str, tuple[np.ndarray, np.ndarray]] = {
+    "rgb8": (RGB[0], RGB[0]),
+    "bgr8": (RGB[0][..., ::-1], RGB[0]),
+    "8UC3": (RGB[0][..., ::-1], RGB[0]),
+    "rgba8": (np.concatenate((RGB[0], ALPHA), -1), RGB[0]),
+    "bgra8": (np.concatenate((RGB[0][..., ::-1], ALPHA), -1), RGB[0]),
+    "mono8": (RGB[0][..., 0], np.repeat(RGB[0][..., :1], 3, -1)),
+    "rgb16": (RGB[0].astype(np.uint16) * 257, RGB[0]),
+    **{f"bayer_{name}8": (mosaic(FLAT, name), FLAT) for name in BAYER},
+    "bayer_rggb16": (mosaic(FLAT, "rggb").astype(np.uint16) * 257, FLAT),
+}
+
+
+@pytest.mark.parametrize("pad", [0, 6])
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("encoding", PICTURES)
+def test_encodings_of_colours(encoding: str, big: bool, pad: int, tmp_path: Path):
+    pixels, expected = PICTURES[encoding]
+    sent = image(pixels, encoding, BEGIN, pad=pad, big_endian=big)
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), (COLOUR, IMAGE, sent, BEGIN)]))
+    np.testing.assert_array_equal(frames[0].rgb, expected)
+    assert frames[0].depth_m is None
+    assert flags == (NO_POSE, NO_DEPTH)
+
+
+def test_yuv_of_one_colour(tmp_path: Path):
+    grey = np.full((24, 32, 2), 128, np.uint8)
+    for encoding, luma in (("yuv422", 1), ("yuyv", 0)):
+        grey[..., luma] = 235
+        sent = (COLOUR, IMAGE, image(grey, encoding, BEGIN), BEGIN)
+        frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), sent]))
+        assert frames[0].rgb.min() > 250
+        grey[..., luma] = 128
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".jpg", "rgb8; jpeg compressed bgr8"), (".png", "png")])
+def test_compressed_colours(suffix: str, kind: str, tmp_path: Path):
+    smooth = cv2.GaussianBlur(RGB[0], (0, 0), 5)
+    data = cv2.imencode(suffix, smooth[..., ::-1])[1].tobytes()
+    topic = COLOUR + "/compressed"
+    sent = (topic, "sensor_msgs/msg/CompressedImage", compressed(data, kind, BEGIN), BEGIN)
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), sent]))
+    assert np.abs(frames[0].rgb.astype(int) - smooth).max() <= (0 if suffix == ".png" else 6)
+
+
+def depth_messages() -> dict[str, tuple[str, str, dict[str, Any]]]:
+    metres = (DEPTH_MM[0] / 1000).astype(np.float32)
+    a, b = 10_000.0, -0.5
+    header, kind = struct.Struct("<iff"), "sensor_msgs/msg/CompressedImage"
+    plain = header.pack(0, 0.0, 0.0) + png(DEPTH_MM[0])
+    quantised = header.pack(0, a, b) + png(np.rint(a / metres + b).astype(np.uint16))
+    return {
+        "16UC1": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, pad=4)),
+        "16UC1 big": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, big_endian=True)),
+        "mono16": (DEPTH, IMAGE, image(DEPTH_MM[0], "mono16", BEGIN)),
+        "32FC1": (DEPTH, IMAGE, image(metres, "32FC1", BEGIN, pad=8)),
+        "32FC1 big": (DEPTH, IMAGE, image(metres, "32FC1", BEGIN, big_endian=True)),
+        "compressedDepth": (DEPTH + "/compressedDepth", kind, compressed(plain, "16UC1; compressedDepth png", BEGIN)),
+        "compressedDepth 32FC1": (
+            DEPTH + "/compressedDepth",
+            kind,
+            compressed(quantised, "32FC1; compressedDepth png", BEGIN),
+        ),
+        "png": (DEPTH + "/compressed", kind, compressed(png(DEPTH_MM[0]), "16UC1; png compressed ", BEGIN)),
+    }
+
+
+@pytest.mark.parametrize("how", depth_messages())
+def test_encodings_of_depth(how: str, tmp_path: Path):
+    topic, kind, fields = depth_messages()[how]
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), colours(0), (topic, kind, fields, BEGIN)]))
+    assert frames[0].depth_m is not None
+    np.testing.assert_allclose(frames[0].depth_m, DEPTH_MM[0] / 1000, atol=2e-3 if "32FC1" in how else 1e-6)
+
+
+def test_missing_depth_is_zero(tmp_path: Path):
+    metres = (DEPTH_MM[0] / 1000).astype(np.float32)
+    metres[0, :3] = [np.nan, np.inf, -1]
+    sent = (DEPTH, IMAGE, image(metres, "32FC1", BEGIN), BEGIN)
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), colours(0), sent]))
+    assert frames[0].depth_m is not None
+    assert (frames[0].depth_m[0, :3] == 0).all()
+
+
+def test_depth_scale_overrules_millimetres(tmp_path: Path):
+    path = write_mcap(tmp_path / "bag.mcap", [info(), colours(0), depths(0)])
+    found = read_recording(path, depth_scale_m=1e-4)
+    assert found.depth_m is not None
+    np.testing.assert_allclose(found.depth_m[0], DEPTH_MM[0] / 10_000, atol=1e-6)
+
+
+def test_the_nearest_depth_in_time_is_taken(tmp_path: Path):
+    sent = [info(), *(colours(t) for t in range(4))]
+    sent += [depths(0, at_ns=BEGIN + 15 * STEP // 100), depths(1, at_ns=BEGIN + 95 * STEP // 100)]
+    sent += [depths(2, at_ns=BEGIN + 2 * STEP + STEP // 2)]  # 25 ms from both its neighbours
+    path = write_mcap(tmp_path / "bag.mcap", sorted(sent, key=lambda one: one[3]))
+    frames, flags = frames_of(path)
+    found = [None if f.depth_m is None else round(float(f.depth_m[5, 5]) * 1000) for f in frames]
+    assert found == [DEPTH_MM[0, 5, 5], DEPTH_MM[1, 5, 5], None, None]
+    assert "no depth within 0.02 s of the colours: 2 frames, first 2" in flags
+    frames, flags = frames_of(path, sync_s=0.03)
+    assert all(frame.depth_m is not None for frame in frames)
+    assert flags == (NO_POSE,)
+
+
+def test_a_clip_has_zeros_where_depth_is_missing(tmp_path: Path):
+    clip = read_recording(write_mcap(tmp_path / "bag.mcap", [info(), colours(0), depths(0), colours(1)]))
+    assert clip.depth_m is not None
+    assert (clip.depth_m[1] == 0).all()
+
+
+def test_depth_of_another_camera_is_registered(tmp_path: Path):
+    """A wall 2 m in front of the colours; the depth camera sits 5 cm to the left and has half the pixels."""
+    half = Camera(20.0, 20.5, 8.1, 6.05, 16, 12)
+    colour_from_depth = np.eye(4)
+    colour_from_depth[0, 3] = -0.05
+    wall = image(np.full((12, 16), 2000, np.uint16), "16UC1", BEGIN, frame=DEPTH_FRAME)
+    static = ("/tf_static", TF, transform(COLOUR_FRAME, DEPTH_FRAME, colour_from_depth, BEGIN), BEGIN)
+    depth_info = (DEPTH_INFO, INFO, camera_info(half, BEGIN, frame=DEPTH_FRAME), BEGIN)
+    sent = [static, info(), depth_info, colours(0), (DEPTH, IMAGE, wall, BEGIN)]
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    assert frames[0].depth_m is not None
+    assert (frames[0].depth_m[4:-4, 4:-4] == 2.0).all()
+    with pytest.raises(RecordingError, match=r"no tf joins the depth's frame 'camera_depth_optical_frame'.*tf_static"):
+        open_recording(write_mcap(tmp_path / "bag.mcap", sent[1:]))
+    with pytest.raises(RecordingError, match=r"no camera_info for /camera/depth.*--topic-depth-info"):
+        open_recording(write_mcap(tmp_path / "bag.mcap", [static, info(), colours(0), (DEPTH, IMAGE, wall, BEGIN)]))
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent[1:]), topic_depth="none")
+    assert frames[0].depth_m is None
+    assert NO_DEPTH in flags
+
+
+@pytest.mark.parametrize(
+    ("model", "d"),
+    [
+        ("plumb_bob", (-0.3, 0.1, 0.0, 0.0, 0.0)),
+        ("rational_polynomial", (0.4, 0.1, 0.0, 0.0, 0.0, 0.6, 0.1, 0.0)),
+        ("equidistant", (0.01, 0.0, 0.0, 0.0)),
+    ],
+)
+def test_distorted_colours_are_rectified(model: str, d: tuple[float, ...], tmp_path: Path):
+    from quest.data.distortion import Distortion, Rectifier
+
+    sent = [info(model=model, d=d), colours(0)]
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    np.testing.assert_array_equal(frames[0].rgb, Rectifier(CAMERA, Distortion(model, d)).rgb(RGB[0]))
+    assert (frames[0].rgb != RGB[0]).any()
+
+
+def test_rectified_topics_use_the_projection_matrix(tmp_path: Path):
+    message = camera_info(CAMERA, BEGIN, d=(-0.3, 0.1, 0.0, 0.0, 0.0))
+    message["p"][0] = 55.0
+    topic = "/camera/color/image_rect_color"
+    sent = [(COLOUR_INFO, INFO, message, BEGIN), (topic, IMAGE, image(RGB[0], "rgb8", BEGIN), BEGIN)]
+    source = open_recording(write_mcap(tmp_path / "bag.mcap", sent))
+    assert source.camera.fx == 55.0
+    np.testing.assert_array_equal(next(iter(source)).rgb, RGB[0])
+
+
+def test_times_of_logging_where_headers_have_none(tmp_path: Path):
+    sent = [info()]
+    sent += [(COLOUR, IMAGE, image(RGB[t], "rgb8", 0), BEGIN + t * STEP) for t in range(3)]
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    np.testing.assert_allclose(np.diff([frame.stamp_s for frame in frames]), 0.05, atol=1e-6)
+    assert NO_STAMP in flags
+
+
+def test_a_clock_that_begins_at_zero_is_kept(tmp_path: Path):
+    sent = [info()] + [(COLOUR, IMAGE, image(RGB[t], "rgb8", t * STEP), BEGIN + t * STEP) for t in range(3)]
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    assert [round(frame.stamp_s, 6) for frame in frames] == [0.0, 0.05, 0.1]
+    assert NO_STAMP not in flags
+
+
+def test_world_frame(tmp_path: Path):
+    path = write_mcap(tmp_path / "bag.mcap", recording())
+    frames, _ = frames_of(path, world_frame="base")
+    np.testing.assert_allclose(frames[0].cam_from_world, frames[-1].cam_from_world)
+    with pytest.raises(RecordingError, match=r"no tf joins .* to 'map' \(--world-frame\); it hangs on 'odom'"):
+        frames_of(path, world_frame="map")
+
+
+def test_tf_that_ends_early_is_said(tmp_path: Path):
+    sent = [one for one in recording() if one[0] != "/tf" or one[3] < BEGIN + STEP // 2]
+    sent += [colours(0, at_ns=BEGIN + 2 * SECOND), depths(0, at_ns=BEGIN + 2 * SECOND)]
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    assert len(frames) == FRAMES + 1
+    assert flags == (f"tf has nothing within 0.5 s: the nearest pose is used: 1 frames, first {FRAMES}",)
+
+
+def test_late_colours_are_left_out(tmp_path: Path):
+    sent = [info(), colours(1), (COLOUR, IMAGE, image(RGB[0], "rgb8", BEGIN), BEGIN + STEP + 1), colours(2)]
+    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    assert len(frames) == 2
+    assert f"{LATE}: 1 frames, first 1" in flags
+
+
+def test_a_camera_that_changes_is_said(tmp_path: Path):
+    sent = [info(), colours(0), info(1, Camera(80.0, 80.0, 16, 12, 32, 24)), colours(1)]
+    assert CAMERA_CHANGED in frames_of(write_mcap(tmp_path / "bag.mcap", sent))[1]
+
+
+def test_topics_are_chosen_by_name_where_several_could_be(tmp_path: Path):
+    aligned = "/camera/aligned_depth_to_color/image_raw"
+    infrared = ("/camera/infra1/image_rect_raw", IMAGE, image(RGB[0][..., 0], "mono8", BEGIN), BEGIN)
+    other_depth = (DEPTH, IMAGE, image(DEPTH_MM[1], "16UC1", BEGIN, frame=DEPTH_FRAME), BEGIN)
+    path = write_mcap(tmp_path / "bag.mcap", [info(), colours(0), infrared, depths(0, topic=aligned), other_depth])
+    frames, _ = frames_of(path)
+    np.testing.assert_array_equal(frames[0].rgb, RGB[0])
+    assert frames[0].depth_m is not None
+    np.testing.assert_allclose(frames[0].depth_m, DEPTH_MM[0] / 1000, atol=1e-6)
+
+
+def two_cameras() -> list[Sent]:
+    return [info(), colours(0), ("/wrist/color/image_raw", IMAGE, image(RGB[1], "rgb8", BEGIN), BEGIN)]
+
+
+BAD: dict[str, tuple[Callable[[], list[Sent]], dict[str, Any], str]] = {
+    "no images": (lambda: [info()], {}, r"no topic of colour images.*topics found: /camera/color/camera_info"),
+    "two cameras": (two_cameras, {}, "several topics may be the colours: /camera/color.*, /wrist.*--topic-rgb"),
+    "no such topic": (
+        lambda: [info(), colours(0)],
+        {"topic_rgb": "/nothing"},
+        r"no topic /nothing \(--topic-rgb\); topics found: .*image_raw \(sensor_msgs/Image, 1\)",
+    ),
+    "topic of another type": (
+        lambda: [info(), colours(0)],
+        {"topic_rgb": COLOUR_INFO},
+        "is of type sensor_msgs/CameraInfo, expected sensor_msgs/Image",
+    ),
+    "no camera_info": (lambda: [colours(0)], {}, "no camera_info for /camera/color/image_raw.*--camera FILE"),
+    "never calibrated": (
+        lambda: [(COLOUR_INFO, INFO, camera_info(CAMERA, BEGIN) | {"k": [0.0] * 9}, BEGIN), colours(0)],
+        {},
+        "never calibrated",
+    ),
+    "camera of another size": (
+        lambda: [info(camera=Camera(40.0, 40.0, 32.0, 24.0, 64, 48)), colours(0)],
+        {},
+        "is 32 x 24 but its camera is for 64 x 48",
+    ),
+    "unknown lens": (lambda: [info(model="omni", d=(0.1, 0.2)), colours(0)], {}, "distortion model 'omni' is unknown"),
+    "mixed sizes": (
+        lambda: [info(), colours(0), (COLOUR, IMAGE, image(RGB[1, ::2, ::2], "rgb8", BEGIN + STEP), BEGIN + STEP)],
+        {},
+        "message 1 of /camera/color/image_raw: colours: 16 x 12, but the camera is for 32 x 24",
+    ),
+    "torn image": (
+        lambda: [info(), colours(0), colours(1, data=b"abc")],
+        {},
+        "message 1 of /camera/color/image_raw: 3 bytes for 32 x 24 pixels",
+    ),
+    "torn JPEG": (
+        lambda: [
+            info(),
+            (COLOUR + "/compressed", "sensor_msgs/msg/CompressedImage", compressed(b"no", "jpeg", BEGIN), BEGIN),
+        ],
+        {},
+        "2 bytes that are no JPEG or PNG",
+    ),
+    "time goes back": (
+        lambda: [info(), colours(0), (COLOUR, IMAGE, image(RGB[1], "rgb8", BEGIN - 9 * SECOND), BEGIN + STEP)],
+        {},
+        r"message 1 of /camera/color/image_raw: time goes back by 9.000 s; cut the bag",
+    ),
+    "depth is no depth": (
+        lambda: [info(), colours(0), depths(0), ("/b/image_raw", IMAGE, image(RGB[1], "rgb8", BEGIN), BEGIN)],
+        {"topic_rgb": COLOUR, "topic_depth": "/b/image_raw"},
+        "encoding 'rgb8' is not one of depth",
+    ),
+    "colours are no colours": (
+        lambda: [info(), colours(0), depths(0)],
+        {"topic_rgb": DEPTH, "topic_info": COLOUR_INFO},
+        "encoding '16UC1' is not one of colours",
+    ),
+    "wrong units": (
+        lambda: [
+            info(),
+            colours(0),
+            (DEPTH, IMAGE, image((DEPTH_MM[0] * 1.0).astype(np.float32), "32FC1", BEGIN), BEGIN),
+        ],
+        {},
+        "the units are wrong, depth_scale_m = 0.001 would give 1.8",
+    ),
+    "RVL": (
+        lambda: [
+            info(),
+            colours(0),
+            (
+                DEPTH + "/compressedDepth",
+                "sensor_msgs/msg/CompressedImage",
+                compressed(b"0" * 99, "16UC1; compressedDepth rvl", BEGIN),
+                BEGIN,
+            ),
+        ],
+        {},
+        "compressed as RVL",
+    ),
+}
+
+
+@pytest.mark.parametrize("how", BAD)
+def test_what_is_refused(how: str, tmp_path: Path):
+    sent, parts, message = BAD[how]
+    path = write_mcap(tmp_path / "bag.mcap", sent())
+    with pytest.raises(RecordingError, match=message) as caught:
+        read_recording(path, parts=Parts(**parts))
+    assert "bag" in str(caught.value)
+
+
+def test_empty_and_torn_folders(tmp_path: Path):
+    with pytest.raises(RecordingError, match="has no topics"):
+        open_recording(write_bag(tmp_path / "empty", []))
+    path = write_bag(tmp_path / "torn", recording())
+    (database,) = path.glob("*.db3")
+    database.write_bytes(database.read_bytes()[:8000])
+    with pytest.raises(RecordingError, match=r"the bag is torn.*reindex"):
+        read_recording(path)
+    path = write_bag(tmp_path / "words", recording())
+    (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [")
+    with pytest.raises(RecordingError, match="cannot be read"):
+        open_recording(path)
+    path = write_bag(tmp_path / "gone", recording())
+    next(path.glob("*.db3")).unlink()
+    with pytest.raises(RecordingError, match="cannot be read"):
+        read_recording(path)
+
+
+def test_a_camera_file_overrules_the_bag(tmp_path: Path):
+    path = write_mcap(tmp_path / "bag.mcap", [colours(0)])
+    other = Camera(50.0, 50.0, 16.0, 12.0, 32, 24)
+    assert open_recording(path, camera=other).camera == other
