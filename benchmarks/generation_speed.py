@@ -1,18 +1,27 @@
-"""Measure how fast takes are made, loading, rendering, annotating and writing included.
+"""Measure how fast takes are made, beside a loop that does nothing but render the same scenes.
 
     python benchmarks/generation_speed.py --out benchmarks/results/speed/generation.json
 
-The first take pays for the renderer's shaders and is left out. Let nothing else run meanwhile.
+Per take, in turn: `generate` is what `quest generate` does (load or make the object, choose joints and cameras, render,
+annotate, and compress and write the take in the background while the next one is made); `bare` poses the same objects
+in the same dressed scene before the same cameras, renders, and fetches colours, positions and labels, only for the
+moments that `generate` draws as well. Scenes are set up within `generate` and not within `bare`. The first take pays
+for the renderer's shaders and is left out. Let nothing else run meanwhile.
 """
 
 from __future__ import annotations
 
+import cProfile
 import json
 import os
+import pstats
 import tempfile
 import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
@@ -20,52 +29,137 @@ from rich.console import Console
 
 from quest.data.provenance import code_commit, machine, package_versions
 from quest.data.store import TakeStore
-from quest.sim.generate import TakeSettings, generate_take
+from quest.sim.cameras import PosedCamera
+from quest.sim.objects import SimObject
 from quest.sim.plan import ObjectShelf, plan_takes, procedural_objects
-from quest.sim.renderer import Renderer
+from quest.sim.production import make_take, write_once
+from quest.sim.renderer import Renderer, Stage
+from quest.types import Take
 
 
 @dataclass(frozen=True)
 class GenerationSpeed:
-    """Frames per second of `quest generate` on procedural objects, three views of 224 x 224."""
+    """Frames per second of `quest generate` on procedural objects, three views of 224 x 224, and of a bare loop."""
 
     takes: int = 12
     """Takes that are timed."""
     level: int = 1
     """Joints that move one after the other."""
+    profile: bool = False
+    """Also print where `generate` spends its time; this slows it down."""
     out: Path | None = None
     """Result file."""
 
     def run(self) -> int:
-        """Time the takes one by one and print the mean with a 95 % bootstrap interval over takes."""
-        settings, renderer = TakeSettings(), Renderer()
-        objects = procedural_objects(self.takes + 1, 0)
-        seconds, frames = [], []
-        with tempfile.TemporaryDirectory() as folder, ObjectShelf() as shelf:
-            store = TakeStore(folder)
-            for spec in plan_takes(objects, levels=(self.level,), takes_per_object=1):
-                start = time.perf_counter()
-                sim_object = shelf.load(spec.source, spec.object_id)
-                take = generate_take(sim_object, spec.level, spec.seed, renderer=renderer, settings=settings)
-                store.write(take)
-                seconds.append(time.perf_counter() - start)
-                frames.append(len(take) * len(take.views))
-        result = {"frames_per_s": _rate(np.array(frames[1:]), np.array(seconds[1:])), "first_take_s": seconds[0]}
-        result |= {"n_takes": self.takes, "n_frames": sum(frames[1:]), "level": self.level, "machine": machine()}
-        result |= {"load": os.getloadavg()[0], "renderer": str(renderer.device), "commit": code_commit()}
-        result |= {"versions": package_versions(), "command": "python benchmarks/generation_speed.py"}
+        """Time both take by take and print means with 95 % bootstrap intervals over takes."""
+        renderer = _WatchedRenderer()
+        specs = plan_takes(procedural_objects(self.takes + 1, 0), levels=(self.level,), takes_per_object=1)
+        timed: list[tuple[float, ...]] = []
+        profiler = cProfile.Profile() if self.profile else None
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            ObjectShelf() as shelf,
+            ThreadPoolExecutor(1) as writer,
+        ):
+            store, writing = TakeStore(folder), _done()
+            for spec in specs:
+                if profiler and timed:
+                    profiler.enable()
+                start = _now()
+                take, _ = make_take(spec, renderer=renderer, shelf=shelf)
+                writing.result()
+                generate_s = _now() - start
+                if profiler:
+                    profiler.disable()
+                bare_s = _bare_loop(renderer.latest(), take)
+                # It is written while the next one is made, and by then the bare loop is over.
+                writing = writer.submit(write_once, store, take)
+                timed.append((len(take) * len(take.views), *generate_s, *bare_s))
+            start = _now()
+            writing.result()
+            last, rest = timed[-1], _now() - start
+            timed[-1] = (last[0], last[1] + rest[0], last[2] + rest[1], *last[3:])
+        result = _summary(np.array(timed[1:])) | {"first_take_s": timed[0][1], "level": self.level}
+        result |= {"machine": machine(), "load": os.getloadavg()[0], "renderer": str(renderer.device)}
+        result |= {"commit": code_commit(), "versions": package_versions()}
+        result |= {"command": "python benchmarks/generation_speed.py"}
         Console().print_json(data=result)
+        if profiler:
+            pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
         if self.out is not None:
             self.out.parent.mkdir(parents=True, exist_ok=True)
             self.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
         return 0
 
 
-def _rate(frames: np.ndarray, seconds: np.ndarray) -> dict[str, float]:
-    draws = np.random.default_rng(0).integers(len(frames), size=(1000, len(frames)))
-    rates = frames[draws].sum(axis=1) / seconds[draws].sum(axis=1)
-    low, high = np.quantile(rates, (0.025, 0.975))
-    return {"mean": float(frames.sum() / seconds.sum()), "low": float(low), "high": float(high)}
+class _WatchedRenderer(Renderer):
+    """A renderer that says which stage it made last."""
+
+    _made: Stage | None = None
+
+    def stage(
+        self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Callable[..., None] | None = None
+    ) -> Stage:
+        self._made = super().stage(sim_object, cameras, dress)
+        return self._made
+
+    def latest(self) -> Stage:
+        """The stage of the last take."""
+        assert self._made is not None
+        return self._made
+
+
+def _now() -> np.ndarray:
+    """Seconds on the wall and of processor time of all threads."""
+    return np.array([time.perf_counter(), time.process_time()])
+
+
+def _bare_loop(stage: Stage, take: Take) -> np.ndarray:
+    """Seconds and processor seconds that rendering and fetching alone take."""
+    scene, cameras = stage._scene, [camera for camera, _ in stage._cameras]
+    start = _now()
+    last: Any = None
+    for pose in take.link_pose:
+        if last is not None and np.array_equal(pose, last):
+            continue
+        stage.pose(pose)
+        scene.update_render()
+        for camera in cameras:
+            camera.take_picture()
+        for camera in cameras:
+            for name in ("Color", "Position", "Segmentation"):
+                camera.get_picture(name)
+        last = pose
+    return _now() - start
+
+
+def _summary(timed: np.ndarray) -> dict[str, Any]:
+    frames = timed[:, 0]
+    return {
+        "frames_per_s": _interval(timed, lambda t: t[..., 0].sum(-1) / t[..., 1].sum(-1)),
+        "bare_frames_per_s": _interval(timed, lambda t: t[..., 0].sum(-1) / t[..., 3].sum(-1)),
+        "share_of_bare": _interval(timed, lambda t: t[..., 3].sum(-1) / t[..., 1].sum(-1)),
+        "share_of_bare_processor_time": _interval(timed, lambda t: t[..., 4].sum(-1) / t[..., 2].sum(-1)),
+        "per_take": [
+            {"frames": int(n), "generate_s": g, "generate_cpu_s": gc, "bare_s": b, "bare_cpu_s": bc}
+            for n, g, gc, b, bc in zip(frames, *np.round(timed.T[1:], 3).tolist(), strict=True)
+        ],
+        "n_takes": len(timed),
+        "n_frames": int(frames.sum()),
+    }
+
+
+def _interval(timed: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
+    """A statistic of the takes, and its 95 % bootstrap interval over takes."""
+    draws = np.random.default_rng(0).integers(len(timed), size=(1000, len(timed)))
+    low, high = np.quantile(statistic(timed[draws]), (0.025, 0.975))
+    return {"mean": float(statistic(timed)), "low": float(low), "high": float(high)}
+
+
+def _done() -> Future[None]:
+    future: Future[None] = Future()
+    future.set_result(None)
+    return future
 
 
 if __name__ == "__main__":

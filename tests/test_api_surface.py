@@ -23,7 +23,7 @@ PUBLIC = [
     "load",
 ]
 
-COMMANDS = ["data", "doctor", "eval", "eval-monitor", "generate", "monitor", "track", "train", "weights"]
+COMMANDS = ["data", "doctor", "eval", "eval-monitor", "generate", "monitor", "objects", "track", "train", "weights"]
 
 ERRORS = [
     "ConfigError",

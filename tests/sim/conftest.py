@@ -33,7 +33,7 @@ def cabinet(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
 def take(cabinet: SimObject, renderer: Renderer) -> Take:
     """A level-2 take of it, seen twice; every third frame."""
     from quest.sim.generate import generate_take
-    from quest.sim.staging import TakeSettings
+    from quest.sim.settings import TakeSettings
 
     settings = TakeSettings(views=2, size=96, every=3, frames_per_joint=24)
     return generate_take(cabinet, 2, 3, renderer=renderer, settings=settings, provenance={"commit": "none"})

@@ -134,3 +134,44 @@ def test_entity_behind_a_closed_door_is_inside(tmp_path: Path) -> None:
 )
 def test_part_names(name: str, label: str | None) -> None:
     assert part_label(name) == label
+
+
+# A laptop that looks along -x, as PartNet-Mobility's do.
+LID = Link(
+    "lid",
+    (Box("screen_frame-1", (0.22, 0.34, 0.006), (-0.11, 0, 0.004)),),
+    kind="revolute",
+    origin=(0.11, 0, 0.02),
+    axis=(0, 1, 0),
+    limits=(0, 2.0),
+)
+BASE = Link("base_body", (Box("base_frame-2", (0.22, 0.34, 0.02), (0, 0, 0.01)),))
+
+
+def test_laptop_has_a_rim_to_open_and_one_to_lift(tmp_path: Path) -> None:
+    laptop = load_object(write_object(tmp_path / "laptop", BASE, LID, category="Laptop"))
+    assert [(e.name, e.joint, e.body) for e in laptop.entities] == [
+        ("lid/rim", 0, 1), ("base/rim", -1, 0), ("lid/hinge", 0, 1)
+    ]  # fmt: skip
+    lid, base = (in_world(laptop, entity(laptop, name)) for name in ("lid/rim", "base/rim"))
+    low, high = bounds(laptop, "base_frame-2")
+    assert base[0] == pytest.approx(high[0], abs=1e-3)  # the free edge, opposite the hinge
+    assert base[1] == pytest.approx((low[1] + high[1]) / 2, abs=0.01)
+    assert low[2] <= base[2] <= high[2]
+    assert lid[2] > base[2]
+    assert laptop.movable == (0,)
+    assert entity(laptop, "base/rim").travel_m == 0
+
+
+@pytest.mark.parametrize(("category", "fixed"), [("Kettle", ["base/handle"]), ("StorageFurniture", [])])
+def test_handle_of_the_base_counts_where_one_lifts_by_it(tmp_path: Path, category: str, fixed: list[str]) -> None:
+    lid = Link(
+        "lid", (Box("lid-1", (0.2, 0.2, 0.02)),), kind="prismatic", origin=(0, 0, 0.2), axis=(0, 0, 1), limits=(0, 0.1)
+    )
+    body = Link(
+        "pot", (Box("base_body-2", (0.2, 0.2, 0.2), (0, 0, 0.1)), Box("handle-3", (0.05, 0.02, 0.1), (0, 0.13, 0.1)))
+    )
+    thing = load_object(write_object(tmp_path / "pot", body, lid, category=category))
+    assert [e.name for e in thing.entities if e.fixed] == fixed
+    assert thing.entities[0].label == ("knob" if category == "Kettle" else "front")
+    assert thing.movable == (0,)

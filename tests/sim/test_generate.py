@@ -22,7 +22,8 @@ from quest.sim.generate import generate_take
 from quest.sim.motion import FRAMES_PER_S, HOLD_FRAMES
 from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Renderer
-from quest.sim.staging import TakeSettings, choose_joints
+from quest.sim.settings import TakeSettings
+from quest.sim.staging import choose_joints
 from quest.types import Take, View
 from tests.sim.small_objects import CARCASS, DOOR, DRAWER, TRAY, write_cabinet, write_object
 
@@ -240,7 +241,7 @@ def test_killed_run_leaves_whole_takes_and_goes_on(tmp_path: Path, renderer: Ren
         assert len(store.read(name)) == 3
     hashes = {name: store.data_hash(name) for name in there}
     again = Generate(
-        out=tmp_path / "takes",
+        out=str(tmp_path / "takes"),
         objects=("partnet:cabinet",),
         objects_root=tmp_path / "objects",
         takes_per_object=len(there) + 2,

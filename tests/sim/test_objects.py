@@ -209,7 +209,7 @@ def test_folder_of_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     [
         ("44817", {"handle"}),
         ("7320", None),  # names meshes that do not exist
-        ("kettle_dh", {"front"}),  # its meshes, but not its joint limits, carry a scale
+        ("kettle_dh", {"knob", "handle"}),  # its meshes, but not its joint limits, carry a scale
         ("bucket_dh", {"handle", "hinge"}),  # its origins lack the scale of its meshes
     ],
 )
@@ -232,5 +232,38 @@ def test_kettle_lid_lifts_off_by_a_few_centimetres(partnet_root: Path) -> None:
     folder = partnet_root / "kettle_dh"
     if not folder.is_dir():
         pytest.skip("no object kettle_dh")
-    (lid,) = load_object(folder).entities
+    lid, handle = load_object(folder).entities
     assert 0.02 < lid.travel_m < 0.1
+    assert (handle.name, handle.fixed, handle.travel_m) == ("base/handle", True, 0.0)
+
+
+@pytest.mark.partnet
+@pytest.mark.parametrize(
+    ("object_id", "names"),
+    [
+        ("01909", {"link_0/handle"}),  # its door's bar is called a door
+        ("door_dh", {"link_1/handle", "link_1/handle_2", "link_2/handle", "link_2/handle_2"}),
+        ("10495", {"link_0/handle", "base/handle"}),
+        ("101284", {"link_0/rim", "link_1/rim"}),
+        ("103104", {"link_0/rim", "link_1/rim"}),
+    ],
+)
+def test_real_objects_have_the_entities_of_their_category(partnet_root: Path, object_id: str, names: set[str]) -> None:
+    folder = partnet_root / object_id
+    if not folder.is_dir():
+        pytest.skip(f"no object {object_id}")
+    found = {e.name for e in load_object(folder).entities if e.label not in ("hinge", "knob")}
+    assert found == names
+
+
+def test_refrigerator_that_would_be_too_deep_is_a_small_one(tmp_path: Path) -> None:
+    deep = load_object(write_object(tmp_path / "deep", CARCASS, DOOR, category="Refrigerator"))
+    assert np.ptp(deep.articulation.world_points(deep.articulation.rest), axis=0)[2] == pytest.approx(1.7)
+    boxes = tuple(replace(b, size=(2 * b.size[0], *b.size[1:])) for b in CARCASS.boxes)
+    door = replace(DOOR, origin=(0.5, -0.3, 0.25))
+    deeper = load_object(
+        write_object(tmp_path / "deeper", replace(CARCASS, boxes=boxes), door, category="Refrigerator")
+    )
+    size = np.ptp(deeper.articulation.world_points(deeper.articulation.rest), axis=0)
+    assert size[0] == pytest.approx(0.65)
+    assert size[2] < 0.9

@@ -9,19 +9,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quest.errors import ConfigError, ObjectError
+from quest.sim.cameras import CameraStyle
 from quest.sim.generate import generate_take
-from quest.sim.motion import HOLD_FRAMES
+from quest.sim.motion import HOLD_FRAMES, MotionStyle
 from quest.sim.objects import SimObject, load_object
 from quest.sim.occlusion import SURROUNDINGS, occlusion_script
 from quest.sim.renderer import Renderer
-from quest.sim.staging import TakeSettings
-from quest.sim.suites import HIDDEN_FRAMES, SUITES, Suite
+from quest.sim.settings import TakeSettings
+from quest.sim.suites import HIDDEN_FRAMES, SUITES, find_suites
 from quest.types import Take
 from tests.sim.small_objects import CARCASS, DRAWER, articulation, write_object
 from tests.sim.test_generate import arrays
 
-ALONE = replace(SUITES["occlusion"], hidden=12)
-BESIDE = replace(ALONE, look_alike=True)
+ALONE = find_suites("occlusion")[0].hidden_for(12)
+BESIDE = ALONE.hidden_for(look_alike=True)
+HIDING = {suite.name: suite.hiding for (suite, *_) in SUITES.values() if suite.hiding is not None}
 SMALL = TakeSettings(views=1, size=64)
 
 seeds = st.integers(0, 2**31 - 1)
@@ -34,12 +36,11 @@ def chest(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
     return load_object(write_object(Path(tmp_path_factory.mktemp("objects")) / "chest", CARCASS, DRAWER, lower))
 
 
-@given(seeds, st.integers(*HIDDEN_FRAMES), st.integers(1, 3), st.sampled_from(sorted(SUITES)))
+@given(seeds, st.integers(*HIDDEN_FRAMES), st.integers(1, 3), st.sampled_from(sorted(HIDING)))
 def test_joints_move_in_view_and_stop_while_hidden(seed: int, hidden: int, count: int, name: str) -> None:
-    suite = SUITES[name]
     thing = articulation(("revolute", 0, 1.5), ("prismatic", 0, 0.4), ("revolute", -2, 0.1))
     joints = tuple(range(count))
-    position, episodes = occlusion_script(thing, joints, suite, hidden, np.random.default_rng(seed))
+    position, episodes = occlusion_script(thing, joints, HIDING[name], hidden, np.random.default_rng(seed))
     assert [e.joint for e in episodes] == list(joints)
     assert len(position) == episodes[-1].end
     np.testing.assert_array_equal(position[:HOLD_FRAMES], np.tile(thing.rest, (HOLD_FRAMES, 1)))
@@ -61,7 +62,7 @@ def test_joints_move_in_view_and_stop_while_hidden(seed: int, hidden: int, count
 def test_sixty_frames_hidden() -> None:
     for seed in range(20):
         _, (e,) = occlusion_script(
-            articulation(("prismatic", 0, 1)), (0,), SUITES["occlusion"], 60, np.random.default_rng(seed)
+            articulation(("prismatic", 0, 1)), (0,), HIDING["occlusion"], 60, np.random.default_rng(seed)
         )
         assert e.end - e.shown - e.slide >= 20
         assert e.hidden - e.slide - e.moves >= 12
@@ -121,7 +122,7 @@ def test_beside_a_look_alike_with_every_second_frame(chest: SimObject, renderer:
 
 @pytest.mark.render
 def test_two_joints_one_after_the_other(chest: SimObject, renderer: Renderer) -> None:
-    suite = replace(SUITES["lockers"], hidden=10)
+    suite = find_suites("lockers")[0].hidden_for(10)
     take = generate_take(chest, 2, 0, renderer=renderer, settings=SMALL, suite=suite)
     assert take.info.suite == "lockers"
     assert len(take) == 2 * (30 + 10)
@@ -142,10 +143,21 @@ def test_nothing_that_the_suite_could_hide(cabinet: SimObject, chest: SimObject,
 @pytest.mark.parametrize("hidden", [9, 121])
 def test_hidden_for_too_short_or_too_long(hidden: int) -> None:
     with pytest.raises(ConfigError, match=f"10 to 120 frames, got {hidden}"):
-        replace(SUITES["occlusion"], hidden=hidden)
+        ALONE.hidden_for(hidden)
 
 
-def test_presets() -> None:
-    assert all(isinstance(suite, Suite) and suite.name == name for name, suite in SUITES.items())
-    assert SUITES["lockers"].level == 4
-    assert SUITES["lockers"].hidden == 30
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"views": 2},
+        {"cameras": CameraStyle(motion="orbit")},
+        {"motion": MotionStyle(kind="robot")},
+        {"disturbance": "bump"},
+        {"gripper": True},
+        {"physics": True},
+        {"frames": 500},
+    ],
+)
+def test_what_cannot_be_had_together_with_hidden_entities(wrong: dict) -> None:
+    with pytest.raises(ConfigError, match="hidden entities"):
+        replace(ALONE, settings=replace(SMALL, **wrong))

@@ -1,7 +1,6 @@
 """Which takes a run makes, where objects come from, and the command that says so."""
 
 import shlex
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,7 @@ from quest.cli.generate import Generate
 from quest.errors import ConfigError, ObjectError
 from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
 from quest.sim.procedural import CATEGORIES
-from quest.sim.suites import SUITES
+from quest.sim.suites import find_suites
 from tests.sim.small_objects import write_cabinet
 
 
@@ -24,15 +23,17 @@ def test_all_objects_come_once_before_any_comes_again() -> None:
 
 
 def test_takes_of_a_suite_have_names_of_their_own() -> None:
-    alone = replace(SUITES["occlusion"], hidden=60)
+    occlusion, lockers = find_suites("occlusion"), find_suites("lockers")
+    alone = occlusion[0].hidden_for(60)
+    wanted = ((), [alone], [alone.hidden_for(look_alike=True)], occlusion, lockers, find_suites("shift", ("blur",)))
     planned = [
         take.name
-        for suite in (None, alone, replace(alone, look_alike=True), SUITES["occlusion"], SUITES["lockers"])
-        for take in plan_takes([("partnet", "1")], levels=(1,), takes_per_object=1, suite=suite)
+        for suites in wanted
+        for take in plan_takes([("partnet", "1")], levels=(1,), takes_per_object=1, suites=suites)
     ]
     assert planned == [
         "1-L1-s000000", "1-L1-occlusion60-s000000", "1-L1-occlusion60alike-s000000", "1-L1-occlusion-s000000",
-        "1-L1-lockers30-s000000",
+        "1-L1-lockers30-s000000", "1-L1-shift-blur-s000000",
     ]  # fmt: skip
 
 
@@ -80,6 +81,8 @@ def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
         "--out a --split validation --objects-root there --takes-per-object 2 --seed 7 --views 1 --size 64",
         "--out a --suite occlusion --hidden 60 --look-alike --objects partnet:1",
         "--out a --suite lockers --procedural 4 --level 2",
+        "--out a --suite noise --variant 5 stereo --procedural 4",
+        "--out s3://bucket/takes --procedural 2 --camera orbit --motion robot --overlap 0.5 --sensor stereo --physics",
     ],
 )
 def test_recorded_command_makes_the_same_run(words: str) -> None:
@@ -111,11 +114,18 @@ def test_recorded_command_makes_the_same_run(words: str) -> None:
         ({"procedural": 1, "suite": "lockers", "look_alike": True}, "--look-alike"),
         ({"objects": ("procedural:chest-1",), "suite": "lockers"}, "procedural:locker_bank-SEED, got chest-1"),
         ({"split": "validation", "suite": "lockers"}, "no objects"),
+        ({"procedural": 1, "variant": ("blur",)}, "--suite"),
+        ({"procedural": 1, "suite": "shift", "variant": ("fog",)}, "light, texture, blur"),
+        ({"procedural": 1, "suite": "long", "variant": ("blur",)}, "only one kind"),
+        ({"procedural": 1, "suite": "moving", "hidden": 60}, "nothing is hidden"),
+        ({"procedural": 1, "suite": "lockers", "camera": "pan"}, "stands still"),
+        ({"procedural": 1, "suite": "long", "gripper": True}, "gripper"),
+        ({"procedural": 1, "frames": 30}, "more frames"),
     ],
 )
 def test_settings_that_cannot_be(tmp_path: Path, words: dict, named: str) -> None:
     with pytest.raises(ConfigError, match=named):
-        Generate(out=tmp_path / "takes", **words).run()
+        Generate(out=str(tmp_path / "takes"), **words).run()
 
 
 def test_missing_folder_of_objects_is_told_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

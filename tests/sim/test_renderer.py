@@ -20,7 +20,7 @@ POSED = PosedCamera(
 
 
 def picture(renderer: Renderer, cabinet: SimObject, position: tuple[float, float]) -> Picture:
-    stage = renderer.stage(cabinet, [POSED], lambda scene, bodies: None)
+    stage = renderer.stage(cabinet, [POSED])
     stage.pose(cabinet.articulation.poses(np.array(position, dtype=float)))
     (taken,) = stage.pictures()
     return taken

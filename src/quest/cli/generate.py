@@ -4,33 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
-import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from quest.errors import ConfigError, ObjectError
 
 if TYPE_CHECKING:
-    from quest.data.store import TakeStore
-    from quest.sim.plan import ObjectShelf, TakeSpec
-    from quest.sim.renderer import Renderer
-    from quest.sim.staging import TakeSettings
+    from quest.sim.settings import TakeSettings
     from quest.sim.suites import Suite
+
+FRAMES_WITH_GRIPPER = 90
+"""Frames that each joint gets if a gripper has to come and go."""
 
 
 @dataclass(frozen=True)
 class Generate:
     """Render takes of articulated objects, with ground truth, into a take store; run again to resume."""
 
-    out: Path
-    """Folder of the take store; takes that it already has are skipped."""
+    out: str
+    """Take store, a folder or a URL such as s3://bucket/takes; takes that it already has are skipped."""
     objects: tuple[str, ...] = ()
-    """Objects by name: partnet:44817,23724 or procedural:chest-12."""
+    """Objects by name, partnet:44817,23724 or procedural:chest-12, or the path of your own folder or URDF."""
     split: Literal["train", "validation", "test"] | None = None
     """All PartNet-Mobility objects of a part of the split; also where --procedural takes its seeds from."""
     procedural: int = 0
@@ -41,8 +39,12 @@ class Generate:
     """Whether --split brings PartNet-Mobility objects; --no-partnet for procedural ones only."""
     objects_root: Path | None = None
     """Folder of PartNet-Mobility folders; default: the environment variable QUEST_OBJECTS."""
-    suite: Literal["occlusion", "lockers"] | None = None
-    """Takes that are hard in one way: something hides a moving entity, also before banks of sixteen like doors."""
+    mix: Literal["usual", "broad"] = "usual"
+    """Kinds of procedural objects, and materials of all: the usual furniture and appliances, or everything there is."""
+    suite: Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "long"] | None = None
+    """Takes that are hard in one way: a named preset of what follows. docs/simulator.md describes each."""
+    variant: tuple[str, ...] = ()
+    """Kinds of a suite, such as blur and bump of shift; default: all of them."""
     hidden: int | None = None
     """Frames for which a suite's entities are hidden, 10 to 120; default: drawn, and 30 before lockers."""
     look_alike: bool = False
@@ -53,16 +55,34 @@ class Generate:
     """Takes of every object and level."""
     seed: int = 0
     """Seed of the first take of each object; the others count up."""
-    every: int = 1
-    """Keep every n-th frame of the motion script (1 to 8)."""
+    every: int | None = None
+    """Keep every n-th frame of the motion script (1 to 8); default: 1."""
     views: int | None = None
     """Cameras per take; default: 3, in suites 1."""
-    size: int = 224
-    """Width and height of the images, pixels."""
-    frames_per_joint: int = 60
-    """Frames of the motion script that each joint gets."""
+    size: int | None = None
+    """Width and height of the images, pixels; default: 224."""
+    frames_per_joint: int | None = None
+    """Frames of the motion script that each joint gets; default: 60, with a gripper 90."""
+    frames: int | None = None
+    """Frames in which the joints open and close again and again; default: each once, in suite long 10000."""
+    camera: Literal["static", "orbit", "handheld", "pan", "mixed"] | None = None
+    """How cameras move; default: static."""
+    motion: Literal["human", "robot", "creep", "mixed"] | None = None
+    """How joints move: eased with stops and reversals, at constant speeds, slowly, or one of these; default: human."""
+    overlap: float | None = None
+    """Share of a joint's time in which the next one moves already, 0 to 0.9; default: 0."""
+    sensor: Literal["ideal", "structured-light", "stereo"] | None = None
+    """Whose depth it is: as rendered, or with the holes, noise and steps of a real sensor; default: ideal."""
+    physics: bool = False
+    """Drive the joints through a physics engine: friction, damping, inertia."""
+    gripper: bool = False
+    """A gripper comes and pulls what moves."""
     randomize_materials: bool = True
     """Give objects random materials: procedural ones always, others now and then."""
+    ray: str | None = None
+    """Make the takes on a Ray cluster: its address, auto, or local for one on this machine."""
+    ray_cpus_per_worker: int = 2
+    """Processor cores that each worker of the cluster claims."""
 
     def run(self) -> int:
         """Render and write; 0 if every planned take is there or was skipped for a stated reason.
@@ -70,45 +90,41 @@ class Generate:
         Raises:
             ObjectError: there is no folder of objects to take the named ones from, or not one planned take can be made.
         """
-        from quest.data.provenance import code_commit, package_versions
+        from quest.cli.generate_progress import GenerateProgress
         from quest.data.store import TakeStore
-        from quest.sim.objects import find_objects
-        from quest.sim.plan import ObjectShelf, plan_takes
-        from quest.sim.renderer import Renderer
-        from quest.sim.staging import TakeSettings
+        from quest.sim.cluster import ClusterSettings, produce_on_cluster
+        from quest.sim.plan import plan_takes
+        from quest.sim.production import StudioSettings, missing_takes, produce
+        from quest.sim.settings import TakeSettings
 
-        suite = self._suite()
-        views = self.views if self.views is not None else 3 if suite is None else 1
-        settings = TakeSettings(views, self.size, self.every, self.frames_per_joint, self.randomize_materials)
-        levels = self.level or (1 if suite is None else suite.level,)
+        suites = self._suites()
+        levels = self.level or (suites[0].level if suites else 1,)
         if self.takes_per_object < 1 or min(levels) < 1:
             raise ConfigError("generate: expected --takes-per-object and --level of at least 1")
         store = TakeStore(self.out)
         takes = plan_takes(
-            self._chosen(suite),
+            self._chosen(suites[0].category if suites else None),
             levels=levels,
             takes_per_object=self.takes_per_object,
             first_seed=self.seed,
-            suite=suite,
+            settings=self._settings(TakeSettings()),
+            suites=suites,
         )
         console = Console(stderr=True, highlight=False)
-        missing = [spec for spec in takes if spec.name not in store]
+        missing = missing_takes(takes, store)
         console.print(
             f"{len(takes)} takes planned, {len(takes) - len(missing)} there already; store {escape(str(self.out))}"
         )
         if not missing:
             return 0
-        if any(spec.source == "partnet" for spec in missing):
-            find_objects(self.objects_root)  # told before the renderer warms up
-        renderer = Renderer()
-        provenance = {
-            "commit": code_commit(),
-            "versions": package_versions(),
-            "renderer": str(renderer.device),
-            "command": self.command_line(),
-        }
-        with ObjectShelf(self.objects_root) as shelf:
-            skipped = _Run(store, shelf, renderer, settings, provenance, console).make(missing)
+        studio = StudioSettings(self.objects_root, self.command_line())
+        with GenerateProgress(console, store.url, len(missing)) as progress:
+            if self.ray is None:
+                produce(missing, store, studio, report=progress)
+            else:
+                cluster = ClusterSettings(self.ray, self.ray_cpus_per_worker)
+                produce_on_cluster(missing, store, studio, cluster, report=progress)
+        skipped = progress.skipped
         if skipped == len(takes):
             raise ObjectError(f"generate: none of the {skipped} planned takes can be made, for the reasons above")
         return 0
@@ -126,34 +142,54 @@ class Generate:
                 words += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
         return shlex.join(words)
 
-    def _suite(self) -> Suite | None:
-        """The suite that the arguments name, or None."""
-        from quest.sim.suites import SUITES
+    def _suites(self) -> tuple[Suite, ...]:
+        """The suites that the arguments name, with what the arguments change about them; none for ordinary takes."""
+        from quest.sim.suites import find_suites
 
         if self.suite is None:
-            if self.hidden is not None or self.look_alike:
-                raise ConfigError("generate: --hidden and --look-alike belong to --suite, and none is given")
-            return None
-        preset = SUITES[self.suite]
-        if self.look_alike and preset.look_alike:
-            raise ConfigError(f"generate: suite {self.suite} always has look-alikes; leave --look-alike away")
-        if self.frames_per_joint != Generate.frames_per_joint:
+            if self.hidden is not None or self.look_alike or self.variant:
+                raise ConfigError("generate: --hidden, --look-alike and --variant belong to --suite, and none is given")
+            return ()
+        suites = [s.hidden_for(self.hidden, look_alike=self.look_alike) for s in find_suites(self.suite, self.variant)]
+        if suites[0].hiding is not None and self.frames_per_joint is not None:
             raise ConfigError(f"generate: suite {self.suite} has a script of its own; leave --frames-per-joint away")
-        if self.views not in (None, 1):
-            raise ConfigError(
-                f"generate: suite {self.suite} expects 1 view, for an occluder hides from one camera; leave --views"
-            )
-        hidden = preset.hidden if self.hidden is None else self.hidden
-        return dataclasses.replace(preset, hidden=hidden, look_alike=preset.look_alike or self.look_alike)
+        return tuple(dataclasses.replace(suite, settings=self._settings(suite.settings)) for suite in suites)
 
-    def _chosen(self, suite: Suite | None) -> list[tuple[str, str]]:
-        """Source and id of every object that the arguments name."""
+    def _settings(self, preset: TakeSettings) -> TakeSettings:
+        """A preset with what the arguments say."""
+        from quest.sim.sensor import SENSORS
+
+        given = {
+            name: getattr(self, name)
+            for name in ("views", "size", "every", "frames_per_joint", "frames")
+            if getattr(self, name) is not None
+        }
+        if self.camera is not None:
+            given["cameras"] = dataclasses.replace(preset.cameras, motion=self.camera)
+        if self.motion is not None or self.overlap is not None:
+            kind = preset.motion.kind if self.motion is None else self.motion
+            overlap = preset.motion.overlap if self.overlap is None else self.overlap
+            given["motion"] = dataclasses.replace(preset.motion, kind=kind, overlap=overlap)
+        if self.sensor is not None:
+            given["sensor"] = SENSORS[self.sensor]
+        if self.gripper and not preset.gripper and self.frames_per_joint is None:
+            given["frames_per_joint"] = FRAMES_WITH_GRIPPER
+        return dataclasses.replace(
+            preset,
+            physics=preset.physics or self.physics,
+            gripper=preset.gripper or self.gripper,
+            randomize_materials=self.randomize_materials,
+            broad_materials=self.mix == "broad",
+            **given,
+        )
+
+    def _chosen(self, category: str | None) -> list[tuple[str, str]]:
+        """Source and id of every object that the arguments name; all of a category if that is given."""
         from quest.data.split import object_split
         from quest.sim.plan import parse_object, procedural_objects
 
         chosen = [pair for text in self.objects for pair in parse_object(text)]
         split = object_split()
-        category = None if suite is None else suite.category
         if self.split is not None and self.partnet and category is None:
             chosen += [("partnet", object_id) for object_id in split.partnet_mobility[self.split]]
         if self.procedural or self.seeds:
@@ -161,7 +197,7 @@ class Generate:
             count = self.procedural or last - first + 1
             if count > last - first + 1:
                 raise ConfigError(f"generate: {count} procedural objects do not fit into seeds {first}..{last}")
-            chosen += procedural_objects(count, first, category)
+            chosen += procedural_objects(count, first, category, mix=self.mix)
         if not chosen:
             raise ConfigError("generate: no objects; pass --objects, --split or --procedural")
         other = [name for _, name in chosen if category is not None and name.rpartition("-")[0] != category]
@@ -178,67 +214,3 @@ def _seed_range(text: str) -> tuple[int, int]:
     if not (dots and first.isdigit() and last.isdigit() and int(first) <= int(last)):
         raise ConfigError(f"generate: expected --seeds A..B with 0 <= A <= B, got {text!r}")
     return int(first), int(last)
-
-
-@dataclass
-class _Run:
-    """Makes takes one after the other and shows how far it is."""
-
-    store: TakeStore
-    shelf: ObjectShelf
-    renderer: Renderer
-    settings: TakeSettings
-    provenance: dict
-    console: Console
-
-    def make(self, takes: list[TakeSpec]) -> int:
-        """Make takes; returns how many were skipped."""
-        columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[speed]}"),
-            TimeElapsedColumn(), TimeRemainingColumn(),
-        )  # fmt: skip
-        frames, skipped, seconds = 0, 0, 0.0
-        warned: set[str] = set()
-        with Progress(*columns, console=self.console) as progress:
-            bar = progress.add_task("warming up (shaders)", total=len(takes), speed="")
-            for index, spec in enumerate(takes):
-                start = time.perf_counter()
-                made = self._make_one(spec, warned)
-                if made == 0:
-                    skipped += 1
-                elif index:  # the first take pays for the shaders
-                    frames, seconds = frames + made, seconds + time.perf_counter() - start
-                speed = f"{frames / seconds:.1f} frames/s" if seconds else ""
-                progress.update(bar, advance=1, description=spec.name, speed=speed)
-        speed = f" at {frames / seconds:.1f} frames/s" if seconds else ""
-        self.console.print(f"{len(takes) - skipped} takes written{speed}, {skipped} skipped; store {self.store.root}")
-        return skipped
-
-    def _make_one(self, spec: TakeSpec, warned: set[str]) -> int:
-        """Number of frames rendered, all views counted; 0 if the take is impossible, which is said once per reason."""
-        from quest.sim.generate import generate_take
-
-        try:
-            sim_object = self.shelf.load(spec.source, spec.object_id)
-            self._warn(spec.object_id, sim_object.warnings, warned)
-            take = generate_take(
-                sim_object,
-                spec.level,
-                spec.seed,
-                renderer=self.renderer,
-                settings=self.settings,
-                suite=spec.suite,
-                provenance=self.provenance,
-            )
-        except ObjectError as error:
-            self._warn(f"skipped {spec.object_id}", (str(error),), warned)
-            return 0
-        self.store.write(take)
-        return len(take) * len(take.views)
-
-    def _warn(self, subject: str, messages: tuple[str, ...], warned: set[str]) -> None:
-        for message in messages:
-            line = f"{subject}: {message}"
-            if line not in warned:
-                warned.add(line)
-                self.console.print(f"[yellow]{escape(line)}[/]")

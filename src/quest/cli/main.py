@@ -16,6 +16,7 @@ from quest.cli.evaluate import Eval
 from quest.cli.evaluate_monitor import EvalMonitor
 from quest.cli.generate import Generate
 from quest.cli.monitor import Monitor
+from quest.cli.objects import Objects
 from quest.cli.track import Track
 from quest.cli.train import Train
 from quest.cli.weights import Weights
@@ -28,6 +29,7 @@ EXIT_INTERRUPTED = 130
 COMMANDS: dict[str, type[Command]] = {
     "generate": Generate,
     "data": Data,
+    "objects": Objects,
     "train": Train,
     "track": Track,
     "monitor": Monitor,

@@ -1,12 +1,16 @@
-"""Static cameras in front of an object: where they stand and how they are aimed."""
+"""Cameras in front of an object: where they stand, how they are aimed, and how they move."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from quest.errors import ConfigError, InputError
+from quest.sim.appearance import CAMERA_AZIMUTH_DEG
+from quest.sim.camera_paths import displaced, fixations, hand_shake, jolt, look, there_and_back
 from quest.types import Camera
 
 AZIMUTH_DEG = (-60.0, 60.0)
@@ -14,8 +18,21 @@ ELEVATION_DEG = (5.0, 50.0)
 FLAT_ELEVATION_DEG = (20.0, 65.0)
 """For objects that lie flat, of which a low camera would see an edge only."""
 FIELD_OF_VIEW_DEG = (40.0, 60.0)
+CAMERA_MOTIONS = ("static", "orbit", "handheld", "pan")
+"""What ``mixed`` draws from."""
+
 _DISTINCT_DEG = 18.0
 _FILL = (0.80, 0.97)
+_ORBIT_FILL = (0.82, 0.95)
+_HANDHELD_FILL = (0.75, 0.90)
+_PAN_FILL = (0.55, 0.80)
+_SHAKE_SHIFT = (0.004, 0.010)  # root mean square of each axis, per metre between camera and object
+_SHAKE_TURN_DEG = (0.4, 1.0)  # root mean square about each axis
+_NECK = (0.03, 0.10)  # from the axes of pan and tilt to the camera, per metre between camera and object
+_GLANCE = (0.3, 1.1)  # of the way from the middle of the object to one of its points
+_CENTRE_WITHIN = 0.9  # of the half image, in which the object's centre stays while a head pans
+_BUMP_TURN_DEG = (2.0, 4.0)
+_BUMP_SHIFT = (0.005, 0.02)  # per metre between camera and world origin
 
 
 @dataclass(frozen=True)
@@ -26,10 +43,97 @@ class PosedCamera:
     cam_from_world: Float[np.ndarray, "4 4"]
 
 
+@dataclass(frozen=True)
+class CameraPath:
+    """A camera and where it is at every frame."""
+
+    camera: Camera
+    cam_from_world: Float[np.ndarray, "S 4 4"]
+
+    def __post_init__(self) -> None:
+        shape = self.cam_from_world.shape
+        if len(shape) != 3 or shape[0] == 0 or shape[1:] != (4, 4):
+            raise InputError(f"camera path: expected one 4 x 4 pose per frame and at least one frame, got {shape}")
+        if not np.isfinite(self.cam_from_world).all():
+            raise InputError("camera path: expected finite poses, got NaN or infinity; check where they come from")
+
+    def __len__(self) -> int:
+        return len(self.cam_from_world)
+
+    @classmethod
+    def standing(cls, posed: PosedCamera, frames: int) -> CameraPath:
+        """A camera that stays where it is."""
+        return cls(posed.camera, np.tile(posed.cam_from_world, (frames, 1, 1)))
+
+    @property
+    def static(self) -> bool:
+        """Whether the camera never moves."""
+        return bool((self.cam_from_world == self.cam_from_world[0]).all())
+
+    def at(self, t: int) -> PosedCamera:
+        """The camera at a frame."""
+        return PosedCamera(self.camera, self.cam_from_world[t])
+
+    def kept(self, index: Int[np.ndarray, " T"]) -> CameraPath:
+        """The same camera at some frames only."""
+        return CameraPath(self.camera, self.cam_from_world[index])
+
+
+@dataclass(frozen=True)
+class CameraStyle:
+    """Where cameras stand and how they move.
+
+    Attributes:
+        motion: ``static``; ``orbit`` (turns about the object, eased, aimed at it, everything stays in the image);
+            ``handheld`` (a person's drift and tremor); ``pan`` (the base stands, a robot's head looks about);
+            ``mixed`` (every camera draws one of these).
+        azimuth_deg: range of the direction to the camera at the first frame; 0 is the front, positive towards +y.
+        elevation_deg: range of its height above the horizon at the first frame; None: by the object, higher for one
+            that lies flat.
+        mirrored: whether half of the cameras stand on the other side, at minus that azimuth.
+        sweep_deg: how far an orbit turns, at most 90.
+        turn: ``around`` (in azimuth, and a little in elevation), ``over`` (from the side, within 10 degrees of the
+            horizon, up to the top) or ``any`` (either one, or down from the top).
+    """
+
+    motion: Literal["static", "orbit", "handheld", "pan", "mixed"] = "static"
+    azimuth_deg: tuple[float, float] = AZIMUTH_DEG
+    elevation_deg: tuple[float, float] | None = None
+    mirrored: bool = False
+    sweep_deg: float = 60.0
+    turn: Literal["around", "over", "any"] = "any"
+
+    def __post_init__(self) -> None:
+        if self.motion not in (*CAMERA_MOTIONS, "mixed"):
+            raise ConfigError(
+                f"camera motion: expected one of {', '.join((*CAMERA_MOTIONS, 'mixed'))}, got {self.motion!r}"
+            )
+        if self.turn not in ("around", "over", "any"):
+            raise ConfigError(f"camera orbit: expected a turn around, over or any, got {self.turn!r}")
+        low, high = self.azimuth_deg
+        if not -180 <= low <= high <= 180:
+            raise ConfigError(f"camera azimuth: expected a range within -180 to 180 degrees, got {low} to {high}")
+        if self.elevation_deg is not None and not 0 <= self.elevation_deg[0] <= self.elevation_deg[1] <= 89:
+            raise ConfigError(
+                f"camera elevation: expected a range within 0 to 89 degrees, got {self.elevation_deg[0]} to "
+                f"{self.elevation_deg[1]}"
+            )
+        if not 0 < self.sweep_deg <= 90:
+            raise ConfigError(
+                f"camera orbit: expected a sweep of more than 0 and up to 90 degrees, got {self.sweep_deg}"
+            )
+
+
 def sample_cameras(
-    points: Float[np.ndarray, "N 3"], count: int, rng: np.random.Generator, *, width: int, height: int
+    points: Float[np.ndarray, "N 3"],
+    count: int,
+    rng: np.random.Generator,
+    *,
+    width: int,
+    height: int,
+    style: CameraStyle = CameraStyle(),
 ) -> list[PosedCamera]:
-    """Cameras in the front hemisphere (+x) that see all ``points``, about 18 degrees apart or more.
+    """Cameras, by default in the front hemisphere (+x), that see all ``points``, about 18 degrees apart or more.
 
     Args:
         points: world points that must stay inside the image: the object on the origin, in all its joint states.
@@ -37,14 +141,109 @@ def sample_cameras(
         rng: what they are drawn from.
         width: image width, pixels.
         height: image height, pixels.
+        style: where they stand; how they move does not matter here.
     """
+    directions = _directions(points, count, rng, style)
+    return [_aimed(points, d, rng, width=width, height=height) for d in directions]
+
+
+def sample_camera_paths(
+    points: Float[np.ndarray, "N 3"],
+    count: int,
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    style: CameraStyle,
+    width: int,
+    height: int,
+) -> list[CameraPath]:
+    """Cameras that stand as those of :func:`sample_cameras` and move as the style says; also while nothing else moves.
+
+    Static cameras are those of :func:`sample_cameras` and see all ``points``; so does an orbit at every frame. A
+    handheld camera may cut a little off at the image's borders. A head that pans keeps the centre of the points in the
+    image, and most of them. No azimuth goes beyond 70 degrees, up to which distractors hide nothing, except where the
+    style asks for it.
+
+    Args:
+        points: world points that must stay inside the image: the object on the origin, in all its joint states.
+        count: how many cameras.
+        frames: how many frames each path has.
+        rng: what they are drawn from.
+        style: where they stand and how they move.
+        width: image width, pixels.
+        height: image height, pixels.
+
+    Raises:
+        ConfigError: there is no frame.
+    """
+    if frames < 1:
+        raise ConfigError(f"camera paths: expected at least one frame, got {frames}")
+    directions = _directions(points, count, rng, style)
+    if style.motion == "mixed":
+        motions = [CAMERA_MOTIONS[int(rng.integers(len(CAMERA_MOTIONS)))] for _ in directions]
+    else:
+        motions = [style.motion] * count
+    paths = []
+    for direction, motion in zip(directions, motions, strict=True):
+        if motion == "static":
+            posed = _aimed(points, direction, rng, width=width, height=height)
+            paths.append(CameraPath.standing(posed, frames))
+        elif motion == "orbit":
+            paths.append(_orbit(points, direction, frames, rng, style, width=width, height=height))
+        elif motion == "handheld":
+            posed = _aimed(points, direction, rng, width=width, height=height, fill_range=_HANDHELD_FILL)
+            paths.append(_handheld(points, posed, frames, rng))
+        else:
+            posed = _aimed(points, direction, rng, width=width, height=height, fill_range=_PAN_FILL)
+            paths.append(_pan(points, posed, frames, rng))
+    return paths
+
+
+def bump(path: CameraPath, frame: int, rng: np.random.Generator) -> CameraPath:
+    """The same camera, knocked at a frame: within three frames it has turned by 2 to 4 degrees and shifted a little.
+
+    It rings for a moment and stays displaced. What was close to the image's border may leave the image.
+
+    Args:
+        path: a camera at every frame.
+        frame: the first frame that is displaced.
+        rng: what the displacement is drawn from.
+
+    Raises:
+        ConfigError: the frame is not one of the path's, or its first.
+    """
+    if not 1 <= frame < len(path):
+        raise ConfigError(f"camera bump: expected a frame from 1 to {len(path) - 1}, got {frame}")
+    # A knock turns a mount about its foot rather than about the line of sight.
+    axis = rng.normal(size=3) * (1.0, 1.0, 0.5)
+    turn = np.deg2rad(rng.uniform(*_BUMP_TURN_DEG)) * axis / np.linalg.norm(axis)
+    side = rng.normal(size=3)
+    distance = float(np.linalg.norm(path.cam_from_world[frame, :3, 3]))
+    shift = rng.uniform(*_BUMP_SHIFT) * distance * side / np.linalg.norm(side)
+    response = jolt(len(path), frame, rng)[:, None]
+    moved = displaced(path.cam_from_world, response * turn, response * shift)
+    moved[:frame] = path.cam_from_world[:frame]
+    return CameraPath(path.camera, moved)
+
+
+def _elevation_range(points: Float[np.ndarray, "N 3"], style: CameraStyle) -> tuple[float, float]:
+    if style.elevation_deg is not None:
+        return style.elevation_deg
     extent = np.ptp(points, axis=0)
-    flat = extent[2] < 0.35 * extent.max()
-    low, high = np.deg2rad(FLAT_ELEVATION_DEG if flat else ELEVATION_DEG)
+    return FLAT_ELEVATION_DEG if extent[2] < 0.35 * extent.max() else ELEVATION_DEG
+
+
+def _directions(
+    points: Float[np.ndarray, "N 3"], count: int, rng: np.random.Generator, style: CameraStyle
+) -> list[np.ndarray]:
+    """Unit vectors from the object to ``count`` cameras."""
+    low, high = np.deg2rad(_elevation_range(points, style))
     directions: list[np.ndarray] = []
     apart = np.deg2rad(_DISTINCT_DEG)
     while len(directions) < count:
-        azimuth, elevation = rng.uniform(*np.deg2rad(AZIMUTH_DEG)), rng.uniform(low, high)
+        azimuth, elevation = rng.uniform(*np.deg2rad(style.azimuth_deg)), rng.uniform(low, high)
+        if style.mirrored and rng.random() < 0.5:
+            azimuth = -azimuth
         direction = np.array(
             [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         )
@@ -52,7 +251,7 @@ def sample_cameras(
             directions.append(direction)
         else:
             apart *= 0.97  # so that any number of cameras fits
-    return [_aimed(points, d, rng, width=width, height=height) for d in directions]
+    return directions
 
 
 def _aimed(
@@ -62,9 +261,10 @@ def _aimed(
     *,
     width: int,
     height: int,
+    fill_range: tuple[float, float] = _FILL,
 ) -> PosedCamera:
     fov = rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG))
-    fill = rng.uniform(*_FILL)
+    fill = rng.uniform(*fill_range)
     roll = rng.normal(0.0, np.deg2rad(1.5))
     focal = max(width, height) / 2 / np.tan(fov / 2)
     forward = -direction
@@ -90,3 +290,108 @@ def _aimed(
     cam_from_world[:3, :3] = rotation
     cam_from_world[:3, 3] = -eye_local
     return PosedCamera(Camera(focal, focal, width / 2, height / 2, width, height), cam_from_world)
+
+
+def _orbit(
+    points: Float[np.ndarray, "N 3"],
+    direction: Float[np.ndarray, "3"],
+    frames: int,
+    rng: np.random.Generator,
+    style: CameraStyle,
+    *,
+    width: int,
+    height: int,
+) -> CameraPath:
+    """A camera at a constant distance, large enough for all points at every frame, that turns about their middle."""
+    (from_azimuth, to_azimuth), (from_elevation, to_elevation) = _orbit_ends(points, direction, rng, style)
+    focal = max(width, height) / 2 / np.tan(rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG)) / 2)
+    slope = rng.uniform(*_ORBIT_FILL) * np.array([width, height]) / 2 / focal
+    low, high = points.min(axis=0), points.max(axis=0)
+    aim = (low + high) / 2 + rng.uniform(-0.05, 0.05, size=3) * (high - low)
+    # The path is gone at different speeds, also twice: its shape alone tells how far away it must stay.
+    along = np.linspace(0.0, 1.0, 181)
+    distance = 0.0
+    for rotation in look(
+        from_azimuth + along * (to_azimuth - from_azimuth), from_elevation + along * (to_elevation - from_elevation)
+    )[1]:
+        local = (points - aim) @ rotation.T
+        distance = max(distance, float((np.abs(local[:, :2]) / slope - local[:, 2:]).max()), float(-local[:, 2].min()))
+    progress = there_and_back(frames, rng)
+    towards, rotation = look(
+        from_azimuth + progress * (to_azimuth - from_azimuth),
+        from_elevation + progress * (to_elevation - from_elevation),
+    )
+    eye = aim + 1.01 * distance * towards  # between two of the directions tried, a little more may be needed
+    return CameraPath(Camera(focal, focal, width / 2, height / 2, width, height), _poses(rotation, eye))
+
+
+def _orbit_ends(
+    points: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "3"], rng: np.random.Generator, style: CameraStyle
+) -> tuple[tuple[float, float], tuple[float, float]]:
+    """First and last azimuth, first and last elevation, radians."""
+    azimuth = float(np.arctan2(direction[1], direction[0]))
+    elevation = float(np.arcsin(np.clip(direction[2], -1, 1)))
+    limit = np.deg2rad(max(CAMERA_AZIMUTH_DEG, *np.abs(style.azimuth_deg)))
+    sweep = np.deg2rad(style.sweep_deg)
+    turn = style.turn if style.turn != "any" else rng.choice(["around", "over", "down"])
+    if turn == "around":
+        sides = [s for s in (-1.0, 1.0) if abs(azimuth + s * sweep) <= limit] or [-1.0, 1.0]
+        side = sides[int(rng.integers(len(sides)))]
+        start = float(np.clip(azimuth, *sorted((-side * limit, side * (limit - sweep)))))
+        low, high = np.deg2rad(_elevation_range(points, style))
+        end = float(np.clip(elevation + rng.uniform(-0.2, 0.2), low, high))
+        return (start, start + side * sweep), (elevation, end)
+    side_view = rng.uniform(0.0, min(np.deg2rad(10), np.pi / 2 - sweep))
+    end = float(np.clip(azimuth + rng.uniform(-0.2, 0.2), -limit, limit))
+    heights = (side_view, side_view + sweep)
+    return (azimuth, end), heights if turn == "over" else heights[::-1]
+
+
+def _handheld(
+    points: Float[np.ndarray, "N 3"], posed: PosedCamera, frames: int, rng: np.random.Generator
+) -> CameraPath:
+    """A person holds the camera: how unsteadily is drawn, shifts grow with the distance."""
+    distance = _distance(points, posed)
+    shake = hand_shake(frames, rng)
+    turn = np.deg2rad(rng.uniform(*_SHAKE_TURN_DEG)) * shake[:, :3]
+    shift = rng.uniform(*_SHAKE_SHIFT) * distance * shake[:, 3:]
+    path = CameraPath.standing(posed, frames)
+    return CameraPath(path.camera, displaced(path.cam_from_world, turn, shift))
+
+
+def _pan(points: Float[np.ndarray, "N 3"], posed: PosedCamera, frames: int, rng: np.random.Generator) -> CameraPath:
+    """A camera before a neck: the head pans and tilts between glances at points of the object."""
+    start = posed.cam_from_world[:3, :3]
+    azimuth, elevation = np.arctan2(-start[2, 1], -start[2, 0]), np.arcsin(np.clip(-start[2, 2], -1, 1))
+    (towards,), (level,) = look(np.array([azimuth]), np.array([elevation]))
+    rolled = start @ level.T
+    eye = -start.T @ posed.cam_from_world[:3, 3]
+    reach = rng.uniform(*_NECK) * _distance(points, posed)
+    centre = points.mean(axis=0)
+    glance = rng.uniform(*_GLANCE, size=(32, 1))
+    seen = eye - (centre + glance * (points[rng.integers(len(points), size=32)] - centre))
+    pan = np.arctan2(seen[:, 1], seen[:, 0]) - azimuth
+    tilt = np.arcsin(seen[:, 2] / np.linalg.norm(seen, axis=1)) - elevation
+    targets = np.stack(((pan + np.pi) % (2 * np.pi) - np.pi, tilt), axis=-1)
+    angles = fixations(targets, frames, rng)
+    half = np.array([posed.camera.width, posed.camera.height]) / 2 / posed.camera.fx
+    while True:
+        facing, rotation = look(azimuth + angles[:, 0], elevation + angles[:, 1])
+        poses = _poses(rolled @ rotation, eye + reach * (towards - facing))
+        local = poses[:, :3, :3] @ centre + poses[:, :3, 3]
+        if (np.abs(local[:, :2]) <= _CENTRE_WITHIN * half * local[:, 2:]).all() or np.abs(angles).max() < 1e-3:
+            return CameraPath(posed.camera, poses)
+        angles = 0.8 * angles
+
+
+def _distance(points: Float[np.ndarray, "N 3"], posed: PosedCamera) -> float:
+    """Along the line of sight, from a camera to the middle of what it sees, metres."""
+    return float(posed.cam_from_world[2, :3] @ points.mean(axis=0) + posed.cam_from_world[2, 3])
+
+
+def _poses(rotation: Float[np.ndarray, "S 3 3"], eye: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 4 4"]:
+    """``cam_from_world`` of cameras at world points."""
+    poses = np.tile(np.eye(4), (len(rotation), 1, 1))
+    poses[:, :3, :3] = rotation
+    poses[:, :3, 3] = -(rotation @ eye[:, :, None])[..., 0]
+    return poses

@@ -1,7 +1,8 @@
 """Where the entities of an object are: points fixed in a body that a tracker can follow.
 
 A moving body carries one entity per handle or knob; without any, the rim of what turns or the front
-of what slides. Every revolute joint also has a hinge, which is reported apart and listed last.
+of what slides. What is fixed in the base and lifts the whole thing (the rim of a laptop's base, the handle of a
+kettle) comes after those. Every revolute joint also has a hinge, which is reported apart and listed last.
 
 The point of an entity lies on the *outer* surface: among surface samples that can be seen from in
 front of the closed object, the one nearest to a target. The target is the part's area-weighted
@@ -12,6 +13,7 @@ that the body moves towards (front).
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +22,7 @@ from jaxtyping import Bool, Float
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, apply
 
 MOVES_AT_LEAST = 0.1
@@ -28,10 +31,39 @@ MOVES_AT_LEAST = 0.1
 HANDLE_GAP = 0.03
 """Parts named as handles that come closer than this, normalised units, are one handle."""
 
+PLACED_WITHIN = 0.1
+"""Points that somebody places lie this close to the surface of their link, normalised units."""
+
+_LIFTED_BY_RIM = frozenset({"Laptop"})
+_LIFTED_BY_HANDLE = frozenset({"Kettle", "Scissors"})
+_KNOB_ON_TOP = frozenset({"Kettle"})
+"""Categories whose sliding part is a lid; what one holds is not named in PartNet-Mobility."""
+
 _NAMED = re.compile(r"(?:^|[^a-z])(handle|knob)", re.IGNORECASE)
 _SAMPLES = 600
+_THIN_SAMPLES = 20_000
+"""Of a base whose rim is a thin face of something large."""
 # Directions towards the cameras: azimuth from the front, elevation.
 _SEEN_FROM_DEG = tuple((a, e) for a in (-45, -15, 15, 45) for e in (10, 30, 50))
+
+
+@dataclass(frozen=True)
+class PlacedEntity:
+    """An entity that somebody has pointed out.
+
+    Attributes:
+        where: who says so, for messages.
+        label: ``handle``, ``knob``, ``rim`` or ``front``.
+        body: the body that carries it; if there are ``parts``, these tell.
+        point: where it is in its body, metres, or None to find out.
+        parts: indices of the parts that are it.
+    """
+
+    where: str
+    label: str
+    body: int
+    point: Float[np.ndarray, "3"] | None
+    parts: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -41,7 +73,7 @@ class SimEntity:
     Attributes:
         name: unique within the object, such as ``link_0/handle``.
         label: ``handle``, ``knob``, ``rim``, ``front`` or ``hinge``.
-        joint: index of the joint that moves it; its body is ``1 + joint``.
+        joint: index of the joint that moves it, whose body is ``1 + joint``; -1 if it is fixed in the base, body 0.
         point: where it is in its body, metres.
         parts: indices of the parts that it is made of; empty for rims, fronts and hinges.
         travel_m: how far it gets from its place at rest when only its joint moves.
@@ -61,6 +93,11 @@ class SimEntity:
         """Index of the body that carries it."""
         return 1 + self.joint
 
+    @property
+    def fixed(self) -> bool:
+        """Whether it is fixed in the base, so that no joint moves it."""
+        return self.joint < 0
+
 
 def part_label(name: str) -> str | None:
     """``handle`` or ``knob`` if a part's name says so, else None."""
@@ -68,49 +105,134 @@ def part_label(name: str) -> str | None:
     return match.group(1).lower() if match else None
 
 
-def find_entities(articulation: Articulation, half_diagonal_m: float) -> tuple[SimEntity, ...]:
+def find_entities(
+    articulation: Articulation,
+    half_diagonal_m: float,
+    *,
+    category: str = "Unknown",
+    placed: Sequence[PlacedEntity] = (),
+) -> tuple[SimEntity, ...]:
     """All entities of an object, hinges last; positions as described at the top of this module.
 
     Args:
         articulation: the object, standing in the world with its front towards +x.
         half_diagonal_m: half the diagonal of its bounding box at rest.
+        category: in PartNet-Mobility's words.
+        placed: entities that somebody has pointed out; bodies that carry one get no others.
+
+    Raises:
+        ObjectError: an entity was placed away from the surface of its body.
     """
     surfaces = _Surfaces(articulation, half_diagonal_m)
-    named: list[SimEntity] = []
+    named = [e for place in placed for e in _placed(articulation, place, surfaces, half_diagonal_m)]
+    taken = {e.body for e in named}
     unnamed: list[SimEntity] = []
     hinges: list[SimEntity] = []
     for j, joint in enumerate(articulation.joints):
         parts = articulation.body_parts(1 + j)
         if not parts:
             continue
+        if joint.joint.kind == "revolute":
+            hinges.append(_entity(articulation, j, "hinge", surfaces.hinge_point(j), False, ()))
+        if 1 + j in taken:
+            continue
         handles = _handles(articulation, j, surfaces, half_diagonal_m)
         named += handles
         if not handles:
             label = "rim" if joint.joint.kind == "revolute" else "front"
             target = surfaces.rim_target(j) if label == "rim" else surfaces.front_target(j)
+            if label == "front" and category in _KNOB_ON_TOP:
+                label = "knob"
             unnamed.append(_entity(articulation, j, label, *surfaces.outer_point(parts, target), ()))
-        if joint.joint.kind == "revolute":
-            hinges.append(_entity(articulation, j, "hinge", surfaces.hinge_point(j), False, ()))
     # A button's or turntable's face is a nuisance unless it is all that there is.
     followed = [e for e in unnamed if e.travel_m >= MOVES_AT_LEAST * half_diagonal_m]
-    if not named and not followed:
+    if not any(not e.fixed for e in named) and not followed:
         followed = unnamed
-    kept = sorted(named + followed, key=lambda e: e.joint)
-    return _with_unique_names(kept + hinges)
+    fixed = [] if 0 in taken else _fixed_in_base(articulation, category, surfaces, half_diagonal_m)
+    kept = sorted(named + followed, key=lambda e: (e.fixed, e.joint))
+    return _with_unique_names(kept + fixed + hinges)
+
+
+def _fixed_in_base(
+    articulation: Articulation, category: str, surfaces: _Surfaces, half_diagonal_m: float
+) -> list[SimEntity]:
+    """What one lifts the whole thing by, in categories where that is known."""
+    if category in _LIFTED_BY_HANDLE:
+        return _handles(articulation, -1, surfaces, half_diagonal_m)
+    parts = articulation.body_parts(0)
+    area = {
+        j: sum(articulation.parts[i].surface.area for i in articulation.body_parts(1 + j))
+        for j, joint in enumerate(articulation.joints)
+        if joint.joint.kind == "revolute" and joint.parent == 0
+    }
+    if category not in _LIFTED_BY_RIM or not parts or not area:
+        return []
+    lid = max(area, key=lambda j: area[j])
+    point, inside = surfaces.outer_point(parts, surfaces.base_rim_target(lid), samples=_THIN_SAMPLES)
+    return [_entity(articulation, -1, "rim", point, inside, ())]
+
+
+def _placed(
+    articulation: Articulation, place: PlacedEntity, surfaces: _Surfaces, half_diagonal_m: float
+) -> list[SimEntity]:
+    if place.parts:
+        bodies = sorted({articulation.parts[i].body for i in place.parts})
+        return [
+            e
+            for body in bodies
+            for e in _of_parts(
+                articulation,
+                body - 1,
+                place.label,
+                [i for i in place.parts if articulation.parts[i].body == body],
+                surfaces,
+                half_diagonal_m,
+            )
+        ]
+    parts = articulation.body_parts(place.body)
+    if not parts:
+        raise ObjectError(f"{place.where}: its link has no visual that could be seen; use a link with meshes")
+    joint = place.body - 1
+    if place.point is None:
+        target = surfaces.rim_target(joint) if place.label == "rim" else surfaces.front_target(joint)
+    else:
+        target = place.point
+    point, inside = surfaces.outer_point(parts, target, samples=_THIN_SAMPLES)
+    gap = float(np.linalg.norm(point - target))
+    if place.point is not None and gap > PLACED_WITHIN * half_diagonal_m:
+        raise ObjectError(
+            f"{place.where}: the point lies {gap:.3f} m away from what can be seen of its link; give it in the link's "
+            "frame and the URDF's units"
+        )
+    return [_entity(articulation, joint, place.label, point, inside, ())]
 
 
 def _handles(articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float) -> list[SimEntity]:
     found = []
     for label in ("handle", "knob"):
         parts = [i for i in articulation.body_parts(1 + joint) if part_label(articulation.parts[i].name) == label]
-        for group in _near_groups([articulation.parts[i].surface for i in parts], HANDLE_GAP * half_diagonal_m):
-            members = tuple(parts[i] for i in group)
-            meshes = [articulation.parts[i].surface for i in members]
-            area = np.concatenate([m.area_faces for m in meshes])
-            centres = np.concatenate([m.triangles_center for m in meshes])
-            target = np.average(centres, axis=0, weights=area) if area.sum() > 0 else centres.mean(axis=0)
-            point, inside = surfaces.outer_point(list(members), target)
-            found.append(_entity(articulation, joint, label, point, inside, members))
+        found += _of_parts(articulation, joint, label, parts, surfaces, half_diagonal_m)
+    return found
+
+
+def _of_parts(
+    articulation: Articulation,
+    joint: int,
+    label: str,
+    parts: list[int],
+    surfaces: _Surfaces,
+    half_diagonal_m: float,
+) -> list[SimEntity]:
+    """One entity for every group of parts of a body that are near each other."""
+    found = []
+    for group in _near_groups([articulation.parts[i].surface for i in parts], HANDLE_GAP * half_diagonal_m):
+        members = tuple(parts[i] for i in group)
+        meshes = [articulation.parts[i].surface for i in members]
+        area = np.concatenate([m.area_faces for m in meshes])
+        centres = np.concatenate([m.triangles_center for m in meshes])
+        target = np.average(centres, axis=0, weights=area) if area.sum() > 0 else centres.mean(axis=0)
+        point, inside = surfaces.outer_point(list(members), target)
+        found.append(_entity(articulation, joint, label, point, inside, members))
     return found
 
 
@@ -122,6 +244,9 @@ def _entity(
     inside: bool,
     parts: tuple[int, ...],
 ) -> SimEntity:
+    name = f"{articulation.body_names[1 + joint]}/{label}"
+    if joint < 0:
+        return SimEntity(name, label, joint, point, parts, 0.0, inside)
     rest = articulation.rest
     start = apply(articulation.poses(rest)[1 + joint], point)
     travel = 0.0
@@ -129,7 +254,7 @@ def _entity(
         moved = rest.copy()
         moved[joint] += share * articulation.joints[joint].opening()
         travel = max(travel, float(np.linalg.norm(apply(articulation.poses(moved)[1 + joint], point) - start)))
-    return SimEntity(f"{articulation.body_names[1 + joint]}/{label}", label, joint, point, parts, travel, inside)
+    return SimEntity(name, label, joint, point, parts, travel, inside)
 
 
 def _with_unique_names(entities: list[SimEntity]) -> tuple[SimEntity, ...]:
@@ -190,14 +315,16 @@ class _Surfaces:
             (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)), axis=-1
         )
 
-    def outer_point(self, parts: list[int], target: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"], bool]:
+    def outer_point(
+        self, parts: list[int], target: Float[np.ndarray, "3"], *, samples: int = 2 * _SAMPLES
+    ) -> tuple[Float[np.ndarray, "3"], bool]:
         """The outer surface sample of some parts that is nearest to a target, both in their body's frame.
 
         Also tells whether it is inside: whether nothing near the target can be seen from the front.
         """
         body = self._articulation.parts[parts[0]].body
         area = np.array([max(self._world[i].area, 1e-12) for i in parts])
-        counts = np.maximum(20, np.ceil(2 * _SAMPLES * area / area.sum())).astype(int)
+        counts = np.maximum(20, np.ceil(samples * area / area.sum())).astype(int)
         points = np.concatenate([_sample(self._world[i], int(n))[0] for i, n in zip(parts, counts, strict=True)])
         goal = apply(self._poses[body], target)
         # Rays are cast for the samples nearest to the target only: they decide.
@@ -229,7 +356,16 @@ class _Surfaces:
 
     def rim_target(self, joint: int) -> Float[np.ndarray, "3"]:
         """Middle of the edge farthest from the axis, in the body's frame (whose origin lies on the axis)."""
-        points, axis = self._body_samples(joint), self._articulation.joints[joint].axis
+        return self._far_edge(self._body_samples(joint), self._articulation.joints[joint].axis)
+
+    def base_rim_target(self, joint: int) -> Float[np.ndarray, "3"]:
+        """Middle of the base's edge farthest from a joint's axis, in the base's frame."""
+        pose = self._articulation.joints[joint].parent_from_joint
+        axis = pose[:3, :3] @ self._articulation.joints[joint].axis
+        return self._far_edge(self._body_samples(-1) - pose[:3, 3], axis) + pose[:3, 3]
+
+    def _far_edge(self, points: Float[np.ndarray, "N 3"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+        """Middle of the edge of points that is farthest from an axis through the origin."""
         along = points @ axis
         radial = points - along[:, None] * axis
         radius = np.linalg.norm(radial, axis=1)

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from quest.sim.annotate import entity_mask
-from quest.sim.appearance import Region, apply_appearance, sample_appearance
-from quest.sim.cameras import PosedCamera
+from quest.sim.appearance import Region, sample_appearance
+from quest.sim.cameras import CameraPath
+from quest.sim.disturbance import odd_appearance
+from quest.sim.dressing import apply_appearance
 from quest.sim.motion import FRAMES_PER_S
 from quest.sim.objects import SimObject
-from quest.sim.occluder import add_occluder, place_occluder
 from quest.sim.occlusion import stage_occlusion
 from quest.sim.renderer import Picture, Renderer
-from quest.sim.staging import Staging, TakeSettings, see_entities, stage_plain
+from quest.sim.sensor import SensorModel, sense
+from quest.sim.settings import TakeSettings
+from quest.sim.staging import Staging, see_entities, stage_plain
 from quest.sim.suites import Suite
 from quest.types import Clip, Entity, Take, TakeInfo, View
 
@@ -46,9 +49,9 @@ def generate_take(
         level: how many joints move one after the other.
         seed: of the motion, the cameras and the appearance.
         renderer: the process's renderer.
-        settings: views, size and frames.
-        suite: what makes the take difficult; None for an ordinary take.
-        provenance: who made it, for the take's metadata; takes of suites add what is hidden when.
+        settings: views, size, frames, and how cameras, joints and sensors behave.
+        suite: which suite it belongs to; None for an ordinary take. Its settings are not applied: pass them.
+        provenance: who made it, for the take's metadata; what is unusual about the take is added.
 
     Raises:
         ConfigError: the suite cannot be made with these settings.
@@ -56,20 +59,26 @@ def generate_take(
             nothing in it to hide.
         RendererError: the renderer broke.
     """
-    key = [zlib.crc32(sim_object.object_id.encode()), level, seed, *([] if suite is None else suite.tag.encode())]
-    motion_rng, camera_rng, appearance_rng, occluder_rng = (np.random.default_rng([*key, n]) for n in range(4))
-    if suite is None:
-        staging = stage_plain(sim_object, level, motion_rng, camera_rng, renderer=renderer, settings=settings)
+    hiding = None if suite is None else suite.hiding
+    # What hides has draws of its own; all other suites show the motion of the ordinary take, to be compared with it.
+    own = suite.tag.encode() if suite is not None and hiding is not None else b""
+    key = [zlib.crc32(sim_object.object_id.encode()), level, seed, *own]
+    motion_rng, camera_rng, appearance_rng, props_rng, sensor_rng = (np.random.default_rng([*key, n]) for n in range(5))
+    if hiding is None:
+        staging = stage_plain(
+            sim_object, level, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
+        )
     else:
         staging = stage_occlusion(
-            sim_object, level, suite, motion_rng, camera_rng, occluder_rng, renderer=renderer, settings=settings
+            sim_object, level, hiding, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
         )
     name = take_name(sim_object.object_id, level, seed, suite)
     played = staging.playback
     stamp_s = played.kept / FRAMES_PER_S
-    views = _record(sim_object, staging, appearance_rng, renderer, settings)
+    views = _record(sim_object, staging, appearance_rng, settings)
     flow = np.zeros_like(played.points)
     flow[:-1] = np.diff(played.points, axis=0)
+    about = {**(provenance or {}), **_conditions(settings, suite), **staging.about}
     info = TakeInfo(
         name=name,
         source=sim_object.source,
@@ -82,12 +91,15 @@ def generate_take(
         entities=tuple(Entity(e.name, e.label, e.body, e.joint) for e in sim_object.entities),
         joints=tuple(j.joint for j in sim_object.articulation.joints),
         moved_joints=staging.moved_joints,
-        provenance={**(provenance or {}), **staging.about},
+        provenance=about,
         suite="standard" if suite is None else suite.name,
     )
     return Take(
         info=info,
-        views=tuple(r.view(f"{name}/view{v}", stamp_s) for v, r in enumerate(views)),
+        views=tuple(
+            r.view(f"{name}/view{v}", stamp_s, settings.sensor, rng)
+            for v, (r, rng) in enumerate(zip(views, sensor_rng.spawn(len(views)), strict=True))
+        ),
         stamp_s=stamp_s,
         point_world=played.points.astype(np.float32),
         flow_world=flow.astype(np.float32),
@@ -98,37 +110,62 @@ def generate_take(
     )
 
 
+def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
+    """What is unusual about how a take is made, for its provenance."""
+    ordinary, found = TakeSettings(), {}
+    for what in ("cameras", "motion", "sensor"):
+        if getattr(settings, what) != getattr(ordinary, what):
+            found[what] = asdict(getattr(settings, what))
+    for what in ("physics", "gripper", "disturbance", "broad_materials"):
+        if getattr(settings, what) != getattr(ordinary, what):
+            found[what] = getattr(settings, what)
+    return {**({"variant": suite.variant} if suite is not None and suite.variant else {}), **found}
+
+
 def _record(
-    sim_object: SimObject,
-    staging: Staging,
-    appearance_rng: np.random.Generator,
-    renderer: Renderer,
-    settings: TakeSettings,
+    sim_object: SimObject, staging: Staging, appearance_rng: np.random.Generator, settings: TakeSettings
 ) -> list[_ViewRecorder]:
     """Dresses the scene, plays the take and photographs every frame."""
-    appearance = sample_appearance(appearance_rng, randomize_materials=settings.randomize_materials)
-    played, occluders = staging.playback, staging.occluders
+    appearance = sample_appearance(
+        appearance_rng, randomize_materials=settings.randomize_materials, broad=settings.broad_materials
+    )
+    if settings.disturbance == "texture":
+        appearance = odd_appearance(appearance, appearance_rng)
+    played, stage, props = staging.playback, staging.stage, staging.props
     region = Region.around(played.swept)
+    wide = not all(path.static for path in staging.cameras)
     actors: list[Any] = []
 
     def dress(scene: Any, bodies: list[Any]) -> None:
-        apply_appearance(scene, appearance, region, bodies, procedural=sim_object.source == "procedural")
-        actors.extend(add_occluder(scene, occluder) for occluder in occluders)
+        procedural = sim_object.source == "procedural"
+        apply_appearance(scene, appearance, region, bodies, procedural=procedural, wide=wide)
+        actors.extend(prop.add(scene) for prop in props)
 
-    stage = renderer.stage(sim_object, staging.cameras, dress)
-    frames = len(played.kept)
-    recorders = [_ViewRecorder(sim_object, camera, frames) for camera in staging.cameras]
+    stage.dress(dress)
+    paths = [path.kept(played.kept) for path in staging.cameras]
+    recorders = [_ViewRecorder(sim_object, path, len(played.kept)) for path in paths]
     pictures: list[Picture] = []
     drawn: tuple[np.ndarray, ...] = ()
-    for t, kept in enumerate(played.kept):
-        poses = (played.poses[t], *(o.world_from_shape[kept] for o in occluders))
-        if t == 0 or not all(map(np.array_equal, poses, drawn)):  # else nothing moved: the pictures are the same
-            stage.pose(played.poses[t])
-            for actor, occluder in zip(actors, occluders, strict=True):
-                place_occluder(actor, occluder, int(kept))
-            pictures, drawn = stage.pictures(), poses
+
+    def annotate(t: int) -> None:
         for recorder, picture in zip(recorders, pictures, strict=True):
             recorder.add(t, picture, played.points[t])
+
+    for t, kept in enumerate(played.kept):
+        cameras = [path.at(t) for path in paths]
+        poses = (played.poses[t], *(c.cam_from_world for c in cameras), *(prop.pose(int(kept)) for prop in props))
+        if t == 0 or not all(map(np.array_equal, poses, drawn)):  # else nothing moved: the pictures are the same
+            stage.pose(played.poses[t])
+            stage.aim(cameras)
+            for actor, prop in zip(actors, props, strict=True):
+                prop.place(actor, int(kept))
+            stage.shoot()
+            if t > 0:
+                annotate(t - 1)  # while this frame is drawn
+            pictures, drawn = stage.develop(), poses
+        else:
+            annotate(t - 1)
+    annotate(len(played.kept) - 1)
     return recorders
 
 
@@ -137,12 +174,12 @@ class _ViewRecorder:
     """Collects what one camera sees, frame by frame."""
 
     sim_object: SimObject
-    posed: PosedCamera
+    path: CameraPath
     frames: int
     _arrays: dict[str, np.ndarray] = field(init=False)
 
     def __post_init__(self) -> None:
-        t, h, w, e = self.frames, self.posed.camera.height, self.posed.camera.width, len(self.sim_object.entities)
+        t, h, w, e = self.frames, self.path.camera.height, self.path.camera.width, len(self.sim_object.entities)
         self._arrays = {
             "rgb": np.zeros((t, h, w, 3), np.uint8),
             "depth_m": np.zeros((t, h, w), np.float32),
@@ -153,13 +190,13 @@ class _ViewRecorder:
         }
 
     def add(self, t: int, picture: Picture, point_world: Float[np.ndarray, "E 3"]) -> None:
-        o, a = self.sim_object, self._arrays
+        o, a, posed = self.sim_object, self._arrays, self.path.at(t)
         a["rgb"][t], a["depth_m"][t], a["link_id"][t] = picture.rgb, picture.depth_m, picture.body
-        a["entity_id"][t] = entity_mask(picture, o.entities, point_world, self.posed, half_diagonal_m=o.half_diagonal_m)
-        a["uv_px"][t], a["visible"][t] = see_entities(o, self.posed, picture, point_world)
+        a["entity_id"][t] = entity_mask(picture, o.entities, point_world, posed, half_diagonal_m=o.half_diagonal_m)
+        a["uv_px"][t], a["visible"][t] = see_entities(o, posed, picture, point_world)
 
-    def view(self, name: str, stamp_s: Float[np.ndarray, " T"]) -> View:
+    def view(self, name: str, stamp_s: Float[np.ndarray, " T"], sensor: SensorModel, rng: np.random.Generator) -> View:
         a = self._arrays
-        poses = np.tile(self.posed.cam_from_world, (self.frames, 1, 1))
-        clip = Clip(name, self.posed.camera, a["rgb"], a["depth_m"], stamp_s, poses)
+        rgb, depth_m = sense(a["rgb"], a["depth_m"], sensor, rng, camera=self.path.camera)
+        clip = Clip(name, self.path.camera, rgb, depth_m, stamp_s, self.path.cam_from_world)
         return View(clip, a["uv_px"], a["visible"], a["link_id"], a["entity_id"])

@@ -1,59 +1,102 @@
 """Motion scripts: which joint is where at every frame of a take.
 
-Nothing moves in the first :data:`HOLD_FRAMES` frames. Then the chosen joints move one after the other,
-``frames_per_joint`` frames each (the hold is part of the first joint's share), along minimum-jerk
-segments of random amplitude with stops and partial returns. A joint stays where its share ends.
-
-Reference: Flash and Hogan (1985), The coordination of arm movements, equation for the minimum-jerk trajectory.
+Nothing moves in the first :data:`HOLD_FRAMES` frames. Then the chosen joints move one after the other, or overlapping,
+``frames_per_joint`` frames each (the hold is part of the first joint's share), and stay where their shares end. How
+they move is a :class:`MotionStyle`; what they may do on the way is in :mod:`quest.sim.profiles`. Whether moving
+parts run into each other is not looked at: drawers behind a door need an order and no overlap.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from quest.errors import ConfigError
 from quest.sim.articulation import Articulation
+from quest.sim.profiles import PROFILES, ProfileKind, draw_profile, joint_profile, minimum_jerk
 
 HOLD_FRAMES = 8
 FRAMES_PER_S = 30.0
-_AMPLITUDE = (0.6, 1.0)
+_MOVES_AT_LEAST = 3
+_LONG_SHARE = (0.7, 1.5)
+_PAUSE_OFTEN = 0.3
+_PAUSE_S = (0.3, 3.0)
+
+__all__ = [
+    "FRAMES_PER_S",
+    "HOLD_FRAMES",
+    "MotionStyle",
+    "Share",
+    "joint_profile",
+    "long_script",
+    "minimum_jerk",
+    "motion_script",
+    "sample_opening",
+    "share_plan",
+]
 
 
-def minimum_jerk(share: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    """Progress in [0, 1] at shares of the duration in [0, 1]; velocity and acceleration vanish at both ends."""
-    return share**3 * (10 - 15 * share + 6 * share**2)
+@dataclass(frozen=True)
+class MotionStyle:
+    """How joints move.
 
-
-def joint_profile(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
-    """How far a joint is open at each of its frames, as a share of its opening; starts near 0, reaches 0.6 to 1.
-
-    Three scripts are drawn from: open; open with a stop on the way; open, return a part, open again.
+    Attributes:
+        kind: ``human`` (minimum jerk, stops, returns), ``robot`` (constant speed between ramps, waits, regrasps),
+            ``creep`` (slowly all the way, sticking and slipping) or ``mixed`` (every movement draws one).
+        overlap: part of a joint's share, in [0, 0.9), in which the next one is already on its way. N shares of F frames
+            make a take of ``F + (N - 1) round((1 - overlap) F)`` frames, unless a joint has to wait for itself.
+        margin: frames at the start and at the end of every share in which its joint does not move, after the hold.
+        cycles: how often the joints are gone through: in the first pass they open in order, in the second they close
+            in the opposite order, in the third they open again, and so on.
     """
-    top = rng.uniform(*_AMPLITUDE)
-    script = rng.choice(3, p=(0.4, 0.3, 0.3))
-    if script == 0:
-        knots, weights = [0.0, top], [1.0]
-    elif script == 1:
-        stop = rng.uniform(0.3, 0.7) * top
-        knots, weights = [0.0, stop, stop, top], [1.0, rng.uniform(0.15, 0.4), 1.0]
-    else:
-        back = rng.uniform(0.2, 0.6) * top
-        knots, weights = [0.0, top, back, rng.uniform(back, top)], [1.2, 0.8, 0.8]
-    # The end of the script may come a little before the end of the share: a last stop.
-    weights = [*weights, rng.uniform(0.0, 0.15) * sum(weights)]
-    knots = [*knots, knots[-1]]
-    ends = np.concatenate(([0.0], np.cumsum(weights) / np.sum(weights)))
-    share = np.arange(1, frames + 1) / frames
-    segment = np.clip(np.searchsorted(ends, share, side="left") - 1, 0, len(weights) - 1)
-    length = np.maximum(ends[segment + 1] - ends[segment], 1e-9)
-    progress = minimum_jerk(np.clip((share - ends[segment]) / length, 0.0, 1.0))
-    start, end = np.array(knots)[segment], np.array(knots)[segment + 1]
-    return start + (end - start) * progress
+
+    kind: Literal["human", "robot", "creep", "mixed"] = "human"
+    overlap: float = 0.0
+    margin: tuple[int, int] = (0, 0)
+    cycles: int = 1
+
+    def __post_init__(self) -> None:
+        if self.kind not in (*PROFILES, "mixed"):
+            raise ConfigError(f"motion: expected one of {', '.join((*PROFILES, 'mixed'))}, got {self.kind!r}")
+        if not 0 <= self.overlap < 0.9:
+            raise ConfigError(f"motion: expected an overlap from 0 to less than 0.9, got {self.overlap}")
+        if min(self.margin) < 0:
+            raise ConfigError(f"motion: expected margins of 0 frames or more, got {self.margin}")
+        if self.cycles < 1:
+            raise ConfigError(f"motion: expected at least 1 cycle, got {self.cycles}")
+
+
+@dataclass(frozen=True)
+class Share:
+    """One movement of one joint.
+
+    Attributes:
+        joint: which one.
+        start: first frame of the share.
+        moves: first frame at which the joint may be elsewhere than before.
+        stops: from here on it stays where it is.
+        end: one past the last frame of the share.
+        opens: whether it opens or closes.
+    """
+
+    joint: int
+    start: int
+    moves: int
+    stops: int
+    end: int
+    opens: bool = True
 
 
 def motion_script(
-    articulation: Articulation, moved_joints: tuple[int, ...], rng: np.random.Generator, *, frames_per_joint: int = 60
+    articulation: Articulation,
+    moved_joints: tuple[int, ...],
+    rng: np.random.Generator,
+    *,
+    frames_per_joint: int = 60,
+    style: MotionStyle = MotionStyle(),
 ) -> Float[np.ndarray, "T J"]:
     """Joint positions (radians or metres) at every frame of a take.
 
@@ -62,20 +105,82 @@ def motion_script(
         moved_joints: joints that move, in order.
         rng: what the script is drawn from.
         frames_per_joint: frames that each joint gets; the hold is taken from the first one's.
+        style: how they move.
 
     Raises:
         ConfigError: ``frames_per_joint`` leaves no time to move.
     """
-    if frames_per_joint <= HOLD_FRAMES + 2:
-        raise ConfigError(f"frames per joint: expected more than {HOLD_FRAMES + 2}, got {frames_per_joint}")
-    position = np.tile(articulation.rest, (frames_per_joint * len(moved_joints), 1))
-    for k, j in enumerate(moved_joints):
-        start = HOLD_FRAMES if k == 0 else k * frames_per_joint
-        end = (k + 1) * frames_per_joint
-        opened = joint_profile(end - start, rng) * sample_opening(articulation, j, rng)
-        position[start:end, j] += opened
-        position[end:, j] += opened[-1]
-    return position
+    shares = share_plan(moved_joints, frames_per_joint=frames_per_joint, style=style)
+    return _played(articulation, shares, max((s.end for s in shares), default=0), rng, style)
+
+
+def share_plan(
+    moved_joints: tuple[int, ...], *, frames_per_joint: int = 60, style: MotionStyle = MotionStyle()
+) -> list[Share]:
+    """When which joint moves in a :func:`motion_script`.
+
+    Raises:
+        ConfigError: ``frames_per_joint`` leaves no time to move.
+    """
+    _check_room(frames_per_joint, style)
+    step = round((1 - style.overlap) * frames_per_joint)
+    shares: list[Share] = []
+    free = dict.fromkeys(moved_joints, 0)
+    start = -step
+    for cycle in range(style.cycles):
+        for joint in moved_joints if cycle % 2 == 0 else moved_joints[::-1]:
+            start = max(start + step, free[joint])
+            free[joint] = start + frames_per_joint
+            shares.append(_share(joint, start, frames_per_joint, style, opens=cycle % 2 == 0))
+    return shares
+
+
+def long_script(
+    articulation: Articulation,
+    moved_joints: tuple[int, ...],
+    rng: np.random.Generator,
+    *,
+    frames: int,
+    frames_per_joint: int = 60,
+    style: MotionStyle = MotionStyle(),
+) -> Float[np.ndarray, "T J"]:
+    """Joint positions at every one of ``frames`` frames: the joints open and close again and again, in random order.
+
+    Every joint gets its turn before any comes again; those that are open close at their turn. Shares are 0.7 to 1.5
+    times as long as given, with pauses between some. The script ends wherever it is.
+
+    Args:
+        articulation: the object.
+        moved_joints: joints that move.
+        rng: what the script is drawn from.
+        frames: length of the script.
+        frames_per_joint: frames that a movement takes about.
+        style: how they move; its cycles do not count.
+
+    Raises:
+        ConfigError: there is no joint, or ``frames_per_joint`` or ``frames`` leaves no time to move.
+    """
+    _check_room(frames_per_joint, style)
+    if not moved_joints or frames <= HOLD_FRAMES:
+        raise ConfigError(
+            f"long script: expected at least one joint and more than {HOLD_FRAMES} frames, got {len(moved_joints)} "
+            f"joints and {frames} frames"
+        )
+    shares: list[Share] = []
+    free = dict.fromkeys(moved_joints, 0)
+    opened = dict.fromkeys(moved_joints, False)
+    start = 0
+    while start < frames:
+        for joint in rng.permutation(moved_joints).tolist():
+            length = max(round(rng.uniform(*_LONG_SHARE) * frames_per_joint), _shortest(style))
+            start = max(start, free[joint])
+            shares.append(_share(joint, start, length, style, opens=not opened[joint]))
+            opened[joint] = not opened[joint]
+            free[joint] = start + length
+            start += round((1 - style.overlap) * length)
+            if rng.random() < _PAUSE_OFTEN:
+                start = max(start, *free.values()) + round(rng.uniform(*_PAUSE_S) * FRAMES_PER_S)
+    return _played(articulation, shares, max(frames, *(s.end for s in shares)), rng, style)[:frames]
 
 
 def sample_opening(articulation: Articulation, joint: int, rng: np.random.Generator) -> float:
@@ -85,3 +190,42 @@ def sample_opening(articulation: Articulation, joint: int, rng: np.random.Genera
     if min(below, above) > 0.6 * max(below, above):
         return above if draw < 0.5 else -below
     return articulation.joints[joint].opening()
+
+
+def _shortest(style: MotionStyle) -> int:
+    return HOLD_FRAMES + sum(style.margin) + _MOVES_AT_LEAST
+
+
+def _check_room(frames_per_joint: int, style: MotionStyle) -> None:
+    if frames_per_joint < _shortest(style):
+        raise ConfigError(
+            f"frames per joint: expected at least {_shortest(style)} (a hold of {HOLD_FRAMES}, margins of "
+            f"{style.margin[0]} and {style.margin[1]}, and time to move), got {frames_per_joint}"
+        )
+
+
+def _share(joint: int, start: int, frames: int, style: MotionStyle, *, opens: bool) -> Share:
+    before, after = style.margin
+    end = start + frames
+    return Share(joint, start, max(start, HOLD_FRAMES) + before, end - after, end, opens)
+
+
+def _played(
+    articulation: Articulation, shares: list[Share], frames: int, rng: np.random.Generator, style: MotionStyle
+) -> Float[np.ndarray, "T J"]:
+    position = np.tile(articulation.rest, (frames, 1))
+    now = {s.joint: 0.0 for s in shares}
+    opening = dict(now)
+    for s in shares:
+        kind: ProfileKind = PROFILES[int(rng.integers(len(PROFILES)))] if style.kind == "mixed" else style.kind
+        if s.opens:
+            profile = draw_profile(kind, s.stops - s.moves, rng)
+            opening[s.joint] = sample_opening(articulation, s.joint, rng)
+        else:
+            profile = draw_profile(kind, s.stops - s.moves, rng, closing_from=now[s.joint])
+        opened = profile * opening[s.joint]
+        rest = articulation.joints[s.joint].rest
+        position[s.moves : s.stops, s.joint] = rest + opened
+        position[s.stops :, s.joint] = rest + opened[-1]
+        now[s.joint] = float(profile[-1])
+    return position

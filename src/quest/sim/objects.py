@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,36 +13,17 @@ import trimesh
 from jaxtyping import Float
 
 from quest.errors import ObjectError
-from quest.sim.articulation import ArticulatedJoint, Articulation, Part, apply
+from quest.sim.articulation import ArticulatedJoint, Articulation, Part
+from quest.sim.description import CORRECTIONS, DESCRIPTION_NAME, FRONTS, Description, place, read_description
 from quest.sim.entities import MOVES_AT_LEAST, SimEntity, find_entities, part_label
+from quest.sim.standing import closed, placed, real_scale, scaled, size_scale, with_scaled_origins
 from quest.sim.urdf import Urdf, UrdfVisual, read_urdf
 from quest.types import Joint
 
 OBJECTS_VARIABLE = "QUEST_OBJECTS"
 """Environment variable that names the folder of PartNet-Mobility folders."""
 
-# Which extent of an object at rest has which real length, metres. "height" is vertical, "length" the longest extent.
-_REAL_SIZE_M: dict[str, tuple[Literal["height", "length"], float]] = {
-    "StorageFurniture": ("height", 0.8),
-    "Table": ("height", 0.75),
-    "Refrigerator": ("height", 1.7),
-    "Microwave": ("height", 0.3),
-    "Oven": ("height", 0.9),
-    "Dishwasher": ("height", 0.85),
-    "Door": ("height", 2.0),
-    "Bucket": ("height", 0.3),
-    "Kettle": ("height", 0.25),
-    "Eyeglasses": ("length", 0.14),
-    "Stapler": ("length", 0.15),
-    "Scissors": ("length", 0.18),
-    "Laptop": ("length", 0.34),
-    "WashingMachine": ("height", 0.85),
-    "TrashCan": ("height", 0.4),
-    "Box": ("length", 0.4),
-    "Safe": ("height", 0.5),
-    "Suitcase": ("length", 0.6),
-}
-_DEFAULT_SIZE_M = ("length", 0.8)
+_PLAUSIBLE_M = (0.02, 5.0)
 _CATEGORY_OF_BASE = {
     "furniture_body": "StorageFurniture",
     "refrigerator_body": "Refrigerator",
@@ -56,7 +37,7 @@ class SimObject:
     """An articulated object, ready to be moved and rendered.
 
     Attributes:
-        source: ``partnet-mobility`` or ``procedural``.
+        source: ``partnet-mobility``, ``procedural``, or ``own`` for a user's own.
         object_id: the folder's name.
         category: such as ``StorageFurniture``; ``Unknown`` if the folder does not tell.
         folder: where it was read from.
@@ -67,7 +48,7 @@ class SimObject:
         warnings: degradations, in words: missing meshes, a category that is not known.
     """
 
-    source: Literal["partnet-mobility", "procedural"]
+    source: Literal["partnet-mobility", "procedural", "own"]
     object_id: str
     category: str
     folder: Path
@@ -81,14 +62,15 @@ class SimObject:
     def movable(self) -> tuple[int, ...]:
         """Joints that carry an entity (hinges aside) that moves at least 0.1 normalised units."""
         least = MOVES_AT_LEAST * self.half_diagonal_m
-        return tuple(sorted({e.joint for e in self.entities if e.label != "hinge" and e.travel_m >= least}))
+        moving = {e.joint for e in self.entities if e.label != "hinge" and not e.fixed and e.travel_m >= least}
+        return tuple(sorted(moving))
 
 
 def find_objects(root: Path | None = None) -> list[Path]:
     """Object folders below ``root`` (default: the environment's ``QUEST_OBJECTS``), sorted.
 
     Raises:
-        ObjectError: no root is given or set, it does not exist, or it holds no folder with a ``mobility.urdf``.
+        ObjectError: no root is given or set, it does not exist, or it holds no folder with a URDF.
     """
     if root is None:
         value = os.environ.get(OBJECTS_VARIABLE)
@@ -102,44 +84,116 @@ def find_objects(root: Path | None = None) -> list[Path]:
         raise ObjectError(
             f"{root}: expected a folder of PartNet-Mobility objects, found none; check {OBJECTS_VARIABLE}"
         )
-    folders = sorted(f.parent for f in root.glob("*/mobility.urdf"))
+    folders = sorted({f.parent for pattern in ("*/mobility.urdf", "*/*.urdf") for f in root.glob(pattern)})
     if not folders:
-        raise ObjectError(f"{root}: expected folders that each hold a mobility.urdf, found none")
+        raise ObjectError(f"{root}: expected folders that each hold a mobility.urdf or another URDF, found none")
     return folders
 
 
-def load_object(folder: Path) -> SimObject:
-    """Reads an object folder; only ``mobility.urdf`` and the meshes it names are needed.
-
-    Meshes that are missing or have no faces are left out and listed in ``warnings``.
+def find_urdf(path: Path) -> Path:
+    """The URDF of an object: the path itself, or the folder's ``mobility.urdf``, or its only URDF.
 
     Raises:
-        ObjectError: the folder or its URDF is missing or broken, all meshes are missing, or nothing moves.
+        ObjectError: there is none, there are several, or it is a xacro file.
     """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ObjectError(f"{folder}: expected an object folder, found none; check the path and the object's id")
+    if path.suffix == ".xacro":
+        raise ObjectError(
+            f"{path}: expected a URDF, got xacro, which has to be expanded; run: xacro {path.name} > {path.stem}"
+        )
+    if path.is_file():
+        return path
+    if not path.is_dir():
+        raise ObjectError(f"{path}: expected an object folder, found none; check the path and the object's id")
+    named = path / "mobility.urdf"
+    found = [named] if named.is_file() else sorted(path.glob("*.urdf"))
+    if len(found) > 1:
+        raise ObjectError(
+            f"{path}: expected one URDF, found {', '.join(f.name for f in found)}; name one of the files itself"
+        )
+    if not found:
+        xacro = next(iter(sorted(path.glob("*.xacro"))), None)
+        if xacro is not None:
+            find_urdf(xacro)
+        raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf")
+    return found[0]
+
+
+def object_id_of(path: Path) -> str:
+    """What the object at a path is called: by its folder, or by its URDF where a folder's URDF is named itself.
+
+    Raises:
+        ObjectError: there is no URDF.
+    """
+    urdf_path = find_urdf(path)
+    by_folder = urdf_path.stem in ("mobility", urdf_path.parent.name) or path.is_dir()
+    return urdf_path.resolve().parent.name if by_folder else urdf_path.stem
+
+
+def load_object(path: Path) -> SimObject:
+    """Reads an object: a folder of PartNet-Mobility's shape, or any folder or URDF of a user's own.
+
+    Only the URDF and the meshes it names are needed. Meshes that are missing or have no faces are left out and listed
+    in ``warnings``. A URDF of another name than ``mobility.urdf``, and any with an ``entities.json`` beside it, is the
+    user's own: its units are metres unless that file tells a size (see :mod:`quest.sim.description`).
+
+    Args:
+        path: the folder, or the URDF.
+
+    Raises:
+        ObjectError: the folder, its URDF or its description is missing or broken, all meshes are missing, or nothing
+            moves.
+    """
+    urdf_path = find_urdf(Path(path))
+    folder = urdf_path.parent
     warnings: list[str] = []
-    urdf = _with_scaled_origins(read_urdf(folder / "mobility.urdf"), warnings)
+    urdf = with_scaled_origins(read_urdf(urdf_path), warnings)
     meta = _read_json(folder / "meta.json", warnings)
     meta = meta if isinstance(meta, dict) else {}
-    articulation = _closed(_articulation(urdf, folder, warnings))
-    category = str(meta.get("model_cat") or _category_of_base(folder))
-    if category == "Unknown":
-        warnings.append("category unknown (no meta.json): assumed to be 0.8 m long")
-    source = "procedural" if meta.get("source") == "procedural" else "partnet-mobility"
-    scale = 1.0 if source == "procedural" else _scale(articulation, category)
-    articulation = _placed(_scaled(articulation, scale))
+    described = folder / DESCRIPTION_NAME
+    source: Literal["partnet-mobility", "procedural", "own"] = "partnet-mobility"
+    if meta.get("source") == "procedural":
+        source = "procedural"
+    elif described.is_file() or urdf_path.name != "mobility.urdf":
+        source = "own"
+    description = read_description(described) if described.is_file() else Description()
+    if source == "partnet-mobility":
+        description = CORRECTIONS.get(folder.name, description)
+    articulation, body_of_link = _articulation(urdf, urdf_path, warnings)
+    articulation = closed(articulation)
+    category = str(description.category or meta.get("model_cat") or _category_of_base(folder))
+    scale = _scale(articulation, source, category, description, warnings)
+    front_rad = None if description.front is None else FRONTS[description.front]
+    articulation = placed(scaled(articulation, scale), front_rad, by_lids=source == "own")
     extent = np.ptp(articulation.world_points(articulation.rest), axis=0)
     half_diagonal_m = float(np.linalg.norm(extent)) / 2
-    entities = find_entities(articulation, half_diagonal_m)
-    if all(e.label == "hinge" for e in entities):
+    told = place(description, articulation, body_of_link, scale)
+    entities = find_entities(articulation, half_diagonal_m, category=category, placed=told)
+    if all(e.label == "hinge" or e.fixed for e in entities):
         raise ObjectError(
             f"{folder}: expected a moving link with a handle, rim or front, found none; use another object"
         )
+    object_id = object_id_of(Path(path))
     return SimObject(
-        source, folder.name, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
+        source, object_id, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
     )  # fmt: skip
+
+
+def _scale(
+    articulation: Articulation, source: str, category: str, description: Description, warnings: list[str]
+) -> float:
+    """Metres per unit of the URDF: as told, else a plausible one for PartNet-Mobility, else 1."""
+    if description.height_m is not None:
+        return size_scale(articulation, "height", description.height_m)
+    if description.size_m is not None:
+        return size_scale(articulation, "length", description.size_m)
+    if source == "partnet-mobility":
+        if category == "Unknown":
+            warnings.append("category unknown (no meta.json): assumed to be 0.8 m long")
+        return real_scale(articulation, category)
+    longest = float(np.ptp(articulation.world_points(articulation.rest), axis=0).max())
+    if not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
+        warnings.append(f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME}")
+    return 1.0
 
 
 def _read_json(path: Path, warnings: list[str]) -> Any:
@@ -158,50 +212,17 @@ def _category_of_base(folder: Path) -> str:
     return next((_CATEGORY_OF_BASE[w] for w in words if w in _CATEGORY_OF_BASE), "Unknown")
 
 
-def _with_scaled_origins(urdf: Urdf, warnings: list[str]) -> Urdf:
-    """Mends a URDF whose meshes were all scaled down but whose origins and travels were not.
+def _articulation(
+    urdf: Urdf, urdf_path: Path, warnings: list[str]
+) -> tuple[Articulation, dict[str, tuple[int, Float[np.ndarray, "4 4"]]]]:
+    """Bodies of links that fixed joints hold together, in URDF units, with the root where the URDF puts it.
 
-    PartNet-Mobility's visuals stand where the joint's origin is taken back, so that all meshes share one frame. If
-    such meshes carry one scale factor, origins in the old units put the axes far outside the object.
+    Also tells the body that each link belongs to, and the link's pose in it.
     """
-    visuals = [v for vs in urdf.links.values() for v in vs if v.mesh is not None]
-    factors = {f for v in visuals for f in v.scale}
-    if len(factors) != 1 or factors == {1.0}:
-        return urdf
-    origins = {j.child: j.parent_from_joint[:3, 3] for j in urdf.joints if j.kind != "fixed"}
-    taken_back = [
-        np.allclose(v.link_from_visual[:3, 3], -origin, atol=1e-6) and np.linalg.norm(origin) > 0
-        for child, origin in origins.items()
-        for v in urdf.links[child]
-    ]
-    if not taken_back or not all(taken_back):
-        return urdf
-    (factor,) = factors
-    warnings.append(f"all meshes are scaled by {factor:g} but joint origins are not: origins were scaled alike")
-
-    def scaled(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        pose = pose.copy()
-        pose[:3, 3] *= factor
-        return pose
-
-    links = {
-        name: tuple(replace(v, link_from_visual=scaled(v.link_from_visual)) for v in vs)
-        for name, vs in urdf.links.items()
-    }
-    joints = []
-    for j in urdf.joints:
-        travel = factor if j.kind == "prismatic" else 1.0
-        joints.append(
-            replace(j, parent_from_joint=scaled(j.parent_from_joint), lower=j.lower * travel, upper=j.upper * travel)
-        )
-    return Urdf(links, tuple(joints))
-
-
-def _articulation(urdf: Urdf, folder: Path, warnings: list[str]) -> Articulation:
-    """Bodies of links that fixed joints hold together, in URDF units, with the root where the URDF puts it."""
+    folder = urdf_path.parent
     moving = [j for j in urdf.joints if j.kind != "fixed" and j.upper > j.lower]
     if not moving:
-        raise ObjectError(f"{folder / 'mobility.urdf'}: expected a joint that moves, found none; use another object")
+        raise ObjectError(f"{urdf_path}: expected a joint that moves, found none; use another object")
     children = {j.child for j in urdf.joints}
     body = {name: 0 for name in urdf.links if name not in children}
     body_from_link = {name: np.eye(4) for name in body}
@@ -216,6 +237,8 @@ def _articulation(urdf: Urdf, folder: Path, warnings: list[str]) -> Articulation
             body[j.child], body_from_link[j.child] = len(joints), np.eye(4)
         else:
             body[j.child], body_from_link[j.child] = body[j.parent], parent_from_joint
+        if j.mimics is not None:
+            warnings.append(f"joint {j.name} mimics {j.mimics}: here it moves on its own")
     names = ("base", *(j.child for j in moving))
     part_names = _names_of_meshes(folder, warnings)
     parts, missing = [], []
@@ -229,14 +252,15 @@ def _articulation(urdf: Urdf, folder: Path, warnings: list[str]) -> Articulation
             parts.append(_part(visual, name, body[link], body_from_link[link], surface))
     if not parts:
         raise ObjectError(
-            f"{folder}: expected meshes beside mobility.urdf, found none of the {len(missing)} that it names "
+            f"{folder}: expected meshes beside {urdf_path.name}, found none of the {len(missing)} that it names "
             f"(first: {missing[0] if missing else 'none named'}); copy the object's textured_objs folder too"
         )
     if missing:
         warnings.append(
             f"{len(missing)} meshes are missing or have no faces and were left out: {', '.join(missing[:5])}"
         )
-    return Articulation(names, tuple(parts), tuple(joints), np.eye(4))
+    body_of_link = {link: (body[link], body_from_link[link]) for link in urdf.links}
+    return Articulation(names, tuple(parts), tuple(joints), np.eye(4)), body_of_link
 
 
 def _part_name(visual: UrdfVisual, link: str, part_names: dict[str, str]) -> str:
@@ -296,92 +320,3 @@ def _part(
     body_from_part = body_from_link @ visual.link_from_visual
     in_body = surface.copy().apply_transform(body_from_part)
     return Part(name, body, body_from_part, visual.mesh, visual.scale, visual.shape, visual.size, visual.rgba, in_body)
-
-
-def _scale(articulation: Articulation, category: str) -> float:
-    extent = np.ptp(articulation.world_points(articulation.rest), axis=0)
-    dimension, metres = _REAL_SIZE_M.get(category, _DEFAULT_SIZE_M)
-    length = float(extent[2] if dimension == "height" else extent.max())
-    return metres / max(length, 1e-9)
-
-
-def _closed(articulation: Articulation) -> Articulation:
-    """The object with doors that are modelled half open at their limit where it takes less room."""
-
-    def room(trial: Articulation) -> float:
-        return float(np.prod(np.ptp(trial.world_points(trial.rest), axis=0)))
-
-    for index, joint in enumerate(articulation.joints):
-        below, above = joint.travel()
-        # A joint that starts at a limit, or nearly, is closed there.
-        if joint.joint.kind != "revolute" or min(below, above) < 0.25 * max(below, above):
-            continue
-        for limit in (joint.joint.lower, joint.joint.upper):
-            joints = list(articulation.joints)
-            joints[index] = replace(joint, rest=limit)
-            trial = replace(articulation, joints=tuple(joints))
-            if room(trial) < 0.85 * room(articulation):
-                articulation = trial
-    return articulation
-
-
-def _scaled(articulation: Articulation, scale: float) -> Articulation:
-    def pose(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        scaled = matrix.copy()
-        scaled[:3, 3] *= scale
-        return scaled
-
-    parts = []
-    for p in articulation.parts:
-        sx, sy, sz = p.scale
-        parts.append(
-            replace(
-                p,
-                body_from_part=pose(p.body_from_part),
-                scale=(sx * scale, sy * scale, sz * scale),
-                size_m=tuple(s * scale for s in p.size_m),
-                surface=p.surface.copy().apply_scale(scale),
-            )
-        )
-    joints = []
-    for j in articulation.joints:
-        factor = scale if j.joint.kind == "prismatic" else 1.0
-        record = replace(j.joint, lower=j.joint.lower * factor, upper=j.joint.upper * factor)
-        joints.append(replace(j, joint=record, parent_from_joint=pose(j.parent_from_joint), rest=j.rest * factor))
-    return replace(
-        articulation, parts=tuple(parts), joints=tuple(joints), world_from_root=pose(articulation.world_from_root)
-    )
-
-
-def _placed(articulation: Articulation) -> Articulation:
-    """The object standing on the floor around the origin, its front towards +x."""
-    yaw = -_front_azimuth(articulation)
-    turn = np.eye(4)
-    turn[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    turned = replace(articulation, world_from_root=turn @ articulation.world_from_root)
-    points = turned.world_points(turned.rest)
-    low, high = points.min(axis=0), points.max(axis=0)
-    shift = np.eye(4)
-    shift[:3, 3] = [-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]]
-    return replace(turned, world_from_root=shift @ turned.world_from_root)
-
-
-def _front_azimuth(articulation: Articulation) -> float:
-    """Where the object's doors and drawers open to, as a multiple of a right angle; PartNet's -x if that is unclear."""
-    poses = articulation.poses(articulation.rest)
-    total = np.zeros(2)
-    opened = 0.0
-    for j, joint in enumerate(articulation.joints):
-        points = articulation.body_points[1 + j]
-        below, above = joint.travel()
-        # A joint that can go both ways from its place at rest does not tell where the front is.
-        if len(points) == 0 or min(below, above) > 0.25 * max(below, above):
-            continue
-        # The middle of the bounding box, not of the vertices, which crowd where the modeller was fond of detail.
-        centre = apply(poses[1 + j], (points.min(axis=0) + points.max(axis=0)) / 2)
-        step = articulation.velocity(j, centre) * abs(joint.opening())
-        total += step[:2]
-        opened += float(np.linalg.norm(step))
-    if np.linalg.norm(total) < 0.3 * opened or opened == 0.0:
-        return np.pi
-    return float(np.round(np.arctan2(total[1], total[0]) / (np.pi / 2)) * (np.pi / 2))

@@ -74,6 +74,33 @@ class Occluder:
     surface: Surface
     world_from_shape: Float[np.ndarray, "T 4 4"]
 
+    def add(self, scene: Any) -> Any:
+        """Put it into a ``sapien.Scene``; returns the entity that :meth:`place` moves."""
+        import sapien
+
+        shape, material = self.shape, make_material(self.surface)
+        half = shape.half_m.astype(np.float32).tolist()
+        component = sapien.render.RenderBodyComponent()
+        if shape.kind == "box":
+            component.attach(sapien.render.RenderShapeBox(half, material))
+        else:
+            component.attach(sapien.render.RenderShapeCylinder(half[1], half[0], material))
+        entity = sapien.Entity()
+        entity.add_component(component)
+        scene.add_entity(entity)
+        self.place(entity, 0)
+        return entity
+
+    def place(self, actors: Any, frame: int) -> None:
+        """Move its entity to where it is at a frame of the script."""
+        import sapien
+
+        actors.set_pose(sapien.Pose(self.world_from_shape[frame]))
+
+    def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
+        """Where it is at a frame of the script."""
+        return self.world_from_shape[frame]
+
 
 def fit_shape(
     slopes: Float[np.ndarray, "N 2"], posed: PosedCamera, nearest_m: float, rng: np.random.Generator
@@ -161,31 +188,6 @@ def slide_in(
 def sample_occluder_surface(rng: np.random.Generator) -> Surface:
     """Draw its material."""
     return sample_surface(rng, textured=0.6)
-
-
-def add_occluder(scene: Any, occluder: Occluder) -> Any:
-    """Put an occluder into a ``sapien.Scene``; returns the entity, which :func:`place_occluder` moves."""
-    import sapien
-
-    shape, material = occluder.shape, make_material(occluder.surface)
-    half = shape.half_m.astype(np.float32).tolist()
-    component = sapien.render.RenderBodyComponent()
-    if shape.kind == "box":
-        component.attach(sapien.render.RenderShapeBox(half, material))
-    else:
-        component.attach(sapien.render.RenderShapeCylinder(half[1], half[0], material))
-    entity = sapien.Entity()
-    entity.add_component(component)
-    scene.add_entity(entity)
-    place_occluder(entity, occluder, 0)
-    return entity
-
-
-def place_occluder(entity: Any, occluder: Occluder, frame: int) -> None:
-    """Move an occluder's entity to where it is at a frame of the script."""
-    import sapien
-
-    entity.set_pose(sapien.Pose(occluder.world_from_shape[frame]))
 
 
 def _turn(axis: int, angle_rad: float) -> Float[np.ndarray, "3 3"]:

@@ -13,16 +13,17 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial import ConvexHull
 
-from quest.errors import ConfigError, ObjectError
+from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, apply
-from quest.sim.cameras import PosedCamera, sample_cameras
+from quest.sim.cameras import CameraPath, PosedCamera, sample_camera_paths
 from quest.sim.entities import MOVES_AT_LEAST
 from quest.sim.motion import HOLD_FRAMES, minimum_jerk, sample_opening
 from quest.sim.objects import SimObject
 from quest.sim.occluder import Occluder, Shape, fit_shape, sample_occluder_surface, slide_in
 from quest.sim.renderer import Renderer, Stage
-from quest.sim.staging import Playback, Staging, TakeSettings, choose_joints, see_entities
-from quest.sim.suites import HIDDEN_FRAMES, Suite
+from quest.sim.settings import TakeSettings
+from quest.sim.staging import Playback, Staging, choose_joints, played_frames, see_entities
+from quest.sim.suites import HIDDEN_FRAMES, Hiding
 
 SURROUNDINGS = 0.09
 """Radius of what is hidden around an entity, as a share of the image's width: 20 pixels of 224."""
@@ -77,7 +78,7 @@ class _Hidden:
 def stage_occlusion(
     sim_object: SimObject,
     level: int,
-    suite: Suite,
+    hiding: Hiding,
     motion_rng: np.random.Generator,
     camera_rng: np.random.Generator,
     occluder_rng: np.random.Generator,
@@ -85,35 +86,44 @@ def stage_occlusion(
     renderer: Renderer,
     settings: TakeSettings,
 ) -> Staging:
-    """A take of a suite, seen by one camera.
+    """A take in which entities are hidden, seen by one camera that stands still.
 
     Of up to 24 draws of joints, motion and camera the first is taken in which every joint's entity can be hidden: it is
-    seen before and after, and look-alikes are in view or not, as the suite wants. With several joints, a draw in which
+    seen before and after, and look-alikes are in view or not, as wanted. With several joints, a draw in which
     two of them can be hidden is kept in reserve.
 
     Raises:
-        ConfigError: more than one view is wanted.
+        ConfigError: more than one view is wanted, or what cannot be had together with hidden entities.
         ObjectError: the object has too few joints, or no draw is good enough.
     """
-    if settings.views != 1:
-        raise ConfigError(
-            f"suite {suite.name}: expected 1 view, for an occluder hides from one camera, got {settings.views}"
-        )
-    joints_left = _joints_with_look_alikes(sim_object) if suite.look_alike else sim_object.movable
-    hidden = suite.hidden or int(occluder_rng.integers(HIDDEN_FRAMES[0], HIDDEN_FRAMES[1] + 1))
+    hiding.check(settings)
+    joints_left = _joints_with_look_alikes(sim_object) if hiding.look_alike else sim_object.movable
+    hidden = hiding.frames or int(occluder_rng.integers(HIDDEN_FRAMES[0], HIDDEN_FRAMES[1] + 1))
+    stage: Stage | None = None
     best: tuple[tuple[int, ...], Float[np.ndarray, "S J"], PosedCamera, list[_Hidden]] | None = None
     for _ in range(_ATTEMPTS):
         joints = choose_joints(sim_object, level, motion_rng, among=joints_left)
-        script, episodes = occlusion_script(sim_object.articulation, joints, suite, hidden, motion_rng)
+        script, episodes = occlusion_script(sim_object.articulation, joints, hiding, hidden, motion_rng)
         playback = Playback.of(sim_object, script)
-        (camera,) = sample_cameras(playback.swept, 1, camera_rng, width=settings.size, height=settings.size)
-        found = _hide(sim_object, playback, episodes, camera, suite, occluder_rng, renderer)
+        (path,) = sample_camera_paths(
+            playback.swept,
+            1,
+            len(script),
+            camera_rng,
+            style=settings.cameras,
+            width=settings.size,
+            height=settings.size,
+        )
+        camera = path.at(0)
+        stage = stage or renderer.stage(sim_object, [camera])  # geometry matters, not light
+        stage.aim([camera])
+        found = _hide(sim_object, playback, episodes, camera, hiding, occluder_rng, stage)
         if len(found) >= min(level, 2) and (best is None or len(found) > len(best[3])):
             best = (joints, script, camera, found)
         if len(found) == level:
             break
-    if best is None:
-        beside = "beside a look-alike that stays in view" if suite.look_alike else "with no look-alike in view"
+    if best is None or stage is None:
+        beside = "beside a look-alike that stays in view" if hiding.look_alike else "with no look-alike in view"
         raise ObjectError(
             f"{sim_object.object_id}: expected a view in which a moving entity is seen before and after, and can be "
             f"hidden {beside}, found none in {_ATTEMPTS} draws; use another seed or another object"
@@ -126,21 +136,24 @@ def stage_occlusion(
     )
     playback = Playback.of(sim_object, script, settings.every)
     about = {
-        "look_alike": suite.look_alike,
-        "hidden": [[sim_object.entities[h.entity].name, *_kept(playback.kept, h.episode)] for h in found],
+        "look_alike": hiding.look_alike,
+        "hidden": [
+            [sim_object.entities[h.entity].name, *played_frames(playback.kept, h.episode.hidden, h.episode.shown)]
+            for h in found
+        ],
     }
-    return Staging(joints, playback, (camera,), occluders, about)
+    return Staging(joints, playback, (CameraPath.standing(camera, len(script)),), stage, occluders, about)
 
 
 def occlusion_script(
-    articulation: Articulation, joints: tuple[int, ...], suite: Suite, hidden: int, rng: np.random.Generator
+    articulation: Articulation, joints: tuple[int, ...], hiding: Hiding, hidden: int, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "S J"], list[Episode]]:
     """Joint positions at every frame, and what happens when.
 
     Args:
         articulation: the object.
         joints: the joints that move, in order, one share each.
-        suite: how long the shares are.
+        hiding: how long the shares are.
         hidden: frames for which every joint's entity is hidden.
         rng: what the script is drawn from.
     """
@@ -148,7 +161,7 @@ def occlusion_script(
     movements: list[Float[np.ndarray, " N"]] = []
     start = 0
     for joint in joints:
-        before, after = (int(rng.integers(low, high + 1)) for low, high in (suite.before, suite.after))
+        before, after = (int(rng.integers(low, high + 1)) for low, high in (hiding.before, hiding.after))
         # The joint stops well before it is shown again; at least half of its way is seen before it is hidden.
         unseen = max(1, round(rng.uniform(*_MOVES_HIDDEN) * hidden))
         room = before - (HOLD_FRAMES if start == 0 else 0)
@@ -186,12 +199,11 @@ def _hide(
     playback: Playback,
     episodes: list[Episode],
     posed: PosedCamera,
-    suite: Suite,
+    hiding: Hiding,
     rng: np.random.Generator,
-    renderer: Renderer,
+    stage: Stage,
 ) -> list[_Hidden]:
-    """What can be hidden of every episode's entities as the suite wants it, from one camera."""
-    stage = renderer.stage(sim_object, [posed], lambda scene, bodies: None)  # geometry matters, not light
+    """What can be hidden of every episode's entities as wanted, from one camera."""
     found = []
     for episode in episodes:
         moments = np.array(
@@ -209,7 +221,7 @@ def _hide(
             continue
         label = sim_object.entities[entity].label
         alike = [i for i, e in enumerate(sim_object.entities) if e.label == label and i != entity]
-        if not suite.look_alike and visible[:, alike].any():
+        if not hiding.look_alike and visible[:, alike].any():
             continue
         slopes = _slopes_to_hide(sim_object, playback, entity, episode, posed)
         nearest_m = float(apply(posed.cam_from_world, playback.swept)[:, 2].min())
@@ -219,7 +231,7 @@ def _hide(
         beside = [i for i in alike if sim_object.entities[i].joint != episode.joint and visible[2:, i].all()]
         camera = posed.camera
         slope = (uv[2:] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-        if suite.look_alike and not any(not shape.hides(slope[:, i]).any() for i in beside):
+        if hiding.look_alike and not any(not shape.hides(slope[:, i]).any() for i in beside):
             continue
         found.append(_Hidden(entity, episode, shape))
     return found
@@ -268,9 +280,3 @@ def _slopes_to_hide(
         slopes += [rays, rays[:1] + disc]
     rays = np.concatenate(slopes)
     return rays[ConvexHull(rays).vertices]
-
-
-def _kept(kept: Int[np.ndarray, " T"], episode: Episode) -> tuple[int, int]:
-    """First hidden frame of the take, and one past the last."""
-    first, end = np.searchsorted(kept, [episode.hidden, episode.shown])
-    return int(first), int(end)

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from quest.errors import ObjectError
 from quest.sim.generate import take_name
-from quest.sim.objects import SimObject, find_objects, load_object
+from quest.sim.objects import SimObject, find_objects, load_object, object_id_of
 from quest.sim.procedural import CATEGORIES, category_for_seed, make_object
+from quest.sim.settings import TakeSettings
 from quest.sim.suites import Suite
 
 
@@ -19,23 +20,26 @@ class TakeSpec:
     """One take to make.
 
     Attributes:
-        source: ``partnet`` or ``procedural``.
-        object_id: folder name, or ``category-seed``.
+        source: ``partnet``, ``procedural`` or ``own``.
+        object_id: folder name, ``category-seed``, or the path of a user's own folder or URDF.
         level: how many joints move.
         seed: of the take.
-        suite: what makes it difficult; None for an ordinary take.
+        settings: how it is made.
+        suite: which suite it belongs to; None for an ordinary take.
     """
 
     source: str
     object_id: str
     level: int
     seed: int
+    settings: TakeSettings = TakeSettings()
     suite: Suite | None = None
 
     @property
     def name(self) -> str:
         """Name of the take in its store."""
-        return take_name(self.object_id, self.level, self.seed, self.suite)
+        object_id = object_id_of(Path(self.object_id)) if self.source == "own" else self.object_id
+        return take_name(object_id, self.level, self.seed, self.suite)
 
 
 def plan_takes(
@@ -44,47 +48,58 @@ def plan_takes(
     levels: Sequence[int],
     takes_per_object: int,
     first_seed: int = 0,
-    suite: Suite | None = None,
+    settings: TakeSettings = TakeSettings(),
+    suites: Sequence[Suite] = (),
 ) -> list[TakeSpec]:
     """Takes of every object at every level, all objects once before any comes again.
 
     Args:
         objects: source and id of each.
         levels: levels to make.
-        takes_per_object: takes per object and level.
+        takes_per_object: takes per object and level, in each suite.
         first_seed: seed of the first take of each object; the others count up.
-        suite: what makes the takes difficult; None for ordinary ones.
+        settings: how ordinary takes are made; suites bring their own.
+        suites: the suites to make takes of, instead of ordinary ones.
     """
     chosen = list(objects)
+    kinds = [(suite.settings, suite) for suite in suites] or [(settings, None)]
     return [
-        TakeSpec(source, object_id, level, first_seed + n, suite)
+        TakeSpec(source, object_id, level, first_seed + n, how, suite)
         for n in range(takes_per_object)
         for level in levels
         for source, object_id in chosen
+        for how, suite in kinds
     ]
 
 
 def parse_object(text: str) -> list[tuple[str, str]]:
-    """Sources and ids of ``partnet:44817,23724``, ``procedural:chest-12`` or ids alone (PartNet-Mobility).
+    """Sources and ids of ``partnet:44817,23724``, ``procedural:chest-12``, ids alone (PartNet-Mobility), or a path.
+
+    A path, with a slash in it or ending in ``.urdf``, is a user's own object.
 
     Raises:
-        ObjectError: the source is unknown or no id is given.
+        ObjectError: the source is unknown, no id is given, or there is no object at the path.
     """
+    if "/" in text or "\\" in text or text.endswith(".urdf"):
+        object_id_of(Path(text))  # told at once
+        return [("own", text)]
     source, colon, ids = text.partition(":")
     if not colon:
         source, ids = "partnet", text
     names = [name.strip() for name in ids.split(",") if name.strip()]
     if source not in ("partnet", "procedural") or not names:
         raise ObjectError(
-            f"objects {text!r}: expected partnet:ID,ID or procedural:CATEGORY-SEED, such as partnet:44817,23724"
+            f"objects {text!r}: expected partnet:ID,ID (partnet:44817,23724), procedural:CATEGORY-SEED, or a path"
         )
     return [(source, name) for name in names]
 
 
-def procedural_objects(count: int, first_seed: int, category: str | None = None) -> list[tuple[str, str]]:
-    """``count`` procedural objects, one per object seed, of a category or in the usual mix of categories."""
+def procedural_objects(
+    count: int, first_seed: int, category: str | None = None, *, mix: str = "usual"
+) -> list[tuple[str, str]]:
+    """``count`` procedural objects, one per object seed, of a category or in a mix of categories."""
     seeds = range(first_seed, first_seed + count)
-    return [("procedural", f"{category or category_for_seed(seed)}-{seed}") for seed in seeds]
+    return [("procedural", f"{category or category_for_seed(seed, mix=mix)}-{seed}") for seed in seeds]
 
 
 class ObjectShelf:
@@ -124,6 +139,8 @@ class ObjectShelf:
         return found
 
     def _folder(self, source: str, object_id: str) -> Path:
+        if source == "own":
+            return Path(object_id)
         if source == "procedural":
             category, _, seed = object_id.rpartition("-")
             if category not in CATEGORIES or not seed.isdigit():

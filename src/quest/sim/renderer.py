@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 
 from quest.errors import RendererError
 from quest.extras import require
@@ -67,16 +67,19 @@ class Renderer:
         # SAPIEN drops its compiled shaders with the last camera: keep a stage alive until the next one exists.
         self._latest: Stage | None = None
 
-    def stage(self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Dress) -> Stage:
+    def stage(self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Dress | None = None) -> Stage:
         """A scene with one object and its cameras.
 
         Args:
             sim_object: the object; body and entity indices in the pictures are its own.
-            cameras: where to look from; they stay where they are.
-            dress: gives the scene lights, surroundings and materials.
+            cameras: where to look from, until :meth:`Stage.aim` says otherwise.
+            dress: gives the scene lights, surroundings and materials; without it the scene is dark until
+                :meth:`Stage.dress`, which is enough for depth and labels.
         """
         try:
-            self._latest = Stage(self._sapien, sim_object, cameras, dress)
+            self._latest = Stage(self._sapien, sim_object, cameras)
+            if dress is not None:
+                self._latest.dress(dress)
             return self._latest
         except RuntimeError as error:
             raise RendererError(
@@ -87,12 +90,12 @@ class Renderer:
 class Stage:
     """A scene with one object that can be posed and photographed; made by :meth:`Renderer.stage`."""
 
-    def __init__(self, sapien: Any, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Dress) -> None:
+    def __init__(self, sapien: Any, sim_object: SimObject, cameras: Sequence[PosedCamera]) -> None:
         self._sapien = sapien
         self._scene = sapien.Scene([sapien.render.RenderSystem()])
         self._bodies: list[list[Any]] = [[] for _ in sim_object.articulation.body_names]
         labels: dict[int, tuple[int, int]] = {}
-        render_bodies = []
+        self._render_bodies: list[Any] = []
         for body, entity, parts in _groups(sim_object):
             component = sapien.render.RenderBodyComponent()
             for part in parts:
@@ -102,25 +105,38 @@ class Stage:
             self._scene.add_entity(actor)
             self._bodies[body].append(actor)
             labels[actor.per_scene_id] = (1 + body, 1 + entity)
-            render_bodies.append(component)
-        dress(self._scene, render_bodies)
-        self._label_of_id = np.zeros((max(labels) + 1, 2), dtype=np.uint8)
-        for per_scene_id, label in labels.items():
-            self._label_of_id[per_scene_id] = label
-        self._cameras = [self._add_camera(camera) for camera in cameras]
+            self._render_bodies.append(component)
+        self._body_of_id = np.zeros(max(labels) + 2, dtype=np.uint8)
+        self._entity_of_id = np.zeros(max(labels) + 2, dtype=np.uint8)
+        for per_scene_id, (body, entity) in labels.items():
+            self._body_of_id[per_scene_id], self._entity_of_id[per_scene_id] = body, entity
         self._posed: list[np.ndarray | None] = [None] * len(self._bodies)
+        self._cameras = [self._add_camera(posed) for posed in cameras]
+        self._aimed: list[PosedCamera | None] = [None] * len(self._cameras)
+        self.aim(cameras)
 
-    def _add_camera(self, posed: PosedCamera) -> Any:
-        camera = posed.camera
-        component = self._sapien.render.RenderCameraComponent(camera.width, camera.height)
-        far = 1e3
-        near = 1e-2 * max(float(np.linalg.norm(posed.cam_from_world[:3, 3])), 1e-2)
-        component.set_perspective_parameters(near, far, camera.fx, camera.fy, camera.cx, camera.cy, 0.0)
+    def dress(self, dress: Dress) -> None:
+        """Gives the scene its lights, surroundings and materials."""
+        dress(self._scene, self._render_bodies)
+
+    def _add_camera(self, posed: PosedCamera) -> tuple[Any, Any]:
+        component = self._sapien.render.RenderCameraComponent(posed.camera.width, posed.camera.height)
         mount = self._sapien.Entity()
         mount.add_component(component)
-        mount.set_pose(self._sapien.Pose(np.linalg.inv(posed.cam_from_world) @ _CV_FROM_SAPIEN))
         self._scene.add_entity(mount)
-        return component
+        return component, mount
+
+    def aim(self, cameras: Sequence[PosedCamera]) -> None:
+        """Moves the cameras; their number and image sizes stay."""
+        for index, posed in enumerate(cameras):
+            last, (component, mount) = self._aimed[index], self._cameras[index]
+            if last is None or last.camera != posed.camera:
+                camera = posed.camera
+                near = 1e-2 * max(float(np.linalg.norm(posed.cam_from_world[:3, 3])), 1e-2)
+                component.set_perspective_parameters(near, 1e3, camera.fx, camera.fy, camera.cx, camera.cy, 0.0)
+            if last is None or not np.array_equal(last.cam_from_world, posed.cam_from_world):
+                mount.set_pose(self._sapien.Pose(np.linalg.inv(posed.cam_from_world) @ _CV_FROM_SAPIEN))
+            self._aimed[index] = posed
 
     def pose(self, world_from_body: Float[np.ndarray, "B 4 4"]) -> None:
         """Moves the bodies."""
@@ -135,20 +151,28 @@ class Stage:
 
     def pictures(self) -> list[Picture]:
         """What every camera sees now."""
+        self.shoot()
+        return self.develop()
+
+    def shoot(self) -> None:
+        """Begins to draw what every camera sees now, and does not wait for it."""
         self._scene.update_render()
-        for camera in self._cameras:
+        for camera, _ in self._cameras:
             camera.take_picture()
-        return [self._picture(camera) for camera in self._cameras]
+
+    def develop(self) -> list[Picture]:
+        """The pictures of the last :meth:`shoot`, when they are drawn."""
+        return [self._picture(camera) for camera, _ in self._cameras]
 
     def _picture(self, camera: Any) -> Picture:
-        rgb = np.clip(camera.get_picture("Color")[..., :3] * 255 + 0.5, 0, 255).astype(np.uint8)
+        colour = camera.get_picture("Color")[..., :3] * np.float32(255)
+        colour += np.float32(0.5)
+        rgb = np.clip(colour, 0, 255, out=colour).astype(np.uint8)
         # Camera space with OpenGL axes: depth is -z, and 0 where nothing was drawn.
         depth = np.maximum(-camera.get_picture("Position")[..., 2], 0.0).astype(np.float32)
-        ids: Int[np.ndarray, "H W"] = camera.get_picture("Segmentation")[..., 1].astype(np.int64)
-        known = ids < len(self._label_of_id)
-        labels = self._label_of_id[np.where(known, ids, 0)]
-        labels[~known] = 0
-        return Picture(rgb, depth, labels[..., 0], labels[..., 1])
+        # Whatever was added after the object (props, surroundings) shares the last entry: background.
+        ids = np.minimum(camera.get_picture("Segmentation")[..., 1], len(self._body_of_id) - 1)
+        return Picture(rgb, depth, self._body_of_id.take(ids), self._entity_of_id.take(ids))
 
 
 def _groups(sim_object: SimObject) -> list[tuple[int, int, list[Part]]]:

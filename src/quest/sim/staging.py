@@ -3,47 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from quest.errors import ConfigError, ObjectError
+from quest.errors import ObjectError
 from quest.sim.annotate import project_points, visible_entities
 from quest.sim.articulation import apply
-from quest.sim.cameras import PosedCamera, sample_cameras
-from quest.sim.motion import FRAMES_PER_S, HOLD_FRAMES, motion_script
+from quest.sim.cameras import CameraPath, PosedCamera, bump, sample_camera_paths
+from quest.sim.disturbance import change_light, disturbed_at
+from quest.sim.gripper import plan_gripper
+from quest.sim.motion import FRAMES_PER_S, MotionStyle, long_script, motion_script
 from quest.sim.objects import SimObject
-from quest.sim.occluder import Occluder
-from quest.sim.renderer import Picture, Renderer
+from quest.sim.physics import play_physically
+from quest.sim.props import Prop
+from quest.sim.renderer import Picture, Renderer, Stage
+from quest.sim.settings import TakeSettings
+
+GRIPPER_MARGIN = (20, 12)
+"""Frames of a joint's share in which a gripper comes, and goes."""
 
 _CAMERA_ATTEMPTS = 12
-
-
-@dataclass(frozen=True)
-class TakeSettings:
-    """What all takes of a run have in common.
-
-    Attributes:
-        views: how many static cameras.
-        size: width and height of the images, pixels.
-        every: keep every n-th frame of the motion script.
-        frames_per_joint: frames of the script that each joint gets; suites have scripts of their own.
-        randomize_materials: whether objects get random materials, beside random light and surroundings.
-    """
-
-    views: int = 3
-    size: int = 224
-    every: int = 1
-    frames_per_joint: int = 60
-    randomize_materials: bool = True
-
-    def __post_init__(self) -> None:
-        if self.views < 1 or self.size < 16:
-            raise ConfigError(f"take: expected at least 1 view of 16 pixels, got {self.views} of {self.size}")
-        if not 1 <= self.every <= HOLD_FRAMES:
-            raise ConfigError(f"take: expected to keep every 1st to {HOLD_FRAMES}th frame, got every {self.every}")
 
 
 @dataclass(frozen=True)
@@ -83,15 +65,17 @@ class Staging:
     Attributes:
         moved_joints: the joints that move, in order.
         playback: the motion.
-        cameras: where it is seen from.
-        occluders: things that come between the cameras and the object; their poses are those of the whole script.
+        cameras: where it is seen from at every frame of the script.
+        stage: the object before these cameras, not dressed yet.
+        props: what else is in the scene and moves or changes, by frames of the script.
         about: what the take's provenance says of it.
     """
 
     moved_joints: tuple[int, ...]
     playback: Playback
-    cameras: tuple[PosedCamera, ...]
-    occluders: tuple[Occluder, ...] = ()
+    cameras: tuple[CameraPath, ...]
+    stage: Stage
+    props: tuple[Prop, ...] = ()
     about: dict[str, Any] = field(default_factory=dict)
 
 
@@ -100,19 +84,64 @@ def stage_plain(
     level: int,
     motion_rng: np.random.Generator,
     camera_rng: np.random.Generator,
+    props_rng: np.random.Generator,
     *,
     renderer: Renderer,
     settings: TakeSettings,
 ) -> Staging:
-    """An ordinary take: nothing but the object.
+    """A take in which nothing is hidden on purpose: the object, and a gripper or a disturbance if the settings say so.
 
     Raises:
-        ObjectError: the object has fewer than ``level`` joints that carry an entity that moves.
+        ObjectError: the object has fewer than ``level`` joints that carry an entity that moves, or a gripper finds
+            nothing to grasp.
     """
     joints = choose_joints(sim_object, level, motion_rng)
-    script = motion_script(sim_object.articulation, joints, motion_rng, frames_per_joint=settings.frames_per_joint)
+    script = _script(sim_object, joints, motion_rng, settings)
     playback = Playback.of(sim_object, script, settings.every)
-    return Staging(joints, playback, _cameras(sim_object, playback, camera_rng, renderer, settings))
+    cameras, stage = _cameras(sim_object, playback, len(script), camera_rng, renderer, settings)
+    props: list[Prop] = []
+    about: dict[str, Any] = {}
+    if settings.gripper:
+        gripper = plan_gripper(
+            sim_object,
+            script,
+            joints,
+            margin=_motion_style(settings).margin,
+            frames_per_joint=settings.frames_per_joint,
+            rng=props_rng,
+        )
+        props.append(gripper)
+        about["grasped"] = [[name, *played_frames(playback.kept, first, end)] for name, first, end in gripper.grasps]
+    if settings.disturbance == "light":
+        props.append(change_light(len(script), props_rng))
+    if settings.disturbance == "bump":
+        at = disturbed_at(len(script), props_rng)
+        cameras = tuple(bump(path, at, props_rng) for path in cameras)
+        about["bumped"] = played_frames(playback.kept, at, len(script))[0]
+    return Staging(joints, playback, cameras, stage, tuple(props), about)
+
+
+def _motion_style(settings: TakeSettings) -> MotionStyle:
+    wanted = settings.motion
+    return replace(wanted, margin=GRIPPER_MARGIN) if settings.gripper and wanted.margin == (0, 0) else wanted
+
+
+def _script(
+    sim_object: SimObject, joints: tuple[int, ...], rng: np.random.Generator, settings: TakeSettings
+) -> Float[np.ndarray, "S J"]:
+    articulation, style = sim_object.articulation, _motion_style(settings)
+    share = settings.frames_per_joint
+    if settings.frames is None:
+        script = motion_script(articulation, joints, rng, frames_per_joint=share, style=style)
+    else:
+        script = long_script(articulation, joints, rng, frames=settings.frames, frames_per_joint=share, style=style)
+    return play_physically(sim_object, script, rng) if settings.physics else script
+
+
+def played_frames(kept: Int[np.ndarray, " T"], first: int, end: int) -> tuple[int, int]:
+    """Frames of the take that show a range of frames of the script: the first one, and one past the last."""
+    low, high = np.searchsorted(kept, [first, end])
+    return int(low), int(high)
 
 
 def choose_joints(
@@ -158,27 +187,43 @@ def _swept(sim_object: SimObject, poses: Float[np.ndarray, "T B 4 4"]) -> Float[
 
 
 def _cameras(
-    sim_object: SimObject, playback: Playback, rng: np.random.Generator, renderer: Renderer, settings: TakeSettings
-) -> tuple[PosedCamera, ...]:
-    """Cameras that see an entity at rest in every view; the best of a few draws if none does."""
+    sim_object: SimObject,
+    playback: Playback,
+    frames: int,
+    rng: np.random.Generator,
+    renderer: Renderer,
+    settings: TakeSettings,
+) -> tuple[tuple[CameraPath, ...], Stage]:
+    """Cameras that see an entity at rest in every view, or the best of a few draws; and the object before them."""
     followed = [i for i, e in enumerate(sim_object.entities) if e.label != "hinge"]
-    best: tuple[tuple[int, int], list[PosedCamera]] | None = None
+    best: tuple[tuple[int, int], list[CameraPath]] | None = None
+    stage: Stage | None = None
     for _ in range(_CAMERA_ATTEMPTS):
-        cameras = sample_cameras(playback.swept, settings.views, rng, width=settings.size, height=settings.size)
-        # Only geometry matters here: the stage stays dark.
-        stage = renderer.stage(sim_object, cameras, lambda scene, bodies: None)
-        stage.pose(playback.poses[0])
-        pictures = stage.pictures()
+        paths = sample_camera_paths(
+            playback.swept,
+            settings.views,
+            frames,
+            rng,
+            style=settings.cameras,
+            width=settings.size,
+            height=settings.size,
+        )
+        cameras = [path.at(0) for path in paths]
+        if stage is None:
+            stage = renderer.stage(sim_object, cameras)  # only geometry matters here: it stays dark
+            stage.pose(playback.poses[0])
+        stage.aim(cameras)
         seen = np.stack(
             [
                 see_entities(sim_object, camera, picture, playback.points[0])[1][followed]
-                for camera, picture in zip(cameras, pictures, strict=True)
+                for camera, picture in zip(cameras, stage.pictures(), strict=True)
             ]
         )
         score = (int(seen.any(axis=1).sum()), int(seen.any(axis=0).sum()))
         if best is None or score > best[0]:
-            best = (score, cameras)
+            best = (score, paths)
         if score[0] == len(cameras):
             break
     assert best is not None
-    return tuple(best[1])
+    assert stage is not None
+    return tuple(best[1]), stage

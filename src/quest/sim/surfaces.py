@@ -91,6 +91,13 @@ def sample_handle_surface(rng: np.random.Generator) -> Surface:
     return sample_surface(rng, kinds=("wood", "noise"), textured=0.3)
 
 
+def sample_glass_surface(rng: np.random.Generator) -> Surface:
+    """Draw a material for panes: dark, smooth and glossy, as glass before a dark inside looks."""
+    grey = float(rng.uniform(0.03, 0.22))
+    tint = rng.uniform(0.9, 1.1, 3)
+    return Surface(triple(np.clip(grey * tint, 0, 1)), float(rng.uniform(0.05, 0.2)), 0.0, float(rng.uniform(0.5, 0.9)))
+
+
 def make_material(surface: Surface) -> Any:
     """A ``sapien.render.RenderMaterial`` of a surface."""
     import sapien

@@ -1,4 +1,4 @@
-"""Small tileable colour images: noise, stripes, checks, wood, tiles, speckle, brushed metal."""
+"""Small tileable colour images: wood, tiles, marble, bricks, concrete, woven cloth, scratches, stickers and others."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float, UInt8
 
-TextureKind = Literal["noise", "stripes", "checker", "wood", "planks", "tiles", "speckle", "brushed"]
-TEXTURE_KINDS: tuple[TextureKind, ...] = get_args(TextureKind)
+TextureKind = Literal[
+    "noise", "stripes", "checker", "wood", "planks", "tiles", "speckle", "brushed",
+    "marble", "bricks", "concrete", "weave", "scratched", "stickers",
+]  # fmt: skip
+TEXTURE_KINDS: tuple[TextureKind, ...] = get_args(TextureKind)[:8]
+"""What materials are drawn from unless asked otherwise; their order is part of what a seed means."""
 
 Colour = tuple[float, float, float]
 """Red, green, blue in [0, 1]; sRGB, as in images."""
@@ -119,6 +123,61 @@ def _draw_brushed(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tup
     return 0.5 + 0.2 * _noise(rng, len(u), falloff=0.4, stretch=25.0), np.zeros_like(u)
 
 
+def _draw_marble(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    # Veins run where a slow field crosses zero; some are broad and faint, others thin and dark.
+    broad = np.exp(-(np.abs(_noise(rng, len(u), falloff=1.7)) / 0.22))
+    thin = np.exp(-(np.abs(_noise(rng, len(u), falloff=1.5)) / 0.05))
+    return 0.45 * broad + 0.55 * thin * rng.uniform(0.5, 1.0), 0.05 * _noise(rng, len(u), falloff=1.6)
+
+
+def _draw_bricks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    rows, across = 4 * n, 2 * n
+    row = (v * rows).astype(int) % rows
+    x = (u + 0.5 / across * (row % 2)) % 1
+    width = rng.uniform(0.05, 0.12)
+    mortar = ((v * rows) % 1 < width) | ((x * across) % 1 < 0.5 * width)
+    tone = rng.standard_normal((rows, across))[row, (x * across).astype(int) % across]
+    return mortar.astype(float), 0.09 * tone * ~mortar + 0.05 * _noise(rng, len(u), falloff=0.8)
+
+
+def _draw_concrete(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    pores = _noise(rng, len(u), falloff=0.7) > 2.2
+    return 0.25 + 0.08 * _noise(rng, len(u), falloff=1.5), 0.03 * _noise(rng, len(u), falloff=0.4) - 0.2 * pores
+
+
+def _draw_weave(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    threads = 16 * n
+    warp, weft = np.abs(np.sin(np.pi * threads * u)), np.abs(np.sin(np.pi * threads * v))
+    over = ((u * threads).astype(int) + (v * threads).astype(int)) % 2 == 0
+    shade = 0.25 * (np.where(over, warp, weft) - 0.7)
+    return np.where(over, 0.0, rng.uniform(0.4, 1.0)), shade + 0.03 * _noise(rng, len(u), falloff=0.5)
+
+
+def _draw_scratched(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    marks = np.zeros_like(u)
+    for _ in range(int(rng.integers(8, 24)) * n):
+        x, y, turn = rng.random(), rng.random(), rng.uniform(0, np.pi)
+        du, dv = (u - x + 0.5) % 1 - 0.5, (v - y + 0.5) % 1 - 0.5
+        along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
+        inside = (np.abs(along) < rng.uniform(0.03, 0.2)) & (np.abs(across) < rng.uniform(0.003, 0.006))
+        marks = np.maximum(marks, inside * rng.uniform(0.4, 1.0))
+    return marks, 0.03 * _noise(rng, len(u), falloff=1.2)
+
+
+def _draw_stickers(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    mix, shade = np.zeros_like(u), 0.02 * _noise(rng, len(u), falloff=1.0)
+    for _ in range(int(rng.integers(2, 5)) * n):
+        x, y, size = rng.random(), rng.random(), rng.uniform(0.04, 0.1)
+        du, dv = (u - x + 0.5) % 1 - 0.5, (v - y + 0.5) % 1 - 0.5
+        distance = (
+            np.hypot(du, dv) if rng.random() < 0.5 else np.maximum(np.abs(du) / rng.uniform(0.8, 1.8), np.abs(dv))
+        )
+        inside = distance < size
+        print_ = inside & ((np.sin(2 * np.pi * dv / size * rng.uniform(1, 3)) > 0.4) & (distance < 0.75 * size))
+        mix, shade = np.where(inside, 1.0, mix), np.where(inside, np.where(print_, -0.5, 0.1), shade)
+    return mix, shade
+
+
 _PATTERNS = {
     "noise": _draw_noise,
     "stripes": _draw_stripes,
@@ -128,4 +187,10 @@ _PATTERNS = {
     "tiles": _draw_tiles,
     "speckle": _draw_speckle,
     "brushed": _draw_brushed,
+    "marble": _draw_marble,
+    "bricks": _draw_bricks,
+    "concrete": _draw_concrete,
+    "weave": _draw_weave,
+    "scratched": _draw_scratched,
+    "stickers": _draw_stickers,
 }

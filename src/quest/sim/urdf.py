@@ -57,6 +57,7 @@ class UrdfJoint:
         axis: unit direction in the joint's frame.
         lower: lower limit, radians or URDF units.
         upper: upper limit, radians or URDF units.
+        mimics: name of the joint that it should follow, or None.
     """
 
     name: str
@@ -67,6 +68,7 @@ class UrdfJoint:
     axis: Float[np.ndarray, "3"]
     lower: float
     upper: float
+    mimics: str | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,10 @@ def read_urdf(path: Path) -> Urdf:
         raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf") from None
     except (ElementTree.ParseError, UnicodeDecodeError) as error:
         raise ObjectError(f"{path}: not a readable URDF ({error}); restore the file from its source") from None
+    if any("ros.org/wiki/xacro" in str(element.tag) for element in root.iter()):
+        raise ObjectError(
+            f"{path}: expected a URDF, got xacro, which has to be expanded; run: xacro {path.name} > expanded.urdf"
+        )
     colours = {m.get("name"): rgba for m in root.findall("material") if (rgba := _rgba(m)) is not None}
     try:
         links = {
@@ -147,7 +153,7 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
         raise ValueError(f"visual {element.get('name')!r} has no geometry")
     mesh, scale, size = None, np.ones(3), np.zeros(0)
     if shape.tag == "mesh":
-        mesh = folder / shape.attrib["filename"].removeprefix("file://").removeprefix("package://")
+        mesh = _mesh_path(shape.attrib["filename"], folder)
         scale_text = shape.get("scale")
         scale = (
             _numbers(scale_text, (1, 1, 1))
@@ -170,6 +176,20 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
     )
 
 
+def _mesh_path(filename: str, folder: Path) -> Path:
+    """Where a mesh is: ``package://NAME/rest`` is looked for beside the URDF and in the folders above it.
+
+    Above it, either a folder called NAME holds ``rest``, or the package's own folder has another name.
+    """
+    if not filename.startswith("package://"):
+        return folder / filename.removeprefix("file://")
+    inside = Path(filename.removeprefix("package://"))
+    rest = Path(*inside.parts[1:])
+    above = [folder, *folder.resolve().parents]
+    candidates = [root / end for root in above for end in (inside, rest)]
+    return next((path for path in candidates if path.is_file()), folder / inside)
+
+
 def _joint(element: ElementTree.Element) -> UrdfJoint:
     parent, child = element.find("parent"), element.find("child")
     if parent is None or child is None:
@@ -182,7 +202,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     norm = float(np.linalg.norm(axis))
     if kind != "fixed" and norm < 1e-9:
         raise ValueError(f"joint {element.get('name')!r} has an axis of length zero")
-    limit = element.find("limit")
+    limit, mimic = element.find("limit"), element.find("mimic")
     lower, upper = 0.0, 0.0
     if kind != "fixed":
         if urdf_type == "continuous" or limit is None:
@@ -193,7 +213,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
             raise ValueError(f"joint {element.get('name')!r} has limits {lower}, {upper}")
     return UrdfJoint(
         element.attrib["name"], kind, parent.attrib["link"], child.attrib["link"], _origin(element),
-        axis / max(norm, 1e-9), lower, upper,
+        axis / max(norm, 1e-9), lower, upper, None if mimic is None else mimic.get("joint"),
     )  # fmt: skip
 
 

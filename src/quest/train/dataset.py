@@ -37,8 +37,8 @@ class Dataset:
 def open_dataset(
     network: QuestNetwork,
     *,
-    stores: Sequence[Path],
-    validation_stores: Sequence[Path],
+    stores: Sequence[str | Path],
+    validation_stores: Sequence[str | Path],
     cache: Path,
     windows: WindowConfig,
     device: torch.device,
@@ -52,8 +52,8 @@ def open_dataset(
 
     Args:
         network: network with the encoder that the features come from.
-        stores: folders of take stores.
-        validation_stores: folders of take stores to choose by; may be empty.
+        stores: take stores, folders or URLs.
+        validation_stores: take stores to choose by; may be empty.
         cache: folder of the feature cache.
         windows: how windows are drawn.
         device: where the encoder runs.

@@ -48,7 +48,7 @@ class CachedView:
         point_world: true world point, metres.
         label: index into LABELS.
         revolute: whether the entity's joint turns.
-        axis_world: origin and direction of the joint's axis at rest.
+        axis_world: origin and direction of the joint's axis at rest; zero for what is fixed in the base.
     """
 
     folder: Path
@@ -169,6 +169,9 @@ class FeatureCache:
         if clip.depth_m is not None:
             depth_m = np.stack([box.depth(image) for image in clip.depth_m])
         joints = [take.info.entities[e].joint for e in tracked]
+        moving = [j >= 0 for j in joints]
+        axis = np.zeros((len(tracked), 6), np.float32)
+        axis[moving] = take.joint_axis[0, [j for j in joints if j >= 0]].reshape(-1, 6)
         arrays = {
             "features": encode_images(self.encoder, rgb, device=device),
             "rgb": rgb,
@@ -179,8 +182,8 @@ class FeatureCache:
             "visible": truth.visible[:, tracked],
             "point_world": take.point_world[:, tracked],
             "label": np.array([LABELS.index(take.info.entities[e].label) for e in tracked], np.int8),
-            "revolute": np.array([take.info.joints[j].kind == "revolute" for j in joints], bool),
-            "axis_world": take.joint_axis[0, joints].astype(np.float32).reshape(-1, 6),
+            "revolute": np.array([j >= 0 and take.info.joints[j].kind == "revolute" for j in joints], bool),
+            "axis_world": axis,
         }
         meta = {
             "stamp": stamp,

@@ -120,7 +120,7 @@ def manifold_loss(
     Args:
         point: predicted positions in the reference frame.
         rest: a true position on the line or circle.
-        axis: origin and unit direction of the joint.
+        axis: origin and unit direction of the joint; a direction of zero makes the line one point, for what is fixed.
         revolute: circle about the axis, else line along it.
         unit: reference units per normalised unit.
         mask: which predictions count.
@@ -159,10 +159,12 @@ def joint_loss(
     Args:
         belief: what the network believes.
         point: true positions in the reference frame.
-        axis: true origin and unit direction of the joint.
+        axis: true origin and unit direction of the joint; a direction of zero says that there is no joint, and then
+            nothing counts.
         revolute: whether the joint turns.
         mask: which beliefs count.
     """
+    mask = mask & (axis[:, None, :, 3:] != 0).any(-1)
     revolute = revolute[:, None].expand_as(mask)
     origin, direction = axis[:, None, :, :3], axis[:, None, :, 3:]
     kind = F.binary_cross_entropy_with_logits(belief.revolute_logit, revolute.float(), reduction="none")

@@ -1,5 +1,5 @@
 """Procedural furniture and appliances, written in PartNet-Mobility's shape."""
 
-from quest.sim.procedural.catalogue import CATEGORIES, category_for_seed, make_object
+from quest.sim.procedural.catalogue import CATEGORIES, MIXES, category_for_seed, make_object
 
-__all__ = ["CATEGORIES", "category_for_seed", "make_object"]
+__all__ = ["CATEGORIES", "MIXES", "category_for_seed", "make_object"]

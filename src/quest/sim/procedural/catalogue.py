@@ -10,10 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from quest.errors import ConfigError
+from quest.sim.procedural.appliances import APPLIANCES
 from quest.sim.procedural.laptop import build_laptop, build_trunk
 from quest.sim.procedural.layouts import FURNITURE
 from quest.sim.procedural.model import ObjectModel
+from quest.sim.procedural.room_door import build_room_door
+from quest.sim.procedural.storage import STORAGE
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
+from quest.sim.procedural.things import THINGS
 from quest.sim.procedural.urdf import write_object
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
@@ -21,6 +25,10 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **{name: partial(build_kitchen, name) for name in KITCHEN},
     "laptop": build_laptop,
     "trunk": build_trunk,
+    **STORAGE,
+    **APPLIANCES,
+    **THINGS,
+    "room_door": build_room_door,
 }
 
 _WEIGHTS = {
@@ -28,23 +36,37 @@ _WEIGHTS = {
     "laptop": 2, "trunk": 1, "base_cabinet": 4, "wall_cabinet": 2, "island": 2, "sink_cabinet": 1, "microwave": 3,
     "refrigerator": 2, "french_refrigerator": 2, "range": 2, "dishwasher": 2,
 }  # fmt: skip
-"""The usual mix; a category without a weight is made for a suite and comes only by its name."""
+"""The usual mix, whose seeds keep their meaning: it never changes. What has no weight comes by its name, or broadly."""
+
+_MORE_WEIGHTS = {
+    "locker_bank": 1, "drawer_desk": 4, "apothecary": 3, "filing_cabinet": 3, "toolbox": 3, "rack_dishwasher": 3,
+    "drawer_oven": 2, "washing_machine": 2, "eyeglasses": 2, "stapler": 2, "bucket": 2, "pot": 2, "room_door": 3,
+}  # fmt: skip
+
+MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
+"""How often each category comes: the usual mix, and one of everything."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""
 
-_MIX = tuple(name for name in CATEGORIES if name in _WEIGHTS)
 
-
-def category_for_seed(seed: int) -> str:
-    """The category that a seed stands for in the usual mix.
+def category_for_seed(seed: int, *, mix: str = "usual") -> str:
+    """The category that a seed stands for in a mix.
 
     Args:
         seed: seed of an object.
+        mix: a key of :data:`MIXES`.
+
+    Raises:
+        ConfigError: there is no such mix.
     """
-    weights = np.array([_WEIGHTS[name] for name in _MIX], dtype=float)
+    if mix not in MIXES:
+        raise ConfigError(f"procedural objects: unknown mix {mix!r}; expected one of {', '.join(MIXES)}")
+    weight_of = MIXES[mix]
+    names = [name for name in CATEGORIES if name in weight_of]
+    weights = np.array([weight_of[name] for name in names], dtype=float)
     rng = np.random.default_rng([zlib.crc32(b"category"), seed])
-    return _MIX[int(rng.choice(len(_MIX), p=weights / weights.sum()))]
+    return names[int(rng.choice(len(names), p=weights / weights.sum()))]
 
 
 def build_model(category: str, seed: int) -> ObjectModel:

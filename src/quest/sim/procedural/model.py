@@ -77,6 +77,8 @@ SURFACES = {
     "dark": (0.08, 0.08, 0.09),
     "white": (0.90, 0.90, 0.88),
     "inside": (0.78, 0.75, 0.70),
+    "leather": (0.25, 0.13, 0.06),
+    "glass": (0.10, 0.13, 0.14),
 }
 """Base colours (linear RGB) that the written ``.mtl`` gives to each kind of surface."""
 

@@ -119,6 +119,42 @@ def lathe(profile: Float[np.ndarray, "P 2"], *, sides: int = 18) -> Mesh:
     return _faceted(mesh)
 
 
+UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Turns a solid of revolution, which grows towards -y, so that it grows towards +z."""
+
+
+def prism_between(
+    outer: Float[np.ndarray, "P 2"], inner: Float[np.ndarray, "P 2"], low: float, high: float, *, closed: bool = False
+) -> Mesh:
+    """The solid between two lines in the x-y plane, from z = ``low`` to ``high``: a curved wall, or a frame.
+
+    Args:
+        outer: points of one line, metres.
+        inner: as many points of the other line, at its left as seen from above.
+        low: smallest z.
+        high: largest z.
+        closed: whether the lines are rings (``outer`` counter-clockwise around ``inner``), without ends.
+    """
+    if closed:
+        outer, inner = np.concatenate([outer, outer[:1]]), np.concatenate([inner, inner[:1]])
+    count = len(outer)
+    rows = [(outer, low), (inner, low), (inner, high), (outer, high)]
+    vertices = np.concatenate([np.column_stack([line, np.full(count, z)]) for line, z in rows])
+    faces = []
+    for row in range(4):
+        a = row * count + np.arange(count - 1)
+        b = (row + 1) % 4 * count + np.arange(count - 1)
+        faces += [np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)]
+    if not closed:
+        start, end = count * np.arange(4), count * np.arange(4) + count - 1
+        faces += [start[[[0, 2, 1], [0, 3, 2]]], end[[[0, 1, 2], [0, 2, 3]]]]
+    mesh = polygon_flat(vertices, np.concatenate(faces))
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    if (np.cross(a, b) * c).sum() < 0:  # the lines run the other way round
+        mesh = polygon_flat(vertices, np.concatenate(faces)[:, ::-1])
+    return mesh
+
+
 def polygon_flat(mesh_vertices: Float[np.ndarray, "N 3"], mesh_faces: np.ndarray) -> Mesh:
     """A mesh from bare triangles: flat shading, texture coordinates by projection along each face's main axis."""
     bare = np.asarray(mesh_vertices, dtype=float)

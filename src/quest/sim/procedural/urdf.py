@@ -12,6 +12,8 @@ from quest.sim.procedural.model import SURFACES, Mesh, ObjectModel, Part
 MESH_FOLDER = "textured_objs"
 URDF_NAME = "mobility.urdf"
 _BODY = "body"
+_ALWAYS = 6
+"""So many surfaces are written for every object, worn or not."""
 
 
 def write_object(model: ObjectModel, folder: Path, *, name: str, meta: dict[str, object]) -> Path:
@@ -31,7 +33,7 @@ def write_object(model: ObjectModel, folder: Path, *, name: str, meta: dict[str,
     """
     meshes = folder / MESH_FOLDER
     meshes.mkdir(parents=True, exist_ok=True)
-    (meshes / "surfaces.mtl").write_text(_materials(), encoding="ascii")
+    (meshes / "surfaces.mtl").write_text(_materials(model), encoding="ascii")
     robot = ET.Element("robot", name=name)
     ET.SubElement(robot, "link", name="base")
     number = _write_link(robot, _BODY, model.body, meshes, 0)
@@ -93,9 +95,12 @@ def _obj(mesh: Mesh, surface: str) -> str:
     return "\n".join(rows) + "\n"
 
 
-def _materials() -> str:
+def _materials(model: ObjectModel) -> str:
     rows = []
-    for name, colour in SURFACES.items():
+    worn = {part.surface for part in (*model.body, *(part for link in model.links for part in link.parts))}
+    for index, (name, colour) in enumerate(SURFACES.items()):
+        if index >= _ALWAYS and name not in worn:
+            continue
         shine = "0.6 0.6 0.6" if name == "metal" else "0.1 0.1 0.1"
         rows.append(f"newmtl {name}\nKd {colour[0]} {colour[1]} {colour[2]}\nKs {shine}\nNs 40\nd 1\n")
     return "\n".join(rows)

@@ -1,0 +1,162 @@
+"""``quest objects``: which objects there are, and what they look like with their entities."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+from quest.errors import ConfigError, ObjectError
+
+if TYPE_CHECKING:
+    from quest.sim.objects import SimObject
+    from quest.sim.plan import ObjectShelf
+
+
+@dataclass(frozen=True)
+class ObjectsList:
+    """List objects with their joints, entities and sizes, and what is wrong with those that cannot be used."""
+
+    objects_root: Path | None = None
+    """Folder of object folders; QUEST_OBJECTS by default."""
+
+    procedural: bool = False
+    """List the procedural categories instead, by one object of each."""
+
+    def run(self) -> int:
+        """Print a table; returns 1 if an object cannot be used."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from quest.viz.object_sheet import entity_words, size_words
+
+        table = Table(box=None)
+        for title in ("object", "category", "joints", "size, m"):
+            table.add_column(title, no_wrap=True, justify="right" if title == "joints" else "left")
+        table.add_column("entities", overflow="fold")
+        problems: list[str] = []
+        warnings: list[str] = []
+        found = _every_category() if self.procedural else _every_folder(self.objects_root)
+        for thing in found:
+            if isinstance(thing, ObjectError):
+                problems.append(str(thing))
+                continue
+            joints = str(len(thing.articulation.joints))
+            table.add_row(thing.object_id, thing.category, joints, size_words(thing), entity_words(thing))
+            warnings += [f"{thing.object_id}: {warning}" for warning in thing.warnings]
+        Console(highlight=False).print(table)
+        print("size: width x depth x height, closed")
+        for warning in warnings:
+            Console(highlight=False, markup=False).print(warning, style="yellow", soft_wrap=True)
+        for problem in problems:
+            Console(stderr=True, highlight=False, markup=False).print(problem, style="red", soft_wrap=True)
+        return 1 if problems else 0
+
+
+@dataclass(frozen=True)
+class ObjectsShow:
+    """Draw objects, closed and open, from a few sides, with their entities marked and named."""
+
+    objects: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """Each an id (44817), ids (partnet:44817,23724), a folder or URDF of your own, a procedural object
+    (procedural:chest-12), a category (procedural:chest), or a mix (procedural:usual, procedural:broad)."""
+
+    out: Path = Path("objects.png")
+    """Picture to write (PNG, JPEG)."""
+
+    objects_root: Path | None = None
+    """Folder of object folders; QUEST_OBJECTS by default."""
+
+    count: int = 12
+    """How many objects of a category or mix."""
+
+    first_seed: int = 0
+    """Seed of the first of them; the others count up."""
+
+    sides: int = 2
+    """From how many sides each is seen."""
+
+    columns: int = 0
+    """Objects beside each other; 0 chooses."""
+
+    size: int = 240
+    """Edge length of every portrait, pixels."""
+
+    def run(self) -> int:
+        """Write the picture and say where it is."""
+        from PIL import Image
+
+        from quest.sim.plan import ObjectShelf
+        from quest.sim.portrait import portray
+        from quest.sim.renderer import Renderer
+        from quest.viz.object_sheet import Card, object_sheet
+
+        if not self.objects:
+            raise ConfigError("objects show: no object is named; name an id, a folder, a URDF or procedural:broad")
+        if self.count < 1 or self.columns < 0:
+            raise ConfigError(
+                f"objects show: expected --count >= 1 and --columns >= 0, got {self.count} and {self.columns}"
+            )
+        with ObjectShelf(self.objects_root) as shelf:
+            things = [thing for name in self.objects for thing in self._named(name, shelf)]
+            renderer = Renderer()
+            cards = [Card(t, portray(t, renderer, sides=self.sides, size_px=self.size)) for t in things]
+        columns = self.columns or max(1, round((len(cards) / (2 * self.sides) * 1.6) ** 0.5))
+        sheet = object_sheet(cards, columns=columns)
+        self.out.parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(sheet).save(self.out)
+        print(f"{self.out}: {sheet.shape[1]} x {sheet.shape[0]} px, {len(cards)} objects")
+        return 0
+
+    def _named(self, name: str, shelf: ObjectShelf) -> list[SimObject]:
+        """The objects that a name stands for."""
+        from quest.sim.objects import load_object
+        from quest.sim.plan import parse_object
+        from quest.sim.procedural import CATEGORIES, MIXES, category_for_seed
+
+        path = Path(name)
+        if path.exists() or path.suffix in (".urdf", ".xacro") or len(path.parts) > 1:
+            return [load_object(path)]
+        source, _, rest = name.partition(":")
+        seeds = range(self.first_seed, self.first_seed + self.count)
+        if source == "procedural" and rest in CATEGORIES:
+            return [shelf.load(source, f"{rest}-{seed}") for seed in seeds]
+        for mix in MIXES:
+            if source == "procedural" and rest == mix:
+                return [shelf.load(source, f"{category_for_seed(seed, mix=mix)}-{seed}") for seed in seeds]
+        return [shelf.load(*found) for found in parse_object(name)]
+
+
+@dataclass(frozen=True)
+class Objects:
+    """Look at the objects that the simulator knows, or at your own."""
+
+    command: Annotated[ObjectsList, tyro.conf.subcommand("list")] | Annotated[ObjectsShow, tyro.conf.subcommand("show")]
+    """What to do."""
+
+    def run(self) -> int:
+        """Run the chosen command."""
+        return self.command.run()
+
+
+def _every_folder(root: Path | None) -> Iterator[SimObject | ObjectError]:
+    from quest.sim.objects import find_objects, load_object
+
+    for folder in find_objects(root):
+        try:
+            yield load_object(folder)
+        except ObjectError as error:
+            yield error
+
+
+def _every_category() -> Iterator[SimObject]:
+    from quest.sim.objects import load_object
+    from quest.sim.procedural import CATEGORIES, make_object
+
+    with tempfile.TemporaryDirectory(prefix="quest-objects-") as folder:
+        for category in CATEGORIES:
+            yield load_object(make_object(category, 0, Path(folder) / f"{category}-0"))

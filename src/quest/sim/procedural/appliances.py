@@ -1,0 +1,230 @@
+"""Appliances that scene-synthesizer lacks: a dishwasher whose racks slide, an oven over a drawer, a washing machine."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.sim.procedural.handles import HandleKind, HandleStyle, handle_part, sample_any_style
+from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
+from quest.sim.procedural.shapes import UP, box, lathe, prism_between
+
+_WASHER_GRIPS: tuple[HandleKind, ...] = ("bow", "d_pull", "arched")
+_SURFACES = ("white", "metal", "dark", "body")
+
+
+def _handle(rng: np.random.Generator, scale: float) -> HandleStyle:
+    """A handle that fits an appliance's door."""
+    style = sample_any_style(rng, knobs=False, scale=scale)
+    if style.kind in ("loop", "t_bar", "cup"):
+        style = replace(style, kind="d_pull" if rng.random() < 0.5 else "bow")
+    return replace(style, surface=str(rng.choice(["metal", "dark", "white"], p=[0.6, 0.25, 0.15])))
+
+
+def _shell(width: float, depth: float, low: float, high: float, wall: float) -> Mesh:
+    """A box that is open at the front, y = 0."""
+    return join([
+        box((0, 0, low), (wall, depth, high)), box((width - wall, 0, low), (width, depth, high)),
+        box((wall, 0, low), (width - wall, depth, low + wall)),
+        box((wall, 0, high - wall), (width - wall, depth, high)),
+        box((wall, depth - wall, low + wall), (width - wall, depth, high - wall)),
+    ])  # fmt: skip
+
+
+def _tray(width: float, depth: float, height: float) -> Mesh:
+    """A box that is open above, from (0, 0, 0)."""
+    return _shell(width, height, 0.0, depth, 0.006).rotated(UP).moved((0, 0, height))
+
+
+def _flap(width: float, height: float, thick: float, window: float, surface: str) -> list[Part]:
+    """A door from (0, 0) to (width, height), outer face at y = 0, with a window of some share of it, or none."""
+    panel = box((0, 0, 0), (width, thick, height))
+    if not window:
+        return [Part("door_panel", panel, surface)]
+    x, z = (1 - window) / 2 * width, 0.45 * (1 - window) * height
+    pane = box((x, -0.0015, z), (width - x, 0.001, z + window * height * 0.85))
+    return [Part("door_panel", panel, surface), Part("window", pane, "glass")]
+
+
+def _rack(rng: np.random.Generator, width: float, depth: float, height: float) -> Mesh:
+    """A basket of wires from (0, 0, 0), its front at y = 0."""
+    wire, gap = 0.004, float(rng.uniform(0.035, 0.06))
+    rods = []
+    for z in (0.0, height):
+        rods += [
+            box((0, 0, z), (width, 2 * wire, z + 2 * wire)),
+            box((0, depth - 2 * wire, z), (width, depth, z + 2 * wire)),
+            box((0, 2 * wire, z), (2 * wire, depth - 2 * wire, z + 2 * wire)),
+            box((width - 2 * wire, 2 * wire, z), (width, depth - 2 * wire, z + 2 * wire)),
+        ]  # fmt: skip
+    for x in np.arange(gap, width - gap / 2, gap):
+        rods.append(box((x, 2 * wire, 0), (x + wire, depth - 2 * wire, wire)))
+        rods += [box((x, y, 2 * wire), (x + wire, y + wire, height)) for y in (wire / 2, depth - 1.5 * wire)]
+    for y in np.arange(2 * gap, depth - gap, 2 * gap):
+        rods += [box((x, y, 2 * wire), (x + wire, y + wire, height)) for x in (wire / 2, width - 1.5 * wire)]
+    return join(rods)
+
+
+def build_rack_dishwasher(rng: np.random.Generator) -> ObjectModel:
+    """A dishwasher whose door folds down, and two racks behind it that slide out."""
+    width, height, depth = float(rng.uniform(0.45, 0.62)), float(rng.uniform(0.8, 0.88)), float(rng.uniform(0.55, 0.62))
+    plinth, thick, wall = float(rng.uniform(0.08, 0.14)), float(rng.uniform(0.03, 0.05)), 0.03
+    surface = str(rng.choice(_SURFACES))
+    inside, deep = width - 2 * wall, depth - wall
+    rack_w, rack_d, rack_h = inside - 0.02, deep - 0.06, float(rng.uniform(0.1, 0.15))
+    low = plinth + wall + 0.05
+    high = low + float(rng.uniform(0.27, 0.33))
+    body = [
+        Part("frame", _shell(width, depth, plinth, height, wall), surface),
+        Part("base", box((0.01, 0.06, 0), (width - 0.01, depth - 0.01, plinth)), "dark"),
+    ]
+    rails = [box((x, 0.03, z - 0.012), (x + 0.006, deep, z)) for x in (wall, width - wall - 0.006) for z in (low, high)]
+    body.append(Part("rail", join(rails), "metal"))
+    door_h = height - plinth - 0.01
+    parts = _flap(width - 0.006, door_h, thick, 0.0, surface)
+    style = _handle(rng, 1.6)
+    edge = float(rng.uniform(0.05, 0.09))
+    panel = box((0.004, -0.001, door_h - 0.035), (width - 0.01, 0.001, door_h - 0.004))
+    room = (0.95 * width, 2 * edge)
+    parts += [
+        handle_part(style, at=(width / 2, 0.0, door_h - 0.04 - edge / 2), vertical=False, room_m=room),
+        Part("decal", panel, "dark"),
+    ]
+    hinge = (0.003, -thick - 0.001, plinth + 0.005)
+    links = [Link("link_0", tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), float(np.deg2rad(rng.uniform(82, 91))))]
+    for n, z in enumerate((low, high)):
+        rack = [Part("rack", _rack(rng, rack_w, rack_d, rack_h), "metal")]
+        bar = box((0.3 * rack_w, -0.014, rack_h - 0.012), (0.7 * rack_w, 0.0, rack_h + 0.006))
+        rack.append(Part("handle", bar, str(rng.choice(["dark", "white"]))))
+        origin = (wall + 0.01, 0.03, z)
+        links.append(Link(f"link_{n + 1}", tuple(rack), "prismatic", origin, (0.0, -1.0, 0.0), 0.8 * rack_d))
+    return ObjectModel("Dishwasher", tuple(body), tuple(links)).moved((-width / 2, -depth / 2, 0.0))
+
+
+def build_drawer_oven(rng: np.random.Generator) -> ObjectModel:
+    """A cooker: a hob and dials above an oven's door that folds down, above a drawer."""
+    width, height, depth = float(rng.uniform(0.5, 0.76)), float(rng.uniform(0.84, 0.94)), float(rng.uniform(0.56, 0.66))
+    wall, thick = 0.035, float(rng.uniform(0.03, 0.05))
+    store, dials = float(rng.uniform(0.16, 0.22)), float(rng.uniform(0.08, 0.12))
+    surface = str(rng.choice(_SURFACES))
+    foot, roof = 0.04, height - dials
+    body = [
+        Part("frame", join([
+            _shell(width, depth, foot, foot + store, 0.02), _shell(width, depth, foot + store, roof, wall),
+            box((0, -thick, roof), (width, depth, height)),
+        ]), surface),
+        Part("base", box((0.02, 0.05, 0), (width - 0.02, depth - 0.02, foot)), "dark"),
+    ]  # fmt: skip
+    plates = [
+        lathe(np.array([[r, -0.001], [r, 0.008], [0.6 * r, 0.01]]), sides=24).rotated(UP).moved((x, y, height))
+        for x, r in ((0.27 * width, 0.075), (0.73 * width, 0.095)) for y in (0.27 * depth, 0.72 * depth)
+    ]  # fmt: skip
+    body.append(Part("hob", join(plates), "dark"))
+    dial = lathe(np.array([[0.02, -0.001], [0.02, 0.012], [0.014, 0.014], [0.013, 0.026]]))
+    places = np.linspace(0.15, 0.85, int(rng.integers(4, 7))) * width
+    body.append(Part("dial", join([dial.moved((x, -thick, roof + dials / 2)) for x in places]), "metal"))
+    racks = [_rack(rng, width - 2 * wall, depth - 2 * wall, 0.01).moved((wall, wall, foot + store + 0.2))]
+    body.append(Part("shelf", join(racks), "metal"))
+    style, gap = _handle(rng, 1.7), 0.006
+    door_w, door_h = width - gap, roof - foot - store - gap
+    parts = _flap(door_w, door_h, thick, float(rng.uniform(0.5, 0.72)), surface)
+    parts.append(handle_part(style, at=(door_w / 2, 0, door_h - 0.045), vertical=False, room_m=(0.95 * door_w, 0.07)))
+    hinge = (gap / 2, -thick - 0.001, foot + store + gap / 2)
+    opening = float(np.deg2rad(rng.uniform(82, 91)))
+    oven = Link("link_0", tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), opening)
+    tray = _tray(width - 0.06, depth - 0.1, 0.6 * store).moved((0.03 - gap / 2, thick, 0.02))
+    front = box((0, 0, 0), (door_w, thick, store - gap))
+    low = handle_part(style, at=(door_w / 2, 0, 0.65 * store), vertical=False, room_m=(0.95 * door_w, 0.6 * store))
+    drawer = (Part("drawer_front", front, surface), Part("drawer_box", tray, "inside"), low)
+    slide = (gap / 2, -thick - 0.001, foot + gap / 2)
+    links = (oven, Link("link_1", drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.7 * depth))
+    return ObjectModel("Oven", tuple(body), links).moved((-width / 2, -depth / 2, 0.0))
+
+
+def _round_door(
+    rng: np.random.Generator,
+    style: HandleStyle,
+    circle: Float[np.ndarray, "P 2"],
+    radius: float,
+    middle: tuple[float, float],
+    surface: str,
+) -> Link:
+    """A round door of glass around a point (x, z) of the front, hinged at either side, with a grip at the other."""
+    sign = -1.0 if rng.random() < 0.7 else 1.0
+    # In the frame of its hinge, the door's middle lies at (-sign * reach, 0).
+    reach = radius + 0.012
+    shift = (-sign * reach, 0.0, 0.0)
+    ring = prism_between(circle * radius, circle * 0.72 * radius, 0.0, 0.035, closed=True).rotated(_FRONT)
+    r = 0.74 * radius
+    glass = lathe(np.array([[r, -0.02], [r, 0.012], [0.85 * r, 0.022], [0.5 * r, 0.032], [0.15 * r, 0.036]]), sides=32)
+    grip = handle_part(style, at=(-sign * 0.86 * radius, -0.035, 0.0), vertical=True, room_m=(0.1, 0.16))
+    parts = (
+        Part("door_panel", ring.moved(shift), str(rng.choice(["metal", "dark", surface]))),
+        Part("glass", glass.moved(shift), "glass"),
+        Part("handle", grip.mesh.moved(shift), grip.surface),
+    )
+    hinge = (middle[0] + sign * reach, -0.001, middle[1])
+    return Link("link_0", parts, "revolute", hinge, (0.0, 0.0, sign), float(np.deg2rad(rng.uniform(95, 125))))
+
+
+def build_washing_machine(rng: np.random.Generator) -> ObjectModel:
+    """A washing machine: a round glass door hinged at one side, and a drawer for the powder."""
+    width, height, depth = 0.6, float(rng.uniform(0.82, 0.88)), float(rng.uniform(0.45, 0.62))
+    surface = str(rng.choice(["white", "white", "metal", "dark"]))
+    radius, wall = float(rng.uniform(0.15, 0.19)), 0.02
+    x, z = width / 2, float(rng.uniform(0.4, 0.46))
+    angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    square = circle / np.abs(circle).max(axis=1, keepdims=True)
+    panel_low, panel_high = 0.06, height - 0.13
+    half = np.array([width / 2 - wall, (panel_high - panel_low) / 2])
+    middle = np.array([x, (panel_low + panel_high) / 2])
+    hole = circle * (radius - 0.025) + [x, z]
+    plate = prism_between(square * half + middle, hole, -wall, 0.0, closed=True).rotated(_FRONT)
+    tub = prism_between(circle * (radius - 0.02) + [x, z], hole, -0.3, -wall, closed=True).rotated(_FRONT)
+    back = lathe(np.array([[radius - 0.02, 0.0], [radius - 0.02, 0.004]]), sides=36).moved((x, 0.3, z))
+    body = [
+        Part("frame", join([
+            box((0, 0, 0.02), (wall, depth, height)), box((width - wall, 0, 0.02), (width, depth, height)),
+            box((wall, 0, 0.02), (width - wall, depth, panel_low)),
+            box((wall, 0, height - 0.02), (width - wall, depth, height)), plate,
+            box((wall, depth - wall, panel_low), (width - wall, depth, height - 0.02)),
+        ]), surface),
+        Part("drum", join([tub, back]), "metal"),
+    ]  # fmt: skip
+    drawer_w, strip = 0.17, 0.105
+    z0 = height - 0.02 - strip
+    body.append(
+        Part("control_panel", box((wall + drawer_w + 0.008, -0.004, z0), (width - wall, 0.02, z0 + strip)), "dark")
+    )
+    dial = lathe(np.array([[0.03, -0.001], [0.028, 0.02], [0.024, 0.022]]), sides=24)
+    body.append(Part("dial", dial.moved((float(rng.uniform(0.5, 0.8)) * width, -0.004, z0 + strip / 2)), "metal"))
+    style = HandleStyle(
+        _WASHER_GRIPS[int(rng.integers(3))], 0.11, 0.014, float(rng.uniform(0.024, 0.036)), 1.0,
+        str(rng.choice(["dark", "metal", "white"])),
+    )  # fmt: skip
+    door = _round_door(rng, style, circle, radius, (x, z), surface)
+    tray = _tray(drawer_w - 0.01, 0.2, strip - 0.03).moved((0.005, 0.02, 0.01))
+    lip = handle_part(
+        replace(style, kind="edge_pull", length_m=0.12, reach_m=0.02), at=(drawer_w / 2, 0, 0.6 * strip),
+        vertical=False, room_m=(drawer_w, strip),
+    )  # fmt: skip
+    front = box((0, 0, 0), (drawer_w, 0.02, strip))
+    drawer = (Part("drawer_front", front, surface), Part("drawer_box", tray, "inside"), lip)
+    slide = (wall + 0.004, -0.004, z0)
+    links = (door, Link("link_1", drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.16))
+    return ObjectModel("WashingMachine", tuple(body), links).moved((-width / 2, -depth / 2, -0.02))
+
+
+_FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane and extruded along +z so that it stands upright, extruded towards -y."""
+
+APPLIANCES: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
+    "rack_dishwasher": build_rack_dishwasher,
+    "drawer_oven": build_drawer_oven,
+    "washing_machine": build_washing_machine,
+}
+"""How to build each kind."""

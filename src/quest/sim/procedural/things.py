@@ -1,0 +1,205 @@
+"""Things that are carried about or worn: eyeglasses, a stapler, a bucket, a pot with a lid."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from quest.sim.procedural.handles import HandleStyle, handle_part
+from quest.sim.procedural.model import Link, ObjectModel, Part, join
+from quest.sim.procedural.shapes import UP, box, lathe, prism_between, tube
+
+_FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane and extruded along +z so that it stands upright, extruded towards -y."""
+
+_SIDE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane so that x runs into the object and y upwards."""
+
+
+def build_eyeglasses(rng: np.random.Generator) -> ObjectModel:
+    """Eyeglasses with unfolded temples, which fold inwards; the rim of a temple is its tip.
+
+    Args:
+        rng: source of randomness.
+    """
+    lens_w, lens_h = float(rng.uniform(0.046, 0.056)), float(rng.uniform(0.034, 0.05))
+    bridge, frame, thick = (
+        float(rng.uniform(0.014, 0.022)),
+        float(rng.uniform(0.002, 0.005)),
+        float(rng.uniform(0.002, 0.004)),
+    )
+    power = float(rng.uniform(2.0, 4.5))  # 2 is an ellipse, more is squarer
+    angle = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    cos, sin = np.cos(angle), np.sin(angle)
+    shape = np.stack([np.sign(cos) * np.abs(cos) ** (2 / power), np.sign(sin) * np.abs(sin) ** (2 / power)], axis=1)
+    inner = shape * [lens_w / 2, lens_h / 2]
+    outer = shape * [lens_w / 2 + frame, lens_h / 2 + frame]
+    middle = (bridge + lens_w) / 2 + frame
+    ring = prism_between(outer, inner, 0.0, thick, closed=True).rotated(_FRONT)
+    pane = prism_between(inner, 0.02 * inner, 0.4 * thick, 0.6 * thick, closed=True).rotated(_FRONT)
+    half = middle + lens_w / 2 + frame
+    hinge_z = 0.22 * lens_h
+    nose = tube(np.array([[x, -0.5 * thick, 0.0] for x in np.linspace(-bridge / 2 - frame, bridge / 2 + frame, 5)]),
+                radius_m=0.45 * thick, flatness=float(rng.uniform(1.0, 1.6)))  # fmt: skip
+    lugs = [
+        box((min(a, b), -thick, hinge_z - 0.004), (max(a, b), 0.006, hinge_z + 0.004))
+        for a, b in ((-half, -half - 0.006), (half, half + 0.006))
+    ]
+    body = (
+        Part("frame", join([
+            *(ring.moved((s * middle, 0, 0)) for s in (-1, 1)), nose.moved((0, 0, 0.15 * lens_h)), *lugs,
+        ]), "dark"),
+        Part("glass", join([pane.moved((s * middle, 0, 0)) for s in (-1, 1)]), "glass"),
+    )  # fmt: skip
+    length, drop = float(rng.uniform(0.125, 0.145)), float(rng.uniform(0.015, 0.032))
+    along = np.linspace(0, 1, 15)
+    path = np.stack([length * along, -drop * np.clip((along - 0.68) / 0.32, 0, 1) ** 1.6, 0 * along], axis=1)
+    temple = tube(path, radius_m=float(rng.uniform(0.0014, 0.003)), flatness=float(rng.uniform(0.5, 1.0))).rotated(
+        _SIDE
+    )
+    links = []
+    for n, side in enumerate((-1.0, 1.0)):
+        origin = (side * (half + 0.003), 0.0065, hinge_z)
+        fold = float(np.deg2rad(rng.uniform(80, 90)))
+        surface = "dark" if rng.random() < 0.7 else "metal"
+        links.append(Link(f"link_{n}", (Part("leg", temple, surface),), "revolute", origin, (0.0, 0.0, side), fold))
+    ground = min(
+        float(p.mesh.bounds[0, 2]) for p in (*body, replace(links[0].parts[0], mesh=temple.moved((0, 0, hinge_z))))
+    )
+    return ObjectModel("Eyeglasses", body, tuple(links)).moved((0.0, -length / 2, -ground))
+
+
+def build_stapler(rng: np.random.Generator) -> ObjectModel:
+    """A stapler: a base, a magazine and an arm that turn about one hinge at the back.
+
+    Args:
+        rng: source of randomness.
+    """
+    length, width = float(rng.uniform(0.11, 0.17)), float(rng.uniform(0.026, 0.042))
+    base_h, mag_h, arm_h = (
+        float(rng.uniform(0.006, 0.011)),
+        float(rng.uniform(0.008, 0.012)),
+        float(rng.uniform(0.012, 0.02)),
+    )
+    z = base_h + 0.004
+    tower = box((-0.35 * width, length - 0.02, base_h), (0.35 * width, length, z + mag_h + 0.3 * arm_h))
+    body = (
+        Part("base_frame", join([box((-width / 2, 0, 0), (width / 2, length, base_h)), tower]), "dark"),
+        Part("anvil", box((-0.3 * width, 0.012, base_h), (0.3 * width, 0.03, base_h + 0.0012)), "metal"),
+    )
+    inside = 0.6 * width
+    magazine = box((-inside / 2, -length + 0.006, 0.0), (inside / 2, -0.022, mag_h))
+    # The arm as a wall between an upper and a lower line, seen from its side; y runs from the hinge to the front.
+    along = np.linspace(0, 1, 9)
+    bulge = float(rng.uniform(0.1, 0.6))
+    upper = np.stack(
+        [0.008 - (length + 0.004) * along, mag_h + arm_h * (0.55 + bulge * np.sin(np.pi * along) * 0.8 + 0.25 * along)],
+        axis=1,
+    )
+    lower = np.stack([0.008 - (length + 0.004) * along, np.full(9, mag_h + 0.001)], axis=1)
+    arm = prism_between(upper, lower, -width / 2, width / 2).rotated(_SIDE)
+    turn = float(np.deg2rad(rng.uniform(85, 110)))
+    hinge = (0.0, length - 0.008, z)
+    links = (
+        Link("link_0", (Part("lid", arm, "front"),), "revolute", hinge, (-1.0, 0.0, 0.0), turn),
+        Link("link_1", (Part("magazine", magazine, "metal"),), "revolute", hinge, (-1.0, 0.0, 0.0), 0.75 * turn),
+    )
+    return ObjectModel("Stapler", body, links).moved((0.0, -length / 2, 0.0))
+
+
+def build_bucket(rng: np.random.Generator) -> ObjectModel:
+    """A bucket whose bail lies on its front edge and turns up.
+
+    Args:
+        rng: source of randomness.
+    """
+    height, radius = float(rng.uniform(0.22, 0.34)), float(rng.uniform(0.11, 0.16))
+    foot, wall = radius * float(rng.uniform(0.65, 0.9)), 0.004
+    lip = float(rng.uniform(0.004, 0.01))
+    profile = [
+        (0.0, 0.0), (foot, 0.0), (radius, height - 0.012), (radius + lip, height - 0.012), (radius + lip, height),
+        (radius - wall, height), (foot - wall, 0.01), (0.0, 0.01),
+    ]  # fmt: skip
+    shell = lathe(np.array(profile), sides=40).rotated(UP)
+    ear_z = height - float(rng.uniform(0.02, 0.04))
+    span = radius + lip + 0.004
+    ears = [box((s * span - 0.007, -0.012, ear_z - 0.012), (s * span + 0.007, 0.012, ear_z + 0.012)) for s in (-1, 1)]
+    metal = bool(rng.random() < 0.5)
+    body = (
+        Part("base_body", shell, "metal" if metal else "front"),
+        Part("ear", join(ears), "metal" if metal else "dark"),
+    )
+    # The bail's hoop in the x-y plane, towards -y, then tilted so that it lies on the lip.
+    wide = span + 0.004
+    angle = np.linspace(0, np.pi, 33)
+    bow = float(rng.uniform(1.0, 1.15))
+    hoop = tube(np.stack([-wide * np.cos(angle), -bow * wide * np.sin(angle), 0 * angle], axis=1), radius_m=0.0028)
+    x = np.linspace(-0.05, 0.05, 9)
+    held = np.stack([x, -bow * np.sqrt(wide**2 - x**2), 0 * x], axis=1)
+    grip = tube(held, radius_m=float(rng.uniform(0.008, 0.012)))
+    tilt = -float(np.deg2rad(rng.uniform(0, 12)))  # a little above the horizontal, clear of the lip
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    lie = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
+    parts = [Part("handle", hoop.rotated(lie), "metal")]
+    if rng.random() < 0.75:
+        parts.append(Part("handle", grip.rotated(lie), str(rng.choice(["dark", "white", "front"]))))
+    turn = float(np.deg2rad(rng.uniform(88, 110)))
+    return ObjectModel("Bucket", body, (Link("link_0", tuple(parts), "revolute", (0, 0, ear_z), (-1, 0, 0), turn),))
+
+
+def build_pot(rng: np.random.Generator) -> ObjectModel:
+    """A pot or a kettle: a belly with a handle at its side, often a spout, and a lid with a knob that lifts off.
+
+    Args:
+        rng: source of randomness.
+    """
+    radius, height = float(rng.uniform(0.07, 0.1)), float(rng.uniform(0.1, 0.16))
+    mouth, wall = radius * float(rng.uniform(0.5, 0.8)), 0.004
+    share = np.linspace(0, 1, 11)
+    belly = mouth + (radius - mouth) * np.sin(np.pi * (0.25 + 0.75 * share)) ** float(rng.uniform(0.5, 1.2))
+    belly[-1] = mouth
+    outer = [(0.0, 0.0), *((float(r), float(h)) for r, h in zip(belly, share * height, strict=True))]
+    inner = [
+        (float(r) - wall, float(h)) for r, h in zip(belly[::-1], share[::-1] * (height - wall) + wall, strict=True)
+    ]
+    shell = lathe(np.array([*outer, *inner, (0.0, wall)]), sides=36).rotated(UP)
+    body = [Part("base_body", shell, "metal" if rng.random() < 0.5 else "front")]
+    # The handle at the right, the spout at the left of someone who stands before it.
+    style = HandleStyle(
+        "d_pull", 0.6 * height, float(rng.uniform(0.01, 0.016)), float(rng.uniform(0.04, 0.06)), 1.0, "dark"
+    )
+    at_side = float(belly[5]) - 0.006
+    held = handle_part(style, at=(0, 0, 0), vertical=True, room_m=(height, height))
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # from -y to +x
+    body.append(Part("handle", held.mesh.rotated(quarter).moved((at_side, 0, 0.5 * height)), "dark"))
+    if rng.random() < 0.7:
+        path = np.array([[0.0, 0.0, 0.0], [-0.03, 0.012, 0.0], [-0.055, 0.04, 0.0], [-0.08, 0.06, 0.0]])
+        spout = tube(path, radius_m=float(rng.uniform(0.01, 0.014))).rotated(
+            np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
+        )
+        body.append(Part("spout", spout.moved((-float(belly[5]) + 0.01, 0, 0.45 * height)), body[0].surface))
+    dome = float(rng.uniform(0.008, 0.025))
+    lid = [(mouth + 0.002, 0.0), (mouth + 0.002, 0.003)]
+    lid += [(float((mouth + 0.002) * np.cos(a)), float(0.003 + dome * np.sin(a))) for a in np.linspace(0.2, 1.4, 6)]
+    # A knob without a stem: its outside is the nearest to its middle.
+    round_ = [(0.85, -0.1), (1.0, 0.35), (0.95, 0.7), (0.55, 1.0)]
+    flat = [(0.9, -0.1), (1.0, 0.9), (0.9, 1.0)]
+    wide, tall = float(rng.uniform(0.011, 0.017)), float(rng.uniform(0.014, 0.024))
+    profile = round_ if rng.random() < 0.5 else flat
+    knob = lathe(np.array([(wide * r, tall * h) for r, h in profile]), sides=24).rotated(UP)
+    turned = Part("knob", knob.moved((0, 0, 0.003 + 0.97 * dome)), "dark")
+    parts = (Part("lid", lathe(np.array(lid), sides=36).rotated(UP), body[0].surface), turned)
+    lift = float(rng.uniform(0.05, 0.1))
+    link = Link("link_0", parts, "prismatic", (0.0, 0.0, height + 0.001), (0.0, 0.0, 1.0), lift)
+    return ObjectModel("Kettle", tuple(body), (link,))
+
+
+THINGS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
+    "eyeglasses": build_eyeglasses,
+    "stapler": build_stapler,
+    "bucket": build_bucket,
+    "pot": build_pot,
+}
+"""How to build each kind."""

@@ -1,0 +1,261 @@
+"""Making many takes: what one process does, and what each worker of a cluster does (:mod:`quest.sim.cluster`).
+
+A studio makes one take after the other; it holds what is costly to set up, a renderer and loaded objects. While a take
+is compressed and written in a thread of its own, the studio makes the next one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+from quest.data.provenance import code_commit, package_versions
+from quest.data.take_format import hash_take
+from quest.errors import ObjectError, TakeError
+from quest.sim.generate import generate_take
+from quest.sim.objects import find_objects
+from quest.sim.plan import ObjectShelf, TakeSpec
+from quest.sim.renderer import Renderer
+from quest.types import Take
+
+if TYPE_CHECKING:
+    from quest.data.store import TakeStore
+
+_WAIT_FOR_BYTES = 1 << 30
+"""Takes larger than this are written before the next one is begun: two of them would be a lot of memory."""
+
+
+@dataclass(frozen=True)
+class TakeMade:
+    """A take is in the store.
+
+    Attributes:
+        spec: which one.
+        frames: its frames, all views counted.
+        seconds: how long it took to make, without writing it.
+        warnings: what was found wrong with its object.
+        node: which machine made it; empty for this one.
+    """
+
+    spec: TakeSpec
+    frames: int
+    seconds: float
+    warnings: tuple[str, ...] = ()
+    node: str = ""
+
+
+@dataclass(frozen=True)
+class TakeSkipped:
+    """A take cannot be made.
+
+    Attributes:
+        spec: which one.
+        reason: why not.
+    """
+
+    spec: TakeSpec
+    reason: str
+
+
+@dataclass(frozen=True)
+class Notice:
+    """Something that a person should know, and that does not stop the production."""
+
+    text: str
+
+
+Event = TakeMade | TakeSkipped | Notice
+Report = Callable[[Event], None]
+"""Is told what happens, in the thread that called."""
+
+
+@runtime_checkable
+class Studio(Protocol):
+    """Makes takes, one after the other, in one thread."""
+
+    def describe(self) -> dict[str, Any]:
+        """What takes depend on beside their specification: versions, renderer, commit."""
+        ...
+
+    def make(self, spec: TakeSpec) -> tuple[Take, tuple[str, ...]]:
+        """A take, and what was found wrong with its object.
+
+        Raises:
+            ObjectError: it cannot be made from this object.
+        """
+        ...
+
+
+@runtime_checkable
+class StudioOpener(Protocol):
+    """Says how a studio is set up; pickled, it sets one up on another machine."""
+
+    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> AbstractContextManager[Studio]:
+        """A studio that can make these takes.
+
+        Args:
+            specs: the takes.
+            complete: whether it must have all their objects. Workers of a cluster must, or it would depend on who
+                makes a take whether it can be made.
+
+        Raises:
+            ObjectError: there is no folder of objects to take the named ones from.
+            RendererError: nothing can render here.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class StudioSettings:
+    """Studios that render.
+
+    Attributes:
+        objects_root: folder of PartNet-Mobility folders; None for the environment's ``QUEST_OBJECTS``.
+        command: the command that makes these takes, for their provenance.
+    """
+
+    objects_root: Path | None = None
+    command: str = ""
+
+    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> RenderingStudio:
+        """A studio that can make these takes.
+
+        Raises:
+            ObjectError: there is no folder of objects to take the named ones from, or some have none and it is to be
+                complete.
+            RendererError: nothing can render here.
+        """
+        wanted = {spec.object_id for spec in specs if spec.source == "partnet"}
+        if wanted:  # told before the renderer warms up
+            missing = sorted(wanted - {folder.name for folder in find_objects(self.objects_root)})
+            if missing and complete:
+                raise ObjectError(
+                    f"objects {', '.join(missing)}: no such folders in {self.objects_root or 'QUEST_OBJECTS'}; every "
+                    "machine needs the folders of all objects"
+                )
+        return RenderingStudio(self)
+
+
+class RenderingStudio:
+    """A renderer and loaded objects; a context manager."""
+
+    def __init__(self, settings: StudioSettings) -> None:
+        self._renderer = Renderer()
+        self._shelf = ObjectShelf(settings.objects_root)
+        self._provenance = {**self.describe(), "command": settings.command}
+
+    def __enter__(self) -> RenderingStudio:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._shelf.__exit__(*exception)
+
+    def describe(self) -> dict[str, Any]:
+        """Commit, versions and renderer."""
+        return {"commit": code_commit(), "versions": package_versions(), "renderer": str(self._renderer.device)}
+
+    def make(self, spec: TakeSpec) -> tuple[Take, tuple[str, ...]]:
+        """A take, and what was found wrong with its object.
+
+        Raises:
+            ConfigError: its suite cannot be made with its settings.
+            ObjectError: it cannot be made from this object.
+            RendererError: the renderer broke.
+        """
+        return make_take(spec, renderer=self._renderer, shelf=self._shelf, provenance=self._provenance)
+
+
+def make_take(
+    spec: TakeSpec, *, renderer: Renderer, shelf: ObjectShelf, provenance: dict[str, Any] | None = None
+) -> tuple[Take, tuple[str, ...]]:
+    """One take, and what was found wrong with its object.
+
+    Raises:
+        ConfigError: its suite cannot be made with its settings.
+        ObjectError: it cannot be made from this object.
+        RendererError: the renderer broke.
+    """
+    sim_object = shelf.load(spec.source, spec.object_id)
+    take = generate_take(
+        sim_object,
+        spec.level,
+        spec.seed,
+        renderer=renderer,
+        settings=spec.settings,
+        suite=spec.suite,
+        provenance=provenance,
+    )
+    return take, sim_object.warnings
+
+
+def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]:
+    """Those takes that the store does not have as a whole, each once."""
+    wanted = {spec.name: spec for spec in specs}
+    there = store.present(wanted)
+    return [spec for name, spec in wanted.items() if name not in there]
+
+
+def produce(specs: Sequence[TakeSpec], store: TakeStore, opener: StudioOpener, *, report: Report) -> None:
+    """Makes takes one after the other in this process and writes them into a store.
+
+    Interrupted, it finishes the take that is being written; the store never has a part of one.
+
+    Args:
+        specs: the takes; the store must not have them.
+        store: where they go.
+        opener: who makes them.
+        report: told of every take when it is in the store, or cannot be made.
+
+    Raises:
+        ObjectError, RendererError: no studio can be opened here.
+        TakeError: the store cannot be written.
+    """
+    writing: tuple[TakeMade, Future[None]] | None = None
+
+    def finish() -> None:
+        nonlocal writing
+        if writing is not None:
+            made, future = writing
+            writing = None
+            future.result()
+            report(made)
+
+    with ThreadPoolExecutor(1, thread_name_prefix="quest-write") as writer, opener.open(specs) as studio:
+        try:
+            for spec in specs:
+                start = time.perf_counter()
+                try:
+                    take, warnings = studio.make(spec)
+                except ObjectError as error:
+                    finish()
+                    report(TakeSkipped(spec, str(error)))
+                    continue
+                made = TakeMade(spec, len(take) * len(take.views), time.perf_counter() - start, warnings)
+                large = sum(view.clip.rgb.nbytes * 3 for view in take.views) > _WAIT_FOR_BYTES
+                finish()
+                writing = made, writer.submit(write_once, store, take)
+                del take
+                if large:
+                    finish()
+        finally:
+            finish()
+
+
+def write_once(store: TakeStore, take: Take) -> None:
+    """Write a take that somebody else may be writing as well: the first one counts, if both made the same.
+
+    Raises:
+        TakeError: the store has another take of that name.
+    """
+    try:
+        store.write(take)
+    except TakeError as error:
+        if take.info.name not in store:
+            raise
+        if store.data_hash(take.info.name) != hash_take(take):
+            raise TakeError(f"{error}; its arrays differ from those made here, so versions or settings do") from error

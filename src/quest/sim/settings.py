@@ -1,0 +1,65 @@
+"""What all takes of a run, or of a suite, have in common."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from quest.errors import ConfigError
+from quest.sim.cameras import CameraStyle
+from quest.sim.disturbance import DISTURBANCES, Disturbance
+from quest.sim.motion import HOLD_FRAMES, MotionStyle
+from quest.sim.sensor import SensorModel
+
+
+@dataclass(frozen=True)
+class TakeSettings:
+    """How takes are made.
+
+    Attributes:
+        views: how many cameras.
+        size: width and height of the images, pixels.
+        every: keep every n-th frame of the motion script.
+        frames_per_joint: frames of the script that each joint gets; takes in which things are hidden have scripts of
+            their own.
+        frames: length of a script in which joints open and close again and again; None for one share per joint.
+        randomize_materials: whether objects get random materials, beside random light and surroundings.
+        broad_materials: whether materials are drawn from all textures rather than the usual ones.
+        cameras: where cameras stand and how they move.
+        motion: how joints move.
+        physics: whether joints are driven through a physics engine along their script, or play it as it is.
+        gripper: whether a gripper pulls what moves.
+        sensor: what the sensor makes of colours and depth; the ground truth knows nothing of it.
+        disturbance: what happens to light, materials or cameras.
+    """
+
+    views: int = 3
+    size: int = 224
+    every: int = 1
+    frames_per_joint: int = 60
+    frames: int | None = None
+    randomize_materials: bool = True
+    broad_materials: bool = False
+    cameras: CameraStyle = CameraStyle()
+    motion: MotionStyle = MotionStyle()
+    physics: bool = False
+    gripper: bool = False
+    sensor: SensorModel = SensorModel()
+    disturbance: Disturbance = "none"
+
+    def __post_init__(self) -> None:
+        if self.views < 1 or self.size < 16:
+            raise ConfigError(f"take: expected at least 1 view of 16 pixels, got {self.views} of {self.size}")
+        if not 1 <= self.every <= HOLD_FRAMES:
+            raise ConfigError(f"take: expected to keep every 1st to {HOLD_FRAMES}th frame, got every {self.every}")
+        if self.frames is not None and self.frames <= self.frames_per_joint:
+            raise ConfigError(
+                f"take: expected more frames than one joint's share ({self.frames_per_joint}), got {self.frames}"
+            )
+        if self.gripper and (self.frames is not None or self.motion.overlap > 0 or self.motion.cycles > 1):
+            raise ConfigError(
+                "take: a gripper pulls one joint after the other, each once; leave overlap, cycles and frames away"
+            )
+        if self.disturbance not in DISTURBANCES:
+            raise ConfigError(
+                f"take: unknown disturbance {self.disturbance!r}; expected one of {', '.join(DISTURBANCES)}"
+            )
