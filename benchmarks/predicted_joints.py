@@ -34,7 +34,7 @@ from quest.track import Tracker
 class PredictedJoints:
     """Shares of right kinds and axis errors of the tracker's joints."""
 
-    takes: Path
+    takes: str
     """Folder of the take store."""
     split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation",)
     """Parts of the object split."""

@@ -113,7 +113,7 @@ def test_command_writes_what_it_prints(
     monkeypatch.setenv("COLUMNS", "200")
     out = tmp_path / "results.json"
     command = Eval(
-        takes=store.root,
+        takes=str(store.root),
         protocol=("point", "semantic"),
         trackers=("quest", "lk"),
         objects=("panels-100001",),
@@ -138,12 +138,12 @@ def test_command_writes_what_it_prints(
 
 
 def test_command_reports_training_objects_as_such(store: TakeStore, capsys: pytest.CaptureFixture) -> None:
-    assert Eval(takes=store.root, trackers=("hold-still",), split=("train",), resamples=5).run() == 0
+    assert Eval(takes=str(store.root), trackers=("hold-still",), split=("train",), resamples=5).run() == 0
     assert "TRAINING OBJECTS" in capsys.readouterr().out
 
 
 def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytest.CaptureFixture) -> None:
-    command = Eval(takes=store.root, trackers=("hold-still",), split=("validation",), resamples=5)
+    command = Eval(takes=str(store.root), trackers=("hold-still",), split=("validation",), resamples=5)
     assert command.run() == 0
     assert "--same-objects" in capsys.readouterr().out
     assert dataclasses.replace(command, same_objects=True).run() == 0
@@ -162,7 +162,7 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
     ],
 )
 def test_command_errors(store: TakeStore, changes: dict, error: type[Exception], match: str) -> None:
-    command = dataclasses.replace(Eval(takes=store.root, trackers=("hold-still",)), **changes)
+    command = dataclasses.replace(Eval(takes=str(store.root), trackers=("hold-still",)), **changes)
     with pytest.raises(error, match=match):
         command.run()
 
@@ -171,5 +171,5 @@ def test_torn_takes_are_left_out_and_named(tmp_path: Path, capsys: pytest.Captur
     store = TakeStore(tmp_path)
     store.write(_take(100000))
     (tmp_path / "torn.zarr").mkdir()
-    assert Eval(takes=tmp_path, trackers=("hold-still",), resamples=5).run() == 0
+    assert Eval(takes=str(tmp_path), trackers=("hold-still",), resamples=5).run() == 0
     assert "torn takes of the store were left out: torn" in capsys.readouterr().out

@@ -57,13 +57,13 @@ def folder(tmp_path: Path, stores: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
 
 
 def calibrated(folder: Path, **changes: str) -> int:
-    command = CalibrateWeights(folder / "w.safetensors", (folder / "validation",), folder / "records")
+    command = CalibrateWeights(folder / "w.safetensors", (str(folder / "validation"),), folder / "records")
     return replace(command, **changes).run()  # type: ignore[arg-type]
 
 
 def judged(folder: Path, **changes: object) -> int:
     command = EvalMonitor(
-        (folder / "test",),
+        (str(folder / "test"),),
         folder / "judged",
         folder / "records",
         weights=str(folder / "w.safetensors"),
@@ -108,7 +108,7 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
 def test_objects_of_the_calibration_are_not_judged(folder: Path):
     calibrated(folder)
     with pytest.raises(ConfigError, match="calibrated on them"):
-        judged(folder, takes=(folder / "validation",), split=("validation",))
+        judged(folder, takes=(str(folder / "validation"),), split=("validation",))
     with pytest.raises(InputError, match="none among 0 files"):
         judged(folder, calibration=folder / "elsewhere")
     with pytest.raises(ConfigError, match="alpha"):
@@ -141,7 +141,7 @@ def test_arguments():
         ]
     )
     assert isinstance(command, EvalMonitor)
-    assert (command.takes, command.alpha) == ((Path("a"), Path("b")), (0.05,))
+    assert (command.takes, command.alpha) == (("a", "b"), (0.05,))
     command = parse(["weights", "calibrate", "w.safetensors", "--takes", "a", "b", "--records", "r"])
     assert isinstance(command, Weights)
-    assert command.command == CalibrateWeights(Path("w.safetensors"), (Path("a"), Path("b")), Path("r"))
+    assert command.command == CalibrateWeights(Path("w.safetensors"), ("a", "b"), Path("r"))

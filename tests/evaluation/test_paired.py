@@ -36,6 +36,19 @@ def test_suite_of_a_take(take: str, suite: str, alike: bool):
     assert TakeSuite.of(take) == TakeSuite(suite, alike)
 
 
+@pytest.mark.parametrize(
+    ("take", "suite", "variant"),
+    [
+        ("chest-12-L1-shift-blur-s000000", "shift", "blur"),
+        ("chest-12-L2-noise-structured-light-s000003", "noise", "structured-light"),
+        ("chest-12-L1-noise-5-s000000", "noise", "5"),
+        ("chest-12-L1-gripper-s000000", "gripper", ""),
+    ],
+)
+def test_variant_of_a_take(take: str, suite: str, variant: str):
+    assert TakeSuite.of(take) == TakeSuite(suite, False, variant)
+
+
 def test_seen_around():
     visible = np.array([1, 1, 1, 1, 0, 1, 1, 1, 1, 1], bool)
     np.testing.assert_array_equal(seen_around(visible), [1, 1, 0, 0, 0, 0, 0, 1, 1, 1])

@@ -27,6 +27,7 @@ from quest.evaluation import (
 from quest.evaluation.bootstrap import draw_objects, mean_value, median_value
 from quest.evaluation.metrics import Sums
 from quest.evaluation.results import records_path
+from tests.evaluation.answers import make_answer
 
 RUN = Run("quest eval", "abc", "def", None, None, 50, 0, "machine", {"python": "3"}, "2026-01-01T00:00:00", 1.0)
 
@@ -57,6 +58,21 @@ def _record(rng: np.random.Generator, i: int, *, frames: int = 20, **changes: ob
 def records() -> tuple[EntityRecord, ...]:
     rng = np.random.default_rng(1)
     return tuple(_record(rng, i, frames=20 if i % 2 else 33) for i in range(14))
+
+
+def test_suites_have_rows_of_their_own() -> None:
+    takes = ("box-1-L1-s000000", "box-1-L1-noise-0-s000000", "box-1-L1-noise-5-s000000", "box-1-L1-occlusion-s000000")
+    records = [make_answer([0.1 * i] * 4, take=take) for i, take in enumerate(takes)]
+    rows = {row.suite: row for row in summarise(records, resamples=5, seed=0) if row.reading == "all"}
+    assert list(rows) == ["noise-0", "noise-5", "occlusion", "standard"]
+    ape = rows["noise-5"].metrics.ape
+    assert ape is not None
+    assert ape.mean == pytest.approx(0.2)
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(results_table(Results(RUN, tuple(rows.values()))))
+    text = console.export_text()
+    assert "suite noise-5" in text
+    assert "suite standard" not in text
 
 
 def test_rows_pool_frames_of_records_of_any_length(records: tuple[EntityRecord, ...]) -> None:

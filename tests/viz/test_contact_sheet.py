@@ -1,19 +1,15 @@
-"""Contact sheets and the command that draws them."""
+"""Contact sheets of takes and of stores."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
-from quest.cli.data import Data, DataList, DataShow
-from quest.data.store import TakeStore
-from quest.errors import InputError, TakeError
+from quest.errors import InputError
 from quest.types import Take
-from quest.viz.contact_sheet import contact_sheet
+from quest.viz.contact_sheet import contact_sheet, takes_sheet
 from quest.viz.palette import query_colour
 from tests.synthetic import make_take
 
@@ -56,30 +52,28 @@ def test_nothing_to_draw(take: Take):
         contact_sheet(take, columns=0)
 
 
-def test_command_show(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    TakeStore(tmp_path / "store").write(take)
-    out = tmp_path / "pictures" / "sheet.png"
-    assert Data(DataShow(tmp_path / "store" / "panels.zarr", out=out, columns=4)).run() == 0
-    assert Image.open(out).width > 900
-    assert str(out) in capsys.readouterr().out
+def test_cameras_that_move_are_told(take: Take, monkeypatch: pytest.MonkeyPatch):
+    written: list[str] = []
+    monkeypatch.setattr("quest.viz.contact_sheet.draw_text", lambda canvas, text, xy, **kind: written.append(text))
+    pose = take.views[1].clip.cam_from_world.copy()
+    pose[-1, :3, :3] = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]) @ pose[-1, :3, :3]
+    moving = replace(take.views[1], clip=replace(take.views[1].clip, cam_from_world=pose))
+    info = replace(take.info, suite="moving")
+    contact_sheet(replace(take, views=(take.views[0], moving), info=info), every=10)
+    words = " ".join(written)
+    assert "camera at rest" in words
+    assert "turns 90.0 deg" in words
+    assert "suite moving" in words
+    assert "frame 80" in words  # the ninth frame that is here is the 81st
 
 
-def test_command_show_of_what_is_no_take(tmp_path: Path):
-    with pytest.raises(TakeError, match="no folder"):
-        DataShow(tmp_path / "panels.zarr").run()
-    with pytest.raises(TakeError, match="expected the folder of a take"):
-        DataShow(tmp_path).run()
-
-
-def test_command_list(take: Take, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    store = TakeStore(tmp_path)
-    store.write(take)
-    store.write(replace(take, info=replace(take.info, name="torn")))
-    assert DataList(tmp_path, verify=True).run() == 0
-    (store.path("torn") / "zarr.json").unlink()
-    assert DataList(tmp_path).run() == 1
-    captured = capsys.readouterr()
-    assert "panels" in captured.out
-    assert "torn" in captured.err
-    with pytest.raises(TakeError, match="no such folder"):
-        DataList(tmp_path / "nowhere").run()
+def test_sheet_of_takes(take: Take):
+    other = make_take(frames=3, views=1, size=(48, 64), seed=1)
+    sheet = takes_sheet([take, other], title="two takes", columns=4, tile_width_px=64)
+    assert sheet.dtype == np.uint8
+    for e in take.tracked:
+        assert has_colour(sheet, query_colour(int(e)))
+    assert len(takes_sheet([take], title="one", tile_width_px=64)) < len(sheet)
+    for takes in ([], [replace(take, views=())]):
+        with pytest.raises(InputError, match="expected takes with views"):
+            takes_sheet(takes, title="none")

@@ -1,83 +1,146 @@
-"""``quest data``: look at takes."""
+"""``quest data``: look at takes, check them, and hand them to others."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
+
+from quest.cli.data_export import DataExport
+from quest.cli.data_stats import DataStats
+from quest.cli.data_verify import DataVerify
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from quest.data.store import TakeStore
+
+MOST_FRAMES_SHOWN = 600
 
 
 @dataclass(frozen=True)
 class DataShow:
-    """Draw a contact sheet of a take: frames of every view with entities, masks and depth."""
+    """Look at a take, or at several of a store: a contact sheet, or a Rerun recording."""
 
-    take: Annotated[Path, tyro.conf.Positional]
-    """Folder of the take, such as store/take.zarr."""
+    takes: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of a take (STORE/NAME.zarr), or of a store."""
 
     out: Path | None = None
-    """Picture to write (PNG, JPEG); <take>.png in the current folder by default."""
+    """Picture to write (PNG, JPEG); default: its name and .png in the current folder, unless Rerun is asked for."""
 
     columns: int = 8
-    """Frames to show, spread evenly from the first to the last."""
+    """Frames on the sheet, spread evenly from the first to the last."""
+
+    rows: int = 12
+    """Takes on the sheet of a store, spread evenly over their names."""
+
+    rrd: Path | None = None
+    """Save a Rerun recording: images, depth as points, entities and trails, joint axes, cameras, masks, curves."""
+
+    rerun: bool = False
+    """Open Rerun's viewer."""
+
+    every: int | None = None
+    """Of a take, show every n-th frame only; default: 1, more for takes of more than 600 frames."""
 
     def run(self) -> int:
-        """Write the picture and say where it is."""
+        """Write the picture or the recording and say where it is."""
+        from quest.cli.takes import open_takes
+        from quest.errors import ConfigError, TakeError
+
+        if (self.every is not None and self.every < 1) or self.rows < 1 or self.columns < 1:
+            raise ConfigError("show: expected --every, --rows and --columns of at least 1")
+        store, names = open_takes(self.takes)
+        if names is not None:
+            return self._show_take(store, names[0])
+        if self.rrd is not None or self.rerun or self.every is not None:
+            example = next(iter(store.names()), "NAME")
+            raise TakeError(
+                f"show: --rrd, --rerun and --every are for one take, and {self.takes} is a store; name one, such as "
+                f"{self.takes.rstrip('/')}/{example}.zarr"
+            )
+        return self._show_store(store)
+
+    def _show_take(self, store: TakeStore, name: str) -> int:
+        every = self.every or -(-store.header(name).frames // MOST_FRAMES_SHOWN)
+        take = store.read(name, frames=slice(None, None, every))
+        if self.rrd is not None or self.rerun:
+            from quest.viz.rerun_log import open_viewer, save_rrd
+
+            if self.rrd is not None:
+                save_rrd(take, self.rrd)
+                megabytes = self.rrd.stat().st_size / 1e6
+                print(f"{self.rrd}: {megabytes:.1f} MB, take {name}; open it with: rerun {self.rrd}")
+            if self.rerun:
+                open_viewer(take)
+        if self.out is not None or not (self.rrd or self.rerun):
+            from quest.viz.contact_sheet import contact_sheet
+
+            sheet = contact_sheet(take, columns=self.columns, every=every)
+            self._write(sheet, self.out or Path(f"{name}.png"), f"take {name}")
+        return 0
+
+    def _show_store(self, store: TakeStore) -> int:
+        from quest.errors import TakeError
+        from quest.viz.contact_sheet import takes_sheet
+
+        headers = store.headers()
+        if not headers:
+            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+        names = list(headers)
+        picked = sorted({round(i * (len(names) - 1) / max(self.rows - 1, 1)) for i in range(self.rows)})
+        takes = []
+        for name in (names[i] for i in picked):
+            step = max(1, (headers[name].frames - 1) // max(self.columns - 1, 1))
+            takes.append(store.read(name, views=[0], frames=slice(None, None, step)))
+        title = f"{self.takes}: {len(takes)} of {len(names)} takes"
+        name = self.takes.rstrip("/\\").replace("\\", "/").rpartition("/")[2] or "takes"
+        sheet = takes_sheet(takes, title=title, columns=self.columns)
+        self._write(sheet, self.out or Path(f"{name}.png"), f"{len(takes)} takes")
+        return 0
+
+    @staticmethod
+    def _write(sheet: np.ndarray, out: Path, what: str) -> None:
         from PIL import Image
 
-        from quest.data.store import TakeStore
-        from quest.errors import TakeError
-        from quest.viz.contact_sheet import contact_sheet
-
-        folder = self.take
-        if folder.suffix != ".zarr":
-            raise TakeError(f"take {folder}: expected the folder of a take, <store>/<name>.zarr")
-        name = folder.name.removesuffix(".zarr")
-        sheet = contact_sheet(TakeStore(folder.parent).read(name), columns=self.columns)
-        out = self.out or Path(f"{name}.png")
         out.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(sheet).save(out)
-        print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]} px, take {name}")
-        return 0
+        print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]} px, {what}")
 
 
 @dataclass(frozen=True)
-class DataList:
+class DataLs:
     """List the takes of a store, and what is wrong with those that cannot be read."""
 
-    store: Annotated[Path, tyro.conf.Positional]
-    """Folder of takes."""
-
-    verify: bool = False
-    """Also read every array and compare with the recorded hash."""
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of takes."""
 
     def run(self) -> int:
-        """Print a table; returns 1 if a take is torn or altered."""
+        """Print a table; returns 1 if a take is torn."""
         from rich.console import Console
         from rich.table import Table
 
-        from quest.data.store import TakeStore
-        from quest.errors import TakeError
+        from quest.cli.takes import open_takes, wide_console
 
-        store = TakeStore(self.store)
-        if not self.store.is_dir():
-            raise TakeError(f"store {self.store}: no such folder; check the path, or generate takes into it")
+        store, names = open_takes(self.store)
         table = Table(box=None)
         table.add_column("take", no_wrap=True)
-        for title in ("category", "level", "frames", "views", "entities", "data hash"):
-            table.add_column(title, overflow="fold")
-        headers, problems = store.headers(), store.problems()
+        for title in ("suite", "category", "level", "frames", "views", "entities", "MB", "data hash"):
+            right = title in ("level", "frames", "views", "entities", "MB")
+            table.add_column(title, overflow="fold", justify="right" if right else "left")
+        headers = {name: header for name, header in store.headers().items() if names is None or name in names}
+        problems = {name: text for name, text in store.problems().items() if names is None or name in names}
         for name, header in headers.items():
-            if self.verify:
-                try:
-                    store.verify(name)
-                except TakeError as error:
-                    problems[name] = str(error)
             info = header.info
-            counts = (info.level, header.frames, len(header.cameras), len(info.entities))
-            table.add_row(name, info.category, *map(str, counts), header.data_hash[:12])
-        Console(highlight=False).print(table)
+            counts = map(str, (info.level, header.frames, len(header.cameras), len(info.entities)))
+            megabytes = f"{sum(header.files.values()) / 1e6:.1f}"
+            table.add_row(name, info.suite, info.category, *counts, megabytes, header.data_hash[:12])
+        console = wide_console()
+        console.print(table)
+        frames = sum(header.frames * len(header.cameras) for header in headers.values())
+        console.print(f"{len(headers)} takes, {frames} frames", style="dim")
         for problem in problems.values():
             Console(stderr=True, highlight=False, markup=False).print(problem, style="red", soft_wrap=True)
         return 1 if problems else 0
@@ -85,9 +148,15 @@ class DataList:
 
 @dataclass(frozen=True)
 class Data:
-    """Look at the data that quest reads and writes."""
+    """Look at takes, verify them, and export them."""
 
-    command: Annotated[DataShow, tyro.conf.subcommand("show")] | Annotated[DataList, tyro.conf.subcommand("list")]
+    command: (
+        Annotated[DataLs, tyro.conf.subcommand("ls")]
+        | Annotated[DataShow, tyro.conf.subcommand("show")]
+        | Annotated[DataStats, tyro.conf.subcommand("stats")]
+        | Annotated[DataVerify, tyro.conf.subcommand("verify")]
+        | Annotated[DataExport, tyro.conf.subcommand("export")]
+    )
     """What to do."""
 
     def run(self) -> int:

@@ -44,7 +44,7 @@ class Eval:
         out: result file (.json); the per-frame records go beside it (.records.parquet).
     """
 
-    takes: Path
+    takes: str
     protocol: tuple[Literal["point", "semantic"], ...] = ("point",)
     trackers: tuple[TrackerName, ...] = ("quest", "lk", "hold-still")
     weights: str = "quest-s16"
@@ -101,11 +101,11 @@ class Eval:
         from quest.data.store import TakeStore
         from quest.errors import TakeError
 
-        if not self.takes.is_dir():
-            raise TakeError(
-                f"take store {self.takes}: expected a folder of takes, found none; make one with quest generate"
-            )
         store = TakeStore(self.takes)
+        if not store.exists():
+            raise TakeError(
+                f"take store {self.takes}: expected a store of takes, found none; make one with quest generate"
+            )
         return store, sorted(store.problems())
 
     def _load_trackers(self) -> list[ClipTracker]:

@@ -39,7 +39,7 @@ class EvalMonitor:
         out: result file (.json).
     """
 
-    takes: tuple[Path, ...]
+    takes: tuple[str, ...]
     records: Path
     calibration: Path
     weights: str = "quest-s16"

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 class Train:
     """Train a network on takes; run again with the same --out to go on."""
 
-    data: tuple[Path, ...]
+    data: tuple[str, ...]
     """Folders of take stores; the committed object split says which takes teach and which choose."""
     out: Path
     """Folder of the run: checkpoints, curves, and the file weights.safetensors."""
@@ -38,7 +38,7 @@ class Train:
     """Initial encoder weights (quest weights import-encoder); needed unless --weights is given."""
     weights: str | None = None
     """Start from these trained weights (a name or a file) instead, to fit your own objects."""
-    validation: tuple[Path, ...] = ()
+    validation: tuple[str, ...] = ()
     """Stores to choose by, for objects that are in no split."""
     preset: Literal["default", "paper"] = "default"
     """Network to train, unless --weights is given."""

@@ -48,7 +48,7 @@ class TuneWeights:
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
-    takes: Path = Path("takes")
+    takes: str = "takes"
     """Store with takes of validation objects."""
     level: tuple[int, ...] = (1,)
     """Levels of the takes to use."""
@@ -87,7 +87,7 @@ class CalibrateWeights:
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
-    takes: tuple[Path, ...]
+    takes: tuple[str, ...]
     """Stores with takes of validation objects."""
     records: Path
     """Folder for the recorded streams."""

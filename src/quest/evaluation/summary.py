@@ -13,6 +13,7 @@ from jaxtyping import Int
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
 from quest.evaluation.metrics import INPUT_PX, Sums, accuracy, distance_at, frame_mean, slope, switches
 from quest.evaluation.records import Discovery, EntityRecord
+from quest.evaluation.take_suite import STANDARD, TakeSuite
 
 Reading = Literal["all", "moved"]
 READINGS: tuple[Reading, ...] = ("all", "moved")
@@ -70,6 +71,7 @@ class Row:
         tracks: how many (take, view, entity).
         frames: how many scored frames of these.
         metrics: the numbers.
+        suite: of the simulator, with its variant, such as ``noise-5``; ``standard`` for ordinary takes.
     """
 
     tracker: str
@@ -84,6 +86,7 @@ class Row:
     tracks: int
     frames: int
     metrics: Metrics
+    suite: str = STANDARD
 
 
 def summarise(
@@ -93,7 +96,7 @@ def summarise(
     resamples: int,
     seed: int,
 ) -> tuple[Row, ...]:
-    """Rows per protocol, part, source, level, reading and tracker; a reading without records has no row.
+    """Rows per protocol, part, source, suite, level, reading and tracker; a reading without records has no row.
 
     Every row draws its resamples from a generator of its own with the same seed, so that rows over the same objects
     are resampled alike and a row does not depend on which others are there.
@@ -108,19 +111,22 @@ def summarise(
     for record in records:
         for reading in READINGS:
             if reading == "all" or record.moved:
-                s = record.subject
-                groups[(s.protocol, s.part, s.source, s.level, reading, s.tracker)].append(record)
+                groups[_key(record, reading)].append(record)
     slots: dict[tuple, list[Discovery]] = defaultdict(list)
     for found in discoveries:
-        s = found.subject
-        slots[(s.protocol, s.part, s.source, s.level, "all", s.tracker)].append(found)
+        slots[_key(found, "all")].append(found)
     order = {tracker: i for i, tracker in enumerate(dict.fromkeys(r.subject.tracker for r in records))}
-    keys = sorted(groups, key=lambda key: (*key[:5], order[key[5]]))
+    keys = sorted(groups, key=lambda key: (*key[:-1], order[key[-1]]))
     return tuple(_row(key, groups[key], slots[key], resamples=resamples, seed=seed) for key in keys)
 
 
+def _key(kept: EntityRecord | Discovery, reading: Reading) -> tuple:
+    s = kept.subject
+    return s.protocol, s.part, s.source, TakeSuite.of(kept.take).title, s.level, reading, s.tracker
+
+
 def _row(key: tuple, records: list[EntityRecord], found: list[Discovery], *, resamples: int, seed: int) -> Row:
-    protocol, part, source, level, reading, tracker = key
+    protocol, part, source, suite, level, reading, tracker = key
     # Views in which nothing could be scored still belong to the objects that the discovery was judged on.
     objects = sorted({r.subject.object_id for r in records} | {d.subject.object_id for d in found})
     draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
@@ -138,6 +144,7 @@ def _row(key: tuple, records: list[EntityRecord], found: list[Discovery], *, res
         tracks=len(records),
         frames=sum(len(r.distance) - r.first_frame for r in records),
         metrics=_metrics(records, found, index, draws, semantic=protocol == "semantic"),
+        suite=suite,
     )
 
 

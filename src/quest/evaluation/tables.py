@@ -13,6 +13,7 @@ from rich.text import Text
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.results import Results
 from quest.evaluation.summary import Row
+from quest.evaluation.take_suite import STANDARD
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,7 @@ LEGEND = (
 
 
 def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableType:
-    """All rows as tables, one per protocol, part of the split and source, followed by notes and what made them.
+    """All rows as tables, one per protocol, part of the split, source and suite, followed by notes and what made them.
 
     Args:
         results: what to show.
@@ -72,12 +73,15 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
     """
     parts: list[RenderableType] = []
     dropped: set[str] = set()
-    for (protocol, part, source), group in groupby(results.rows, key=lambda r: (r.protocol, r.part, r.source)):
+    for (protocol, part, source, suite), group in groupby(
+        results.rows, key=lambda r: (r.protocol, r.part, r.source, r.suite)
+    ):
         rows = list(group)
         columns = [c for c in COLUMNS if any(getattr(row.metrics, c.field) is not None for row in rows)]
         kept = _fitting(columns, rows, width)
         dropped |= {c.heading for c in columns if c not in kept}
-        parts.append(_table(f"{protocol} · {source} · {PART_TITLES.get(part, f'{part} objects')}", rows, kept))
+        title = f"{protocol} · {source} · {PART_TITLES.get(part, f'{part} objects')}"
+        parts.append(_table(title if suite == STANDARD else f"{title} · suite {suite}", rows, kept))
     run = results.run
     small = [LEGEND, *results.notes]
     if dropped:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 STANDARD = "standard"
 """Ordinary takes, which belong to no suite."""
 
-_TAG = re.compile(r"-L\d+-(?P<suite>[a-z]+?)\d*(?P<alike>alike)?-s\d+$")
+_TAG = re.compile(r"-L\d+-(?P<suite>[a-z]+?)(\d*(?P<alike>alike)?|-(?P<variant>[a-z0-9-]+))-s\d+$")
 
 
 @dataclass(frozen=True)
@@ -16,15 +16,24 @@ class TakeSuite:
     """The suite of a take.
 
     Attributes:
-        name: ``occlusion``, ``lockers``, or :data:`STANDARD`.
+        name: such as ``occlusion`` or ``shift``, or :data:`STANDARD`.
         look_alike: whether the name says that a look-alike stays in view while an entity is hidden.
+        variant: which kind of the suite, such as ``blur``; empty if there is only one.
     """
 
     name: str
     look_alike: bool
+    variant: str = ""
 
     @classmethod
     def of(cls, take: str) -> TakeSuite:
         """The suite of a take by its name, such as ``desk-102015-L1-occlusion60alike-s000000``."""
         found = _TAG.search(take)
-        return cls(STANDARD, False) if found is None else cls(found["suite"], found["alike"] is not None)
+        if found is None:
+            return cls(STANDARD, False)
+        return cls(found["suite"], found["alike"] is not None, found["variant"] or "")
+
+    @property
+    def title(self) -> str:
+        """The suite with its variant, such as ``shift-blur``."""
+        return f"{self.name}-{self.variant}" if self.variant else self.name

@@ -1,10 +1,13 @@
-"""Contact sheets: one picture of a take in which a person sees whether its ground truth is right.
+"""Contact sheets: one picture of a take in which a person sees whether its ground truth is right; or of many takes.
 
 Each view has a row of frames, with the outlines of links, the masks of entities tinted and the entities' true pixels
 marked (filled where visible, hollow where not), and a row of depth. Below are the entities and the joints over time.
+The sheet of many takes has one such row of frames for each.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -19,13 +22,16 @@ _MARGIN, _GAP, _HEAD, _NAME, _ROW = 24, 6, 96, 30, 26
 _TINT = 0.5
 
 
-def contact_sheet(take: Take, *, columns: int = 8, tile_width_px: int = 288) -> UInt8[np.ndarray, "H W 3"]:
+def contact_sheet(
+    take: Take, *, columns: int = 8, tile_width_px: int = 288, every: int = 1
+) -> UInt8[np.ndarray, "H W 3"]:
     """Draw a take as one picture.
 
     Args:
         take: what to draw; with at least one view.
         columns: frames to show, spread evenly from the first to the last.
         tile_width_px: width of each frame on the sheet.
+        every: of a longer take, these are every n-th frame; for the numbers of frames.
 
     Raises:
         InputError: the take has no views, or fewer than one column or pixel is asked for.
@@ -41,7 +47,8 @@ def contact_sheet(take: Take, *, columns: int = 8, tile_width_px: int = 288) -> 
     rows: list[Canvas] = []
     for v, view in enumerate(take.views):
         tiles = [_draw_frame(view, int(t), colours, take.tracked, tile_width_px) for t in shown]
-        rows.append(_row(tiles, f"view {v}    {view.clip.camera.width} x {view.clip.camera.height} px"))
+        size = f"{view.clip.camera.width} x {view.clip.camera.height} px"
+        rows.append(_row(tiles, f"view {v}    {size}    {_camera_motion(view)}"))
         if view.clip.depth_m is not None:
             tiles = [_draw_depth(view.clip.depth_m[t], near_m, far_m, tile_width_px) for t in shown]
             rows.append(
@@ -52,11 +59,51 @@ def contact_sheet(take: Take, *, columns: int = 8, tile_width_px: int = 288) -> 
     height = _HEAD + sum(len(row) for row in rows) + len(foot) + _MARGIN
     sheet = np.empty((height, width + 2 * _MARGIN, 3), dtype=np.uint8)
     sheet[:] = BACKGROUND
-    _draw_head(sheet[:_HEAD], take, shown, tile_width_px)
+    _draw_head(sheet[:_HEAD], take, shown, tile_width_px, every)
     top = _HEAD
     for part in (*rows, foot):
         sheet[top : top + len(part), _MARGIN : _MARGIN + part.shape[1]] = part
         top += len(part)
+    return sheet
+
+
+def takes_sheet(
+    takes: Sequence[Take], *, title: str, columns: int = 8, tile_width_px: int = 224
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw several takes as one picture: a row of frames of the first view of each.
+
+    Args:
+        takes: what to draw, each with at least one view; a few frames of each are enough.
+        title: what they have in common.
+        columns: frames to show, spread evenly from the first to the last.
+        tile_width_px: width of each frame on the sheet.
+
+    Raises:
+        InputError: there is no take, one has no views, or fewer than one column or pixel is asked for.
+    """
+    if not takes or not all(take.views for take in takes) or columns < 1 or tile_width_px < 16:
+        raise InputError(
+            f"contact sheet {title!r}: expected takes with views, a column and tiles of 16 pixels, "
+            f"got {len(takes)} takes, {columns} and {tile_width_px}"
+        )
+    rows: list[Canvas] = []
+    for take in takes:
+        shown = np.unique(np.linspace(0, len(take) - 1, columns).round().astype(int))
+        view, colours = take.views[0], _entity_colours(take)
+        tiles = [_draw_frame(view, int(t), colours, take.tracked, tile_width_px) for t in shown]
+        info = take.info
+        suite = " ".join(str(word) for word in (info.suite, info.provenance.get("variant", "")) if word)
+        facts = (info.name, info.category, suite, f"level {info.level}", f"{take.stamp_s[-1]:.1f} s")
+        rows.append(_row(tiles, "    ".join((*facts, _camera_motion(view)))))
+    width = max(max(row.shape[1] for row in rows), 600)
+    head = _HEAD - 40
+    sheet = np.empty((head + sum(map(len, rows)) + _MARGIN, width + 2 * _MARGIN, 3), dtype=np.uint8)
+    sheet[:] = BACKGROUND
+    draw_text(sheet, fit_text(title, 24, width), (_MARGIN, 28), size=24, colour=TEXT)
+    top = head
+    for row in rows:
+        sheet[top : top + len(row), _MARGIN : _MARGIN + row.shape[1]] = row
+        top += len(row)
     return sheet
 
 
@@ -145,21 +192,34 @@ def _row(tiles: list[Canvas], name: str) -> Canvas:
     return row
 
 
-def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int) -> None:
+def _camera_motion(view: View) -> str:
+    """How far the camera comes from where it was first, and how far it turns, in words."""
+    pose = view.clip.cam_from_world
+    centre = -np.einsum("tji,tj->ti", pose[:, :3, :3], pose[:, :3, 3])
+    moved_m = float(np.linalg.norm(centre - centre[0], axis=-1).max())
+    cosine = (np.einsum("tij,ij->t", pose[:, :3, :3], pose[0, :3, :3]) - 1) / 2
+    turned_deg = float(np.rad2deg(np.arccos(np.clip(cosine.min(), -1, 1))))
+    if moved_m < 1e-6 and turned_deg < 0.01:
+        return "camera at rest"
+    return f"camera moves up to {moved_m:.2f} m and turns {turned_deg:.1f} deg"
+
+
+def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int, every: int) -> None:
     info = take.info
     room = head.shape[1] - 2 * _MARGIN
     draw_text(head, fit_text(info.name, 24, room), (_MARGIN, 28), size=24, colour=TEXT)
     facts = (
         f"{info.category} {info.object_id} ({info.source})",
         f"level {info.level}",
+        *([f"suite {info.suite}"] if info.suite != "standard" else []),
         f"seed {info.seed}",
-        f"{len(take)} frames at {info.frames_per_s:g}/s",
+        f"{len(take)} frames at {info.frames_per_s / every:g}/s",
         f"half diagonal {info.half_diagonal_m:.3f} m",
     )
     draw_text(head, fit_text("    ".join(facts), 15, room), (_MARGIN, 56), size=15, colour=MUTED)
     for i, t in enumerate(shown):
         x = _MARGIN + i * (tile_width + _GAP) + tile_width / 2
-        label = f"frame {t}   {take.stamp_s[t]:.2f} s"
+        label = f"frame {t * every}   {take.stamp_s[t]:.2f} s"
         draw_text(head, fit_text(label, 13, tile_width), (x, 84), size=13, colour=TEXT, align="centre")
 
 
@@ -184,7 +244,8 @@ def _draw_entities(area: Canvas, take: Take, colours: list[RGB]) -> None:
         y = _NAME + (e + 0.5) * _ROW
         draw_disc(area, (8, y), 5, colour=colours[e])
         draw_text(area, fit_text(f"{e}   {entity.name}", 14, columns[1] - 30), (22, y), size=14, colour=TEXT)
-        draw_text(area, take.info.joints[entity.joint].kind, (columns[1], y), size=14, colour=TEXT)
+        kind = "fixed" if entity.fixed else take.info.joints[entity.joint].kind
+        draw_text(area, kind, (columns[1], y), size=14, colour=TEXT)
         reach = f"{moves[e]:.2f} m = {moves[e] / take.info.half_diagonal_m:.2f}"
         draw_text(area, reach, (columns[2], y), size=14, colour=TEXT if take.moved[e] else MUTED)
         seen = "   ".join(f"{100 * view.visible[:, e].mean():.0f} %" for view in take.views)

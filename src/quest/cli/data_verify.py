@@ -1,0 +1,89 @@
+"""``quest data verify``: do the truths of stored takes agree with each other and with the images?"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import tyro
+
+if TYPE_CHECKING:
+    from quest.data.verify import StoreReport
+
+
+@dataclass(frozen=True)
+class DataVerify:
+    """Check takes: hashes, re-projection, rigid links, joints, flow, velocities, visibility, masks."""
+
+    takes: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of a store, or of one take (STORE/NAME.zarr)."""
+
+    json: Path | None = None
+    """Also write every check of every take to this file."""
+
+    def run(self) -> int:
+        """Print a table of the worst of each check; returns 1 if a take fails."""
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+        from quest.cli.takes import open_takes
+        from quest.data.verify import TakeReport, verify_store
+        from quest.errors import TakeError
+
+        store, names = open_takes(self.takes)
+        chosen = names if names is not None else sorted({*store.names(), *store.problems()})
+        if not chosen:
+            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+        errors = Console(stderr=True, highlight=False, markup=False)
+        columns = (TextColumn("verifying"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+        with Progress(*columns, console=errors, transient=True) as progress:
+            task = progress.add_task("", total=len(chosen))
+
+            def told(report: TakeReport) -> None:
+                if not report.passed:
+                    progress.console.print(report.message(), style="red", soft_wrap=True)
+                progress.advance(task)
+
+            found = verify_store(store, chosen, report=told)
+        if self.json is not None:
+            _write(found, self.json)
+        _print(found)
+        return 0 if found.passed else 1
+
+
+def _print(found: StoreReport) -> None:
+    from rich.table import Table
+
+    from quest.cli.takes import wide_console
+
+    table = Table(box=None)
+    for title in ("check", "worst", "at most", "failed takes", "where the worst is"):
+        table.add_column(title, overflow="fold", no_wrap=title == "check")
+    for name in found.check_names():
+        worst = found.worst(name)
+        assert worst is not None
+        take, check = worst
+        failed = sum(not c.passed for report in found.takes for c in [report.worst(name)] if c is not None)
+        where = f"{take}: {check.where}" if check.worst > 0 else ""
+        unit = f" {check.unit}" if check.unit else ""
+        style = "red" if failed else None
+        table.add_row(name, f"{check.worst:.3g}{unit}", f"{check.limit:.3g}{unit}", str(failed), where, style=style)
+    console = wide_console()
+    if table.row_count:
+        console.print(table)
+    frames = sum(report.frames * report.views for report in found.takes)
+    console.print(
+        f"{len(found.takes) - len(found.failed)} of {len(found.takes)} takes pass, {frames} frames",
+        style="green" if found.passed else "bold red",
+    )
+
+
+def _write(found: StoreReport, path: Path) -> None:
+    takes = [
+        {**asdict(report), "passed": report.passed, "message": report.message()} for report in found.takes
+    ]  # what a property says is not in asdict
+    result = {"passed": found.passed, "takes": len(takes), "failed": [r.name for r in found.failed], "reports": takes}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,39 @@
+"""What commands that read takes share: a store or one of its takes, by folder or URL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from quest.data.store import TakeStore
+
+
+def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:
+    """A store, and the one take that was named; None where all are meant.
+
+    Args:
+        where: folder or URL of a store, or of a take (``STORE/NAME.zarr``).
+
+    Raises:
+        TakeError: there is no such store.
+    """
+    from quest.data.store import TakeStore, locate_take
+    from quest.errors import TakeError
+
+    if where.rstrip("/\\").endswith(".zarr"):
+        store, name = locate_take(where)
+        return store, [name]
+    store = TakeStore(where)
+    if not store.exists():
+        raise TakeError(f"store {where}: no such folder; check the path, or generate takes into it")
+    return store, None
+
+
+def wide_console() -> Console:
+    """For tables: as wide as the terminal; where there is none, wide enough that lines are not broken."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    return console if console.is_terminal else Console(highlight=False, width=180)
