@@ -15,7 +15,17 @@ from jaxtyping import UInt8
 
 from quest.errors import InputError
 from quest.types import LABELS, Take, View
-from quest.viz.ink import Canvas, draw_box, draw_disc, draw_line, draw_path, draw_ring, draw_text, fit_text
+from quest.viz.ink import (
+    Canvas,
+    draw_box,
+    draw_disc,
+    draw_line,
+    draw_outlined,
+    draw_path,
+    draw_ring,
+    draw_text,
+    fit_text,
+)
 from quest.viz.palette import BACKGROUND, LINE, MUTED, RGB, SURFACE, TEXT, query_colour
 
 _MARGIN, _GAP, _HEAD, _NAME, _ROW = 24, 6, 96, 30, 26
@@ -159,17 +169,10 @@ def _draw_frame(view: View, t: int, colours: list[RGB], tracked: np.ndarray, wid
 
 
 def _draw_number(tile: Canvas, number: int, xy: tuple[float, float]) -> None:
-    """Draw an entity's number beside its mark, outlined so that it reads on any background."""
+    """Draw an entity's number beside its mark."""
     right = xy[0] < tile.shape[1] - 24
-    x, y = xy[0] + (8 if right else -8), min(max(xy[1] - 8, 8), len(tile) - 8)
-    for dx, dy, colour in (
-        (-1, 0, BACKGROUND),
-        (1, 0, BACKGROUND),
-        (0, -1, BACKGROUND),
-        (0, 1, BACKGROUND),
-        (0, 0, TEXT),
-    ):
-        draw_text(tile, str(number), (x + dx, y + dy), size=13, colour=colour, align="left" if right else "right")
+    at = (xy[0] + (8 if right else -8), min(max(xy[1] - 8, 8), len(tile) - 8))
+    draw_outlined(tile, str(number), at, size=13, align="left" if right else "right")
 
 
 def _draw_depth(depth_m: np.ndarray, near_m: float, far_m: float, width: int) -> Canvas:

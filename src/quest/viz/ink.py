@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from quest.viz.palette import RGB
+from quest.viz.palette import BACKGROUND, RGB, TEXT
 
 Canvas = UInt8[np.ndarray, "_ _ 3"]
 Number = float | int
@@ -41,6 +41,16 @@ def draw_text(
     mask = _text_mask(text, size)
     shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align]
     blend(canvas, mask, round(xy[0] - shift * mask.shape[1]), round(xy[1] - mask.shape[0] / 2), colour)
+
+
+def draw_outlined(
+    canvas: Canvas, text: str, xy: XY, *, size: int, align: Literal["left", "centre", "right"] = "left"
+) -> None:
+    """Draw a line of text that reads on any background."""
+    x, y = xy
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        draw_text(canvas, text, (x + dx, y + dy), size=size, colour=BACKGROUND, align=align)
+    draw_text(canvas, text, xy, size=size, colour=TEXT, align=align)
 
 
 def fit_text(text: str, size: int, width: Number) -> str:

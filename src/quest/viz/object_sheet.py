@@ -14,7 +14,7 @@ from quest.errors import InputError
 from quest.sim.objects import SimObject
 from quest.sim.portrait import Portrait
 from quest.types import LABELS
-from quest.viz.ink import Canvas, draw_disc, draw_ring, draw_text, fit_text, text_size
+from quest.viz.ink import Canvas, draw_disc, draw_outlined, draw_ring, draw_text, fit_text, text_size
 from quest.viz.palette import BACKGROUND, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
 
 _GAP, _PAD, _HEAD, _ROW = 4, 10, 46, 20
@@ -149,14 +149,7 @@ def _draw_portrait(card: Card, portrait: Portrait, colours: list[RGB]) -> Canvas
 
 
 def _draw_word(tile: Canvas, word: str, xy: tuple[float, float]) -> None:
-    """A word beside a mark, outlined so that it reads on any background."""
+    """A word beside a mark."""
     right = xy[0] + text_size(word, 12)[0] + 12 < tile.shape[1]
-    x, y = xy[0] + (8 if right else -8), min(max(xy[1] - 7, 8), len(tile) - 8)
-    for dx, dy, colour in (
-        (-1, 0, BACKGROUND),
-        (1, 0, BACKGROUND),
-        (0, -1, BACKGROUND),
-        (0, 1, BACKGROUND),
-        (0, 0, TEXT),
-    ):
-        draw_text(tile, word, (x + dx, y + dy), size=12, colour=colour, align="left" if right else "right")
+    at = (xy[0] + (8 if right else -8), min(max(xy[1] - 7, 8), len(tile) - 8))
+    draw_outlined(tile, word, at, size=12, align="left" if right else "right")
