@@ -106,10 +106,12 @@ def test_verify(whole: Path, broken: Path, tmp_path: Path, capsys: pytest.Captur
     message = next(line for line in captured.err.splitlines() if "wrong" in line)
     assert "take 'wrong': reprojection 4.243 px, at most 0.5 px (view 0, frame" in message
     found = json.loads(path.read_text())
-    assert (found["passed"], found["failed"]) == (False, ["torn", "wrong"])
-    checks = {check["name"]: check for check in found["reports"][2]["checks"]}
-    assert checks["rigid in link"]["passed"]
-    assert checks["reprojection"]["worst"] == pytest.approx(4.243, abs=1e-3)
+    assert (found["passed"], list(found["failed"])) == (False, ["torn", "wrong"])
+    assert found["takes"] == {"torn": False, "whole": True, "wrong": False}
+    assert found["suites"] == {"standard": 2}
+    assert found["worst"]["rigid in link"]["passed"]
+    assert found["worst"]["reprojection"]["take"] == "wrong"
+    assert found["worst"]["reprojection"]["worst"] == pytest.approx(4.243, abs=1e-3)
     assert quest("verify", broken / "whole.zarr") == 0
     assert quest("verify", broken / "nowhere.zarr") == 1
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import shlex
+import sys
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 if TYPE_CHECKING:
+    from quest.data.store import TakeStore
     from quest.data.verify import StoreReport
 
 
@@ -21,7 +25,7 @@ class DataVerify:
     """Folder or URL of a store, or of one take (STORE/NAME.zarr)."""
 
     json: Path | None = None
-    """Also write every check of every take to this file."""
+    """Also write to this file which takes pass, why the others fail, and the worst of each check."""
 
     def run(self) -> int:
         """Print a table of the worst of each check; returns 1 if a take fails."""
@@ -48,7 +52,7 @@ class DataVerify:
 
             found = verify_store(store, chosen, report=told)
         if self.json is not None:
-            _write(found, self.json)
+            _write(found, store, self.json)
         _print(found)
         return 0 if found.passed else 1
 
@@ -80,10 +84,24 @@ def _print(found: StoreReport) -> None:
     )
 
 
-def _write(found: StoreReport, path: Path) -> None:
-    takes = [
-        {**asdict(report), "passed": report.passed, "message": report.message()} for report in found.takes
-    ]  # what a property says is not in asdict
-    result = {"passed": found.passed, "takes": len(takes), "failed": [r.name for r in found.failed], "reports": takes}
+def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
+    from quest.data.provenance import code_commit, combined_hash, machine
+
+    headers = store.headers()
+    known = {report.name: headers[report.name] for report in found.takes if report.name in headers}
+    worst = {name: pair for name in found.check_names() if (pair := found.worst(name)) is not None}
+    result = {
+        "passed": found.passed,
+        "n_takes": len(found.takes),
+        "n_frames": sum(report.frames * report.views for report in found.takes),
+        "suites": dict(Counter(header.info.suite for header in known.values()).most_common()),
+        "failed": {report.name: report.message() for report in found.failed},
+        "worst": {name: {"take": take, **asdict(check)} for name, (take, check) in worst.items()},
+        "takes": {report.name: report.passed for report in found.takes},
+        "data_hash": combined_hash((name, header.data_hash) for name, header in known.items()),
+        "commit": code_commit(),
+        "machine": machine(),
+        "command": shlex.join(["quest", *sys.argv[1:]]),
+    }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
