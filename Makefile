@@ -37,9 +37,10 @@ format: $(ALL)
 types: $(ALL)
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do.
+# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do. What kills
+# processes, starts clusters or trains runs in the second only.
 pytest: $(ALL) render-deps
-	$(BIN)/python -m pytest -n $(WORKERS) --jaxtyping-packages=quest,beartype.beartype
+	$(BIN)/python -m pytest -n $(WORKERS) --jaxtyping-packages=quest,beartype.beartype -m "not slow"
 	$(BIN)/python -m pytest -n $(WORKERS)
 
 render-deps: $(BASE)

@@ -153,7 +153,7 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
 @pytest.mark.parametrize(
     ("changes", "error", "match"),
     [
-        ({"takes": Path("no-such-folder")}, TakeError, "quest generate"),
+        ({"takes": "no-such-folder"}, TakeError, "quest generate"),
         ({"trackers": ()}, ConfigError, "expected a protocol"),
         ({"resamples": 0}, ConfigError, "resamples"),
         ({"out": Path("result.txt")}, ConfigError, "json"),

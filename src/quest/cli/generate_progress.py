@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.markup import escape
@@ -36,7 +36,7 @@ class GenerateProgress:
         self._said: set[str] = set()
         self._frames, self._first, self._last = 0, 0.0, 0.0
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> GenerateProgress:
         self._bar.start()
         return self
 
