@@ -26,7 +26,8 @@ class Table:
     Attributes:
         file: report, below the folder of results.
         title: heading.
-        rows: key of the list of rows in the report.
+        rows: key of the rows in the report: a list, or a mapping whose keys become the column ``key``; empty if the
+            report itself is the only row.
         columns: headings and where in a row the value is, as keys joined by dots; ``%`` before it for percent.
         each: key of a list in a row of which every entry makes a line; its values come after ``each.``.
     """
@@ -136,6 +137,31 @@ TABLES = (
             "p90": "axis_p90_deg",
         },
     ),
+    Table(
+        "data/verify.json",
+        "Takes of all suites, verified",
+        "worst",
+        {"check": "key", "worst": "worst", "at most": "limit", "unit": "unit", "where the worst is": "take"},
+    ),
+    Table(
+        "speed/generation.json",
+        "Making takes, three views of 224 pixels, beside a bare SAPIEN loop",
+        "",
+        {
+            "takes": "n_takes",
+            "frames": "n_frames",
+            "frames/s": "frames_per_s",
+            "bare loop": "bare_frames_per_s",
+            "share of bare %": "%share_of_bare",
+            "of its processor time %": "%share_of_bare_processor_time",
+        },
+    ),
+    Table(
+        "speed/windows.json",
+        "Random training windows of four frames, frames per second",
+        "frames_per_s",
+        {"reader": "key", "median": "median", "least": "least", "most": "most"},
+    ),
 )
 
 
@@ -160,7 +186,7 @@ class UpdateReports:
 def page(folder: Path) -> str:
     """All reports of a folder as Markdown; those that are not there are left out."""
     parts = [
-        "# Results of monitor, grounding and suites",
+        "# Results of monitor, grounding, suites and simulator",
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
         "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
         "Validation objects chose settings; test objects did not.",
@@ -172,11 +198,16 @@ def page(folder: Path) -> str:
 def _section(table: Table, path: Path) -> str:
     report = json.loads(path.read_text(encoding="utf-8"))
     lines = [_line(table.columns), _line(["---"] * len(table.columns))]
-    for row in report[table.rows]:
+    rows = report[table.rows] if table.rows else [report]
+    if isinstance(rows, dict):
+        rows = [{"key": key, **row} for key, row in rows.items()]
+    for row in rows:
         for entry in row[table.each] if table.each else [{}]:
             lines.append(_line([_cell(row | {"each": entry}, where) for where in table.columns.values()]))
     run = report.get("run", report)
     notes = [f"`{run['command']}`, commit {run['commit']}."]
+    if "n_takes" in report and "machine" in report:
+        notes.insert(0, f"n = {report['n_takes']} takes, {report['machine']}.")
     if "calibration" in report:
         notes.append(f"Calibration: {report['calibration']}.")
     return "\n".join([f"## {table.title}", "", *lines, "", *notes])
@@ -199,7 +230,7 @@ def _shown(value: Any, factor: float) -> str:
         low, high = (_shown(value.get(key), factor) for key in ("low", "high"))
         return f"{middle} ({low}–{high})" if low and high else middle
     if isinstance(value, float):
-        return f"{factor * value:.0f}" if factor == 100 else f"{value:.3g}"
+        return f"{factor * value:.0f}" if factor == 100 or abs(value) >= 1000 else f"{value:.3g}"
     return str(value)
 
 
