@@ -15,6 +15,8 @@ import cProfile
 import json
 import os
 import pstats
+import shlex
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -82,7 +84,7 @@ class GenerationSpeed:
         result = _summary(np.array(timed[1:])) | {"first_take_s": timed[0][1], "level": self.level}
         result |= {"machine": machine(), "load": os.getloadavg()[0], "renderer": str(renderer.device)}
         result |= {"commit": code_commit(), "versions": package_versions()}
-        result |= {"command": "python benchmarks/generation_speed.py"}
+        result |= {"command": shlex.join(["python", "benchmarks/generation_speed.py", *sys.argv[1:]])}
         Console().print_json(data=result)
         if profiler:
             pstats.Stats(profiler).sort_stats("tottime").print_stats(25)

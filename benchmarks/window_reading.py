@@ -1,6 +1,7 @@
 """Measure how fast random training windows come from a store: colour, depth, masks and truth of a few frames.
 
-    python benchmarks/window_reading.py takes/train --out benchmarks/results/speed/windows.json
+    quest generate --out runs/windows --procedural 4
+    python benchmarks/window_reading.py runs/windows --out benchmarks/results/speed/windows.json
 
 Beside it stand the same windows through ``TakeStore.read``, and reads of the very bytes that the windows need without
 decoding them. The files are read once before, so that all readers find them in the page cache. Let nothing else run
@@ -11,6 +12,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -79,7 +82,7 @@ class WindowReading:
             "load": os.getloadavg()[0],
             "commit": code_commit(),
             "versions": package_versions(),
-            "command": "python benchmarks/window_reading.py STORE",
+            "command": shlex.join(["python", "benchmarks/window_reading.py", *sys.argv[1:]]),
         }
         Console().print_json(data=result)
         if self.out is not None:

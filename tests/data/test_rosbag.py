@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from quest.data.frame_source import Parts
 from quest.data.recording import open_recording, read_recording
 from quest.data.ros_frames import CAMERA_CHANGED, LATE, NO_DEPTH, NO_POSE, NO_STAMP
 from quest.errors import RecordingError
-from quest.types import Camera, Frame
+from quest.types import Camera
+from tests.data.bag_drive import (
+    BEGIN,
+    CAMERA,
+    DEPTH_MM,
+    FRAMES,
+    IMAGE,
+    INFO,
+    OPTICAL,
+    RGB,
+    STEP,
+    TF,
+    WRITERS,
+    base_at,
+    colours,
+    depths,
+    frames_of,
+    info,
+    recording,
+)
 from tests.data.bags import (
     COLOUR,
     COLOUR_FRAME,
@@ -29,74 +45,10 @@ from tests.data.bags import (
     camera_info,
     compressed,
     image,
-    png,
     transform,
     write_bag,
     write_mcap,
-    write_ros1,
 )
-
-CAMERA = Camera(40.0, 41.0, 16.2, 12.1, 32, 24)
-IMAGE, INFO, TF = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
-FRAMES = 8
-BEGIN = 1_700_000_000 * SECOND
-STEP = SECOND // 20
-RNG = np.random.default_rng(0)
-RGB = RNG.integers(0, 256, (FRAMES, 24, 32, 3)).astype(np.uint8)
-DEPTH_MM = RNG.integers(500, 3000, (FRAMES, 24, 32)).astype(np.uint16)
-OPTICAL = np.eye(4)
-OPTICAL[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
-
-WRITERS: dict[str, Callable[[Path, Sequence[Sent]], Path]] = {
-    "mcap": lambda folder, sent: write_mcap(folder / "bag.mcap", sent),
-    "sqlite3 folder": lambda folder, sent: write_bag(folder / "bag", sent),
-    "mcap folder": lambda folder, sent: write_bag(folder / "bag", sent, storage="mcap"),
-    "ros1": lambda folder, sent: write_ros1(folder / "bag.bag", sent),
-}
-
-
-def base_at(seconds: float) -> np.ndarray:
-    """Where the robot is: it drives and turns evenly."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("z", 0.4 * seconds).as_matrix()
-    pose[:3, 3] = [0.5 * seconds, 0.1, 0.3]
-    return pose
-
-
-def colours(t: int, *, at_ns: int | None = None, **changes: Any) -> Sent:
-    stamp = BEGIN + t * STEP if at_ns is None else at_ns
-    return COLOUR, IMAGE, image(RGB[t], "rgb8", stamp) | changes, stamp
-
-
-def depths(t: int, *, at_ns: int | None = None, topic: str = DEPTH) -> Sent:
-    stamp = BEGIN + t * STEP if at_ns is None else at_ns
-    return topic, IMAGE, image(DEPTH_MM[t], "16UC1", stamp), stamp
-
-
-def info(t: int = 0, camera: Camera = CAMERA, **changes: Any) -> Sent:
-    return COLOUR_INFO, INFO, camera_info(camera, BEGIN + t * STEP, **changes), BEGIN + t * STEP
-
-
-def recording() -> list[Sent]:
-    """A driving robot: colours, aligned depth a little later, cameras, and transforms between the frames' times."""
-    mount = np.eye(4)
-    mount[:3, 3] = [0.1, 0.02, 0.5]
-    sent: list[Sent] = [
-        ("/tf_static", TF, transform("base", "camera_link", mount, BEGIN), BEGIN),
-        ("/tf_static", TF, transform("camera_link", COLOUR_FRAME, OPTICAL, BEGIN), BEGIN),
-    ]
-    for t in range(FRAMES):
-        sent += [info(t), colours(t), depths(t, at_ns=BEGIN + t * STEP + STEP // 10)]
-    for k in range(-2, 4 * FRAMES):
-        at = BEGIN + k * STEP // 3
-        sent.append(("/tf", TF, transform("odom", "base", base_at((at - BEGIN) / SECOND), at), at))
-    return sorted(sent, key=lambda one: one[3])
-
-
-def frames_of(path: Path, **parts: Any) -> tuple[list[Frame], tuple[str, ...]]:
-    source = open_recording(path, parts=Parts(**parts))
-    frames = list(source)
-    return frames, source.flags
 
 
 @pytest.mark.parametrize("writer", WRITERS.values(), ids=WRITERS.keys())
@@ -135,108 +87,6 @@ def test_frames_come_before_the_bag_is_read(tmp_path: Path, monkeypatch: pytest.
     assert read.count(COLOUR) <= 3
     assert len(list(iterator)) == FRAMES - 1
     assert len(list(source)) == FRAMES, "a second pass begins anew"
-
-
-BAYER = {"rggb": ((0, 1), (1, 2)), "bggr": ((2, 1), (1, 0)), "gbrg": ((1, 2), (0, 1)), "grbg": ((1, 0), (2, 1))}
-
-
-def mosaic(rgb: np.ndarray, pattern: str) -> np.ndarray:
-    y, x = np.mgrid[: rgb.shape[0], : rgb.shape[1]]
-    channel = np.array(BAYER[pattern])[y % 2, x % 2]
-    return np.take_along_axis(rgb, channel[..., None], axis=-1)[..., 0]
-
-
-FLAT = np.tile(np.array([200, 100, 40], np.uint8), (24, 32, 1))
-ALPHA = np.full((24, 32, 1), 77, np.uint8)
-PICTURES: dict[str, tuple[np.ndarray, np.ndarray]] = {
-    "rgb8": (RGB[0], RGB[0]),
-    "bgr8": (RGB[0][..., ::-1], RGB[0]),
-    "8UC3": (RGB[0][..., ::-1], RGB[0]),
-    "rgba8": (np.concatenate((RGB[0], ALPHA), -1), RGB[0]),
-    "bgra8": (np.concatenate((RGB[0][..., ::-1], ALPHA), -1), RGB[0]),
-    "mono8": (RGB[0][..., 0], np.repeat(RGB[0][..., :1], 3, -1)),
-    "rgb16": (RGB[0].astype(np.uint16) * 257, RGB[0]),
-    **{f"bayer_{name}8": (mosaic(FLAT, name), FLAT) for name in BAYER},
-    "bayer_rggb16": (mosaic(FLAT, "rggb").astype(np.uint16) * 257, FLAT),
-}
-
-
-@pytest.mark.parametrize("pad", [0, 6])
-@pytest.mark.parametrize("big", [False, True])
-@pytest.mark.parametrize("encoding", PICTURES)
-def test_encodings_of_colours(encoding: str, big: bool, pad: int, tmp_path: Path):
-    pixels, expected = PICTURES[encoding]
-    sent = image(pixels, encoding, BEGIN, pad=pad, big_endian=big)
-    frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), (COLOUR, IMAGE, sent, BEGIN)]))
-    np.testing.assert_array_equal(frames[0].rgb, expected)
-    assert frames[0].depth_m is None
-    assert flags == (NO_POSE, NO_DEPTH)
-
-
-def test_yuv_of_one_colour(tmp_path: Path):
-    grey = np.full((24, 32, 2), 128, np.uint8)
-    for encoding, luma in (("yuv422", 1), ("yuyv", 0)):
-        grey[..., luma] = 235
-        sent = (COLOUR, IMAGE, image(grey, encoding, BEGIN), BEGIN)
-        frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), sent]))
-        assert frames[0].rgb.min() > 250
-        grey[..., luma] = 128
-
-
-@pytest.mark.parametrize(("suffix", "kind"), [(".jpg", "rgb8; jpeg compressed bgr8"), (".png", "png")])
-def test_compressed_colours(suffix: str, kind: str, tmp_path: Path):
-    smooth = cv2.GaussianBlur(RGB[0], (0, 0), 5)
-    data = cv2.imencode(suffix, smooth[..., ::-1])[1].tobytes()
-    topic = COLOUR + "/compressed"
-    sent = (topic, "sensor_msgs/msg/CompressedImage", compressed(data, kind, BEGIN), BEGIN)
-    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), sent]))
-    assert np.abs(frames[0].rgb.astype(int) - smooth).max() <= (0 if suffix == ".png" else 6)
-
-
-def depth_messages() -> dict[str, tuple[str, str, dict[str, Any]]]:
-    metres = (DEPTH_MM[0] / 1000).astype(np.float32)
-    a, b = 10_000.0, -0.5
-    header, kind = struct.Struct("<iff"), "sensor_msgs/msg/CompressedImage"
-    plain = header.pack(0, 0.0, 0.0) + png(DEPTH_MM[0])
-    quantised = header.pack(0, a, b) + png(np.rint(a / metres + b).astype(np.uint16))
-    return {
-        "16UC1": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, pad=4)),
-        "16UC1 big": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, big_endian=True)),
-        "mono16": (DEPTH, IMAGE, image(DEPTH_MM[0], "mono16", BEGIN)),
-        "32FC1": (DEPTH, IMAGE, image(metres, "32FC1", BEGIN, pad=8)),
-        "32FC1 big": (DEPTH, IMAGE, image(metres, "32FC1", BEGIN, big_endian=True)),
-        "compressedDepth": (DEPTH + "/compressedDepth", kind, compressed(plain, "16UC1; compressedDepth png", BEGIN)),
-        "compressedDepth 32FC1": (
-            DEPTH + "/compressedDepth",
-            kind,
-            compressed(quantised, "32FC1; compressedDepth png", BEGIN),
-        ),
-        "png": (DEPTH + "/compressed", kind, compressed(png(DEPTH_MM[0]), "16UC1; png compressed ", BEGIN)),
-    }
-
-
-@pytest.mark.parametrize("how", depth_messages())
-def test_encodings_of_depth(how: str, tmp_path: Path):
-    topic, kind, fields = depth_messages()[how]
-    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), colours(0), (topic, kind, fields, BEGIN)]))
-    assert frames[0].depth_m is not None
-    np.testing.assert_allclose(frames[0].depth_m, DEPTH_MM[0] / 1000, atol=2e-3 if "32FC1" in how else 1e-6)
-
-
-def test_missing_depth_is_zero(tmp_path: Path):
-    metres = (DEPTH_MM[0] / 1000).astype(np.float32)
-    metres[0, :3] = [np.nan, np.inf, -1]
-    sent = (DEPTH, IMAGE, image(metres, "32FC1", BEGIN), BEGIN)
-    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", [info(), colours(0), sent]))
-    assert frames[0].depth_m is not None
-    assert (frames[0].depth_m[0, :3] == 0).all()
-
-
-def test_depth_scale_overrules_millimetres(tmp_path: Path):
-    path = write_mcap(tmp_path / "bag.mcap", [info(), colours(0), depths(0)])
-    found = read_recording(path, depth_scale_m=1e-4)
-    assert found.depth_m is not None
-    np.testing.assert_allclose(found.depth_m[0], DEPTH_MM[0] / 10_000, atol=1e-6)
 
 
 def test_the_nearest_depth_in_time_is_taken(tmp_path: Path):

@@ -10,6 +10,8 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from quest.data.frame_source import Parts
+
 if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
     from quest.track import Tracker
@@ -39,22 +41,8 @@ class Source:
     """Camera file; default: camera.json beside the colours, or what a bag says."""
     depth_scale_m: float | None = None
     """Metres per unit of 16-bit depth; default: what the camera file says, in bags millimetres."""
-    episode: int = 0
-    """Which episode of a LeRobot dataset."""
-    camera_key: str | None = None
-    """Which camera of a LeRobot dataset, such as observation.images.front or front; default: the first."""
-    topic_rgb: str | None = None
-    """Topic of the colours in a bag; default: found by its type and name."""
-    topic_depth: str | None = None
-    """Topic of the depth in a bag, or none; default: found likewise."""
-    topic_info: str | None = None
-    """Topic of the colours' camera_info; default: beside the colours."""
-    topic_depth_info: str | None = None
-    """Topic of the depth's camera_info; default: beside the depth."""
-    world_frame: str | None = None
-    """tf frame that is the world; default: the root of the camera's tf tree."""
-    sync_s: float = 0.02
-    """How far apart colour and depth of a bag may be, seconds."""
+    parts: tyro.conf.OmitArgPrefixes[Parts] = Parts()
+    """What to read of a LeRobot dataset or a bag."""
     device: str = "auto"
     """cpu, cuda, mps or auto."""
 
@@ -67,24 +55,16 @@ class Source:
             MissingExtraError: bags need the extra ``ros``.
         """
         from quest.data.frame_source import source_of_clip
-        from quest.data.recording import Parts, open_recording
+        from quest.data.recording import open_recording
         from quest.data.sample import sample_folder
         from quest.data.store import open_clip
 
         if self.clip.rstrip("/").endswith(".zarr"):
             return source_of_clip(open_clip(self.clip, view=self.view))
         path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
-        parts = Parts(
-            self.episode,
-            self.camera_key,
-            self.topic_rgb,
-            self.topic_depth,
-            self.topic_info,
-            self.topic_depth_info,
-            self.world_frame,
-            self.sync_s,
+        return open_recording(
+            path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m, parts=self.parts
         )
-        return open_recording(path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m, parts=parts)
 
     def read(self) -> Clip:
         """All frames in memory; what is less than it could be in them is said on standard error.

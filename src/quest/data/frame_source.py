@@ -25,14 +25,14 @@ class Parts:
     """Which parts of a recording to read, where it has several or does not say.
 
     Attributes:
-        episode: of a LeRobot dataset.
-        camera_key: feature of a LeRobot dataset, such as ``observation.images.front``; None for the first.
-        topic_rgb: topic of the colours in a bag; None finds it.
-        topic_depth: topic of the depth; None finds it, ``none`` leaves it out.
-        topic_info: topic of the colour camera's CameraInfo; None takes the one beside the colours.
-        topic_depth_info: topic of the depth camera's CameraInfo; None takes the one beside the depth.
-        world_frame: tf frame that is the world; None takes the root of the camera's tf tree.
-        sync_s: how far apart in time colour and depth may be, seconds.
+        episode: Which episode of a LeRobot dataset.
+        camera_key: Which camera of a LeRobot dataset, such as observation.images.front or front; default: the first.
+        topic_rgb: Topic of the colours in a bag; default: found by its type and name.
+        topic_depth: Topic of the depth in a bag, or none to leave it out; default: found likewise.
+        topic_info: Topic of the colours' CameraInfo; default: beside the colours.
+        topic_depth_info: Topic of the depth's CameraInfo; default: beside the depth.
+        world_frame: tf frame that is the world; default: the root of the camera's tf tree.
+        sync_s: How far apart colour and depth of a bag may be, seconds.
     """
 
     episode: int = 0
