@@ -1,14 +1,22 @@
-"""``quest weights``: list what ships, make the encoder's initial weights, tune and calibrate."""
+"""``quest weights``: list, show, push to the hub, make the encoder's initial weights, tune and calibrate."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from quest.data.store import TakeStore
+    from quest.evaluation.selection import SplitPart
+    from quest.model.weights import LoadedNetwork
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,72 @@ class ListWeights:
         console = Console(highlight=False)
         for name, path in shipped_weights().items():
             console.print(f"{name}  {path.stat().st_size / 1e6:.1f} MB  {escape(str(path))}")
+        return 0
+
+
+@dataclass(frozen=True)
+class ShowWeights:
+    """Print what a file of weights holds: network, training, tracker settings, monitor, licence, hash."""
+
+    weights: tyro.conf.Positional[str]
+    """Shipped name, file, folder, or owner/name on the Hugging Face hub (fetched if the cache has no copy)."""
+
+    def run(self) -> int:
+        """Read the file and print a table."""
+        from quest.model.weights import load_network
+
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for name, value in _facts(load_network(self.weights)).items():
+            table.add_row(name, escape(value))
+        Console(highlight=False).print(table)
+        return 0
+
+
+@dataclass(frozen=True)
+class SaveWeights:
+    """Write weights into a folder in the hub's form: model.safetensors, config.json and a card."""
+
+    weights: tyro.conf.Positional[str]
+    """Shipped name, file, folder, or owner/name on the Hugging Face hub."""
+    out: tyro.conf.Positional[Path]
+    """Folder to write; a README.md that is there stays."""
+    licence: str | None = None
+    """Licence to write into the file, such as Apache-2.0; default: what the file says."""
+    version: str | None = None
+    """Version to write into the file; default: what the file says."""
+
+    def run(self) -> int:
+        """Write the folder."""
+        _labelled(self.weights, self.licence, self.version).save_pretrained(self.out)
+        Console(highlight=False).print(f"weights and card: {escape(str(self.out))}", soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class PushWeights:
+    """Push weights and a card to a model repository on the Hugging Face hub (log in first: hf auth login)."""
+
+    weights: tyro.conf.Positional[str]
+    """Shipped name, file or folder. A text beside the file, weights.md beside weights.safetensors, becomes the card."""
+    repository: tyro.conf.Positional[str]
+    """owner/name; it is made if there is none."""
+    private: bool = False
+    """Make a new repository private."""
+    branch: str | None = None
+    """Branch to push to; default: main."""
+    licence: str | None = None
+    """Licence to write into the file, such as Apache-2.0; default: what the file says."""
+    version: str | None = None
+    """Version to write into the file; default: what the file says."""
+
+    def run(self) -> int:
+        """Push, and say how to load."""
+        labelled = _labelled(self.weights, self.licence, self.version)
+        console = Console(highlight=False)
+        commit = labelled.push_to_hub(self.repository, private=self.private or None, branch=self.branch)
+        console.print(escape(commit), soft_wrap=True)
+        at = f"@{self.branch}" if self.branch else ""
+        console.print(f'load it with quest.load("{escape(self.repository + at)}")', soft_wrap=True)
         return 0
 
 
@@ -44,12 +118,16 @@ class ImportEncoder:
 
 @dataclass(frozen=True)
 class TuneWeights:
-    """Choose the tracker's settings on validation objects and store them with the weights."""
+    """Choose the tracker's settings on validation objects and store them with the weights.
+
+    Your own objects, which are in no part of the split, count as validation objects here: name a store that did not
+    teach.
+    """
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
     takes: str = "takes"
-    """Store with takes of validation objects."""
+    """Store with takes of validation objects, or of your own."""
     level: tuple[int, ...] = (1,)
     """Levels of the takes to use."""
     objects: tuple[str, ...] = ()
@@ -58,22 +136,18 @@ class TuneWeights:
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
         from quest.data.store import TakeStore
-        from quest.evaluation.selection import select_takes
         from quest.evaluation.tuning import tune
-        from quest.model.weights import load_network, save_network
+        from quest.model.weights import load_network
         from quest.track import load
 
         console = Console(highlight=False)
         store = TakeStore(self.takes)
-        takes = select_takes(store.infos(), split=("validation",), levels=self.level, objects=self.objects)
+        takes = _to_choose_by(store, levels=self.level, objects=self.objects)
         tuned = tune(
             load(self.weights), store, takes, report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}")
         )
         console.print(f"discovery F1 {tuned.discovery_f1:.3f}; settings {tuned.config.to_json()}")
-        loaded = load_network(self.weights)
-        save_network(
-            self.weights, loaded.network, settings=tuned.config.to_json(), about=loaded.about, monitor=loaded.monitor
-        )
+        replace(load_network(self.weights), settings=tuned.config.to_json()).save(self.weights)
         return 0
 
 
@@ -82,13 +156,14 @@ class CalibrateWeights:
     """Fit the monitor on validation objects and store it with the weights.
 
     Every view of every take is tracked once and its signals are kept in --records, so that an interrupted run goes on
-    where it stopped. Tune before you calibrate: other settings make other signals.
+    where it stopped. Tune before you calibrate: other settings make other signals. Your own objects, which are in no
+    part of the split, count as validation objects here: name stores that did not teach.
     """
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
     takes: tuple[str, ...]
-    """Stores with takes of validation objects."""
+    """Stores with takes of validation objects, or of your own."""
     records: Path
     """Folder for the recorded streams."""
     level: tuple[int, ...] = ()
@@ -97,19 +172,20 @@ class CalibrateWeights:
     """Part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one fits."""
     block_frames: int | None = None
     """Length of the streams that thresholds rest on; that of the shortest by default."""
+    unit: Literal["object", "take"] = "object"
+    """What the promise is about: other objects, or other takes of these objects (where there are few objects)."""
 
     def run(self) -> int:
         """Record, fit, rewrite the file."""
         from quest.data.store import TakeStore
         from quest.evaluation.calibrate import fit_calibration
-        from quest.evaluation.selection import select_takes
         from quest.evaluation.stream_record import Shard, record_streams
-        from quest.model.weights import load_network, save_network
+        from quest.model.weights import load_network
         from quest.track import load
 
         console = Console(highlight=False)
         stores = [TakeStore(path) for path in self.takes]
-        takes = [(s, select_takes(s.infos(), split=("validation",), levels=self.level)) for s in stores]
+        takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
         recorded = record_streams(
             load(self.weights),
             takes,
@@ -120,29 +196,32 @@ class CalibrateWeights:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is fitted yet")
             return 0
-        fitted = fit_calibration(recorded.records, block_frames=self.block_frames)
-        console.print(fitted.calibration.about)
+        records = recorded.records
+        if self.unit == "take":
+            records = [replace(record, object_id=record.take) for record in records]
+        fitted = fit_calibration(records, block_frames=self.block_frames)
+        about = fitted.calibration.about
+        if self.unit == "take":
+            about = about.replace(" objects", " takes") + "; all of the same objects"
+        console.print(about)
         console.print(
             f"cross-validated: AUROC {fitted.auroc:.4f}, ECE {fitted.ece:.4f}, mean delay {fitted.delay:.1f} frames; "
             f"{fitted.hidden} hidden units, decay {fitted.decay}, {fitted.calibration.statistic}"
         )
-        loaded = load_network(self.weights)
-        save_network(
-            self.weights,
-            loaded.network,
-            settings=loaded.settings,
-            about=loaded.about,
-            monitor=fitted.calibration.to_json(),
-        )
+        calibration = replace(fitted.calibration, about=about)
+        replace(load_network(self.weights), monitor=calibration.to_json()).save(self.weights)
         return 0
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Weights that ship with the package, and those that training starts from."""
+    """Weights: what ships, what a file holds, to and from the hub, and what training and tracking need beside."""
 
     command: (
         Annotated[ListWeights, tyro.conf.subcommand("list")]
+        | Annotated[ShowWeights, tyro.conf.subcommand("show")]
+        | Annotated[SaveWeights, tyro.conf.subcommand("save")]
+        | Annotated[PushWeights, tyro.conf.subcommand("push")]
         | Annotated[ImportEncoder, tyro.conf.subcommand("import-encoder")]
         | Annotated[TuneWeights, tyro.conf.subcommand("tune")]
         | Annotated[CalibrateWeights, tyro.conf.subcommand("calibrate")]
@@ -151,3 +230,53 @@ class Weights:
     def run(self) -> int:
         """Run the subcommand."""
         return self.command.run()
+
+
+def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedNetwork:
+    """A network with another licence or version, where they are given."""
+    from quest.model.weights import load_network
+
+    told = {"licence": licence, "version": version}
+    return replace(load_network(weights), **{key: value for key, value in told.items() if value is not None})
+
+
+def _facts(loaded: LoadedNetwork) -> dict[str, str]:
+    """What a file of weights holds, by name, for people."""
+    config = asdict(loaded.network.config)
+    encoder, preset = config.pop("encoder"), config.pop("preset")
+    count = sum(p.numel() for p in loaded.network.parameters())
+    trained = sum(p.numel() for p in loaded.network.trainable())
+    return {
+        "name": loaded.name,
+        "file": f"{loaded.path} ({loaded.path.stat().st_size / 1e6:.1f} MB)",
+        "sha256": loaded.sha256,
+        "version": loaded.version or "not said",
+        "licence": loaded.licence or "not said (see the model card)",
+        "about": loaded.about,
+        "parameters": f"{count / 1e6:.1f} million, {trained / 1e6:.1f} of them outside the encoder",
+        "network": f"preset {preset}: {_pairs(config)}",
+        "encoder": _pairs(encoder),
+        "tracker": _pairs(json.loads(loaded.settings)) or "the usual settings",
+        "monitor": _monitor(loaded.monitor),
+    }
+
+
+def _monitor(calibration: str | None) -> str:
+    from quest.monitor import Calibration
+
+    if calibration is None:
+        return "not calibrated: no alarms; see `quest weights calibrate`"
+    monitor = Calibration.from_json(calibration)
+    return f"{monitor.about}; alpha of at least {1 / (len(monitor.maxima) + 1):.3g} can be promised"
+
+
+def _pairs(values: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} {value}" for key, value in values.items())
+
+
+def _to_choose_by(store: TakeStore, *, levels: tuple[int, ...], objects: tuple[str, ...] = ()) -> dict[str, SplitPart]:
+    """Takes of validation objects, and of objects in no part of the split, which count as such here."""
+    from quest.evaluation.selection import select_takes
+
+    chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
+    return dict.fromkeys(chosen, "validation")

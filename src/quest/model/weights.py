@@ -3,34 +3,48 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import json
+from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 import torch
+from huggingface_hub import ModelCard, PyTorchModelHubMixin
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 
 from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
+from quest.model.hub import FILE, LIBRARY, HubId, download, explained
+from quest.model.model_card import TAGS, model_card
 from quest.model.network import QuestNetwork
 
 FORMAT = "quest-network-1"
 
+FOLDER_FILES = (FILE, "weights.safetensors")
+"""What a folder is searched for: what ``save_pretrained`` writes, then what ``quest train`` writes."""
+
 
 @dataclass(frozen=True)
-class LoadedNetwork:
-    """A network read from a file.
+class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS), pipeline_tag="robotics"):
+    """A network read from a file, with everything else that the file holds.
+
+    It saves itself to folders and to the Hugging Face hub: ``from_pretrained``, ``save_pretrained`` and
+    ``push_to_hub`` are those of :class:`huggingface_hub.PyTorchModelHubMixin`. The folder or repository gets the one
+    file ``model.safetensors``, which loses nothing, a model card, and a ``config.json`` for people, which is not read.
 
     Attributes:
-        name: name or path that it was asked for by.
+        name: name, path or hub id that it was asked for by.
         path: file that it came from.
         network: in evaluation mode, on the CPU.
         settings: settings of the tracker that were chosen with these weights, as JSON text.
         about: where the weights come from.
         sha256: of the file.
         monitor: calibration of the monitor that was fitted with these weights, as JSON text; None without.
+        licence: under which the weights may be used; empty if the file does not say.
+        version: of the weights; empty if the file does not say.
     """
 
     name: str
@@ -40,9 +54,116 @@ class LoadedNetwork:
     about: str
     sha256: str
     monitor: str | None = None
+    licence: str = ""
+    version: str = ""
+
+    # The mixin would set one from the arguments, but this class is frozen and its files carry their own.
+    _hub_mixin_config = {"format": FORMAT}  # noqa: RUF012
+
+    def save(self, path: Path) -> None:
+        """Write everything to a file, atomically; use :func:`dataclasses.replace` to change something first."""
+        save_network(
+            path,
+            self.network,
+            settings=self.settings,
+            about=self.about,
+            monitor=self.monitor,
+            licence=self.licence,
+            version=self.version,
+        )
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_model_name_or_path: str | Path,
+        *,
+        force_download: bool = False,
+        token: str | bool | None = None,
+        cache_dir: str | Path | None = None,
+        local_files_only: bool = False,
+        revision: str | None = None,
+    ) -> LoadedNetwork:
+        """Read a network from a folder that ``save_pretrained`` wrote, or from the hub.
+
+        Args:
+            pretrained_model_name_or_path: a folder, or ``owner/name`` on the hub, optionally ``owner/name@revision``.
+            force_download: whether to download what the cache has.
+            token: of the hub; the one that ``hf auth login`` stored by default.
+            cache_dir: of the hub's files.
+            local_files_only: whether only the cache is looked at.
+            revision: branch, tag or commit.
+
+        Raises:
+            WeightsError: neither has such weights, the hub cannot be reached and the cache has no copy, or the file is
+                torn, foreign, or of another shape.
+        """
+        name = str(pretrained_model_name_or_path)
+        if Path(name).is_dir():
+            return load_network(Path(name))
+        hub_id = HubId.parse(name)
+        if hub_id is None:
+            raise WeightsError(f"{name}: expected a folder, or owner/name on the hub, and it is neither")
+        path = download(
+            HubId(hub_id.repo, revision or hub_id.revision),
+            force_download=force_download,
+            token=token,
+            cache_dir=cache_dir,
+            local_files_only=local_files_only,
+        )
+        return read_network(path, name=name)
+
+    def push_to_hub(self, repo_id: str, **arguments: Any) -> str:
+        """Write the file, the card and the configuration to a repository, which is made if there is none.
+
+        Args:
+            repo_id: ``owner/name``.
+            arguments: those of the mixin: ``private``, ``branch``, ``create_pr``, ``token``, ``commit_message``.
+
+        Returns:
+            Address of the commit.
+
+        Raises:
+            WeightsError: nobody is logged in, may not write there, or the hub cannot be reached.
+        """
+        arguments = {"commit_message": "Weights of QueST", "model_card_kwargs": {"repo_id": repo_id}, **arguments}
+        with explained(HubId(repo_id)):
+            return super().push_to_hub(repo_id, **arguments)
+
+    def generate_model_card(self, *, repo_id: str | None = None) -> ModelCard:
+        """The card: the text beside the file if there is one (the same name, ending in ``.md``), else what it holds.
+
+        Args:
+            repo_id: repository on the hub that the card is for.
+        """
+        beside = self.path.with_suffix(".md")
+        return model_card(
+            self._hub_mixin_info.model_card_data.to_dict(),
+            text=beside.read_text(encoding="utf-8") if beside.is_file() else None,
+            config=self.network.config,
+            about=self.about,
+            settings=self.settings,
+            monitor=self.monitor,
+            licence=self.licence,
+            version=self.version,
+            load_as=repo_id or "path/to/this/folder",
+        )
+
+    def _save_pretrained(self, save_directory: Path) -> None:
+        self.save(save_directory / FILE)
+        config = {"library_name": LIBRARY, "format": FORMAT, "network": asdict(self.network.config)}
+        (save_directory / "config.json").write_text(json.dumps(config, indent=2, sort_keys=True) + "\n")
 
 
-def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str, monitor: str | None = None) -> None:
+def save_network(
+    path: Path,
+    network: QuestNetwork,
+    *,
+    settings: str,
+    about: str,
+    monitor: str | None = None,
+    licence: str = "",
+    version: str = "",
+) -> None:
     """Write a network in half precision, atomically.
 
     Args:
@@ -51,10 +172,13 @@ def save_network(path: Path, network: QuestNetwork, *, settings: str, about: str
         settings: settings of the tracker, as JSON text.
         about: where the weights come from, a line for people.
         monitor: calibration of the monitor, as JSON text; None without.
+        licence: under which the weights may be used, such as ``Apache-2.0``; empty to say nothing.
+        version: of the weights; empty to say nothing.
     """
     tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
     metadata |= {} if monitor is None else {"monitor": monitor}
+    metadata |= {key: value for key, value in (("licence", licence), ("version", version)) if value}
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file(tensors, partial, metadata=metadata)
@@ -72,15 +196,41 @@ def shipped_weights() -> dict[str, Path]:
 
 
 def load_network(name: str | Path) -> LoadedNetwork:
-    """Read a network by the name of shipped weights or by path.
+    """Read a network by name of shipped weights, by path, or by its id on the Hugging Face hub.
+
+    Args:
+        name: a shipped name; a file; a folder that ``save_pretrained`` or ``quest train`` wrote; or ``owner/name`` of
+            a model repository, optionally ``owner/name@revision``. What is there as a file or folder is not looked
+            for on the hub. What was downloaded once works without a network.
 
     Raises:
-        WeightsError: no such name or file, or the file is torn, foreign, or of another shape.
+        WeightsError: no such name, file or repository, or the file is torn, foreign, or of another shape.
     """
     path = shipped_weights().get(str(name), Path(name))
-    if not path.is_file():
-        known = ", ".join(shipped_weights()) or "none"
-        raise WeightsError(f"{name}: no such weights; expected a safetensors file or a shipped name ({known})")
+    if path.is_dir():
+        path = next((path / file for file in FOLDER_FILES if (path / file).is_file()), path)
+    if path.is_file():
+        return read_network(path, name=str(name))
+    known = ", ".join(shipped_weights()) or "none"
+    hub_id = None if isinstance(name, Path) or path.exists() else HubId.parse(name)
+    if hub_id is None:
+        raise WeightsError(
+            f"{name}: no such weights; expected a safetensors file, a folder with {' or '.join(FOLDER_FILES)}, a "
+            f"shipped name ({known}), or owner/name on the Hugging Face hub"
+        )
+    return read_network(download(hub_id), name=str(name))
+
+
+def read_network(path: Path, *, name: str) -> LoadedNetwork:
+    """Read a network from a file.
+
+    Args:
+        path: the file.
+        name: what it was asked for by.
+
+    Raises:
+        WeightsError: the file is torn, foreign, or of another shape.
+    """
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -100,11 +250,13 @@ def load_network(name: str | Path) -> LoadedNetwork:
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return LoadedNetwork(
-        name=str(name),
+        name=name,
         path=path,
         network=network.eval(),
         settings=metadata.get("settings", "{}"),
         about=metadata.get("about", ""),
         sha256=sha256,
         monitor=metadata.get("monitor"),
+        licence=metadata.get("licence", ""),
+        version=metadata.get("version", ""),
     )

@@ -186,13 +186,13 @@ def _groups(sim_object: SimObject) -> list[tuple[int, int, list[Part]]]:
 
 
 def _shape(sapien: Any, part: Part) -> Any:
+    # SAPIEN shares meshes between scenes, and once drawn they no longer take texture coordinates: they get them here.
     render = sapien.render
     if part.mesh is not None:
         try:
             shape = render.RenderShapeTriangleMesh(str(part.mesh), np.array(part.scale, dtype=np.float32))
             shape.set_local_pose(sapien.Pose(part.body_from_part))
             shape.set_name(part.name)
-            # SAPIEN shares meshes between scenes, and once drawn they no longer take texture coordinates.
             for piece in shape.parts:
                 ensure_uv(piece, np.array(part.scale))
             return shape
@@ -206,4 +206,6 @@ def _shape(sapien: Any, part: Part) -> Any:
     faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
     shape = render.RenderShapeTriangleMesh(corners, faces, normals, np.zeros((len(corners), 2), np.float32), material)
     shape.set_name(part.name)
+    for piece in shape.parts:
+        ensure_uv(piece, np.ones(3))
     return shape

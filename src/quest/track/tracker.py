@@ -109,7 +109,7 @@ class Tracker:
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._autocast):
             frames, _ = intake.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
             observed = self.network.observe(frames)
-            return find_peaks(self.network, observed, radius_cells=self.config.slot_radius_cells)
+            return find_peaks(self.network, frames, observed, radius_cells=self.config.slot_radius_cells)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
@@ -162,14 +162,16 @@ class Tracker:
 
 
 def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker:
-    """A tracker from shipped weights or from a file.
+    """A tracker from shipped weights, from a file, or from the Hugging Face hub.
 
     Args:
-        name: name of shipped weights, or path of a safetensors file that ``quest train`` wrote.
+        name: name of shipped weights; path of a safetensors file or of a folder of a run; or ``owner/name`` of a model
+            repository on the hub, optionally ``owner/name@revision``. What was fetched once works without a network.
         device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto`` for the best there is.
 
     Raises:
-        WeightsError: no such weights, or the file is torn, foreign, or of another shape.
+        WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or the
+            file is torn, foreign, or of another shape.
         ConfigError: no such device.
     """
     loaded = load_network(name)

@@ -1,0 +1,143 @@
+"""Weights on the Hugging Face hub: one file of a model repository, and what can go wrong on the way."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from huggingface_hub import constants, hf_hub_download
+from huggingface_hub.errors import (
+    GatedRepoError,
+    HfHubHTTPError,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    LocalTokenNotFoundError,
+    RemoteEntryNotFoundError,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
+from huggingface_hub.errors import HTTPError as TransportError  # pyright: ignore[reportPrivateImportUsage]
+
+from quest.errors import WeightsError
+from quest.extras import DISTRIBUTION
+
+FILE = "model.safetensors"
+"""The file of a repository that holds the network."""
+
+LIBRARY = DISTRIBUTION
+"""What the hub calls this library."""
+
+_ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+?)(@(?P<revision>[^@\s]+))?")
+
+
+@dataclass(frozen=True)
+class HubId:
+    """A model repository at a revision.
+
+    Attributes:
+        repo: ``owner/name``.
+        revision: branch, tag or commit; None for the newest.
+    """
+
+    repo: str
+    revision: str | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> HubId | None:
+        """``owner/name`` or ``owner/name@revision``; None if the text is neither, such as the path of a file."""
+        match = _ID.fullmatch(text)
+        if match is None or match["repo"].endswith(".safetensors") or match["repo"].startswith("."):
+            return None
+        return cls(match["repo"], match["revision"])
+
+    @property
+    def page(self) -> str:
+        """Address of the repository's page."""
+        return f"{constants.ENDPOINT}/{self.repo}"
+
+    def __str__(self) -> str:
+        return self.repo if self.revision is None else f"{self.repo}@{self.revision}"
+
+
+def download(
+    hub_id: HubId,
+    *,
+    force_download: bool = False,
+    token: str | bool | None = None,
+    cache_dir: str | Path | None = None,
+    local_files_only: bool = False,
+) -> Path:
+    """The weights of a repository as a file of the hub's cache; what the cache has needs no network.
+
+    Args:
+        hub_id: the repository.
+        force_download: whether to download what the cache has.
+        token: of the hub; the one that ``hf auth login`` stored by default.
+        cache_dir: of the hub's files.
+        local_files_only: whether only the cache is looked at.
+
+    Raises:
+        WeightsError: there is no such repository, revision or file, it is not open to this user, or the hub cannot be
+            reached and the cache has no copy.
+    """
+    with explained(hub_id):
+        path = hf_hub_download(
+            hub_id.repo,
+            FILE,
+            revision=hub_id.revision,
+            library_name=LIBRARY,
+            force_download=force_download,
+            token=token,
+            cache_dir=cache_dir,
+            local_files_only=local_files_only,
+        )
+    return Path(path)
+
+
+@contextmanager
+def explained(hub_id: HubId) -> Iterator[None]:
+    """Turn the hub's errors into ours, which say what to do.
+
+    Args:
+        hub_id: the repository that is spoken with.
+    """
+    try:
+        yield
+    except GatedRepoError as error:  # before its parent, RepositoryNotFoundError
+        advice = f"accept the terms on {hub_id.page}, then log in with `hf auth login`"
+        raise WeightsError(f"{hub_id}: the repository is gated; {advice}") from error
+    except RepositoryNotFoundError as error:
+        raise WeightsError(
+            f"{hub_id}: {constants.ENDPOINT} has no such model repository, or it is private (and no file or folder "
+            "here is called so); check the spelling, or log in with `hf auth login`"
+        ) from error
+    except RevisionNotFoundError as error:
+        raise WeightsError(f"{hub_id}: the repository has no such branch, tag or commit; see {hub_id.page}") from error
+    except RemoteEntryNotFoundError as error:
+        raise WeightsError(
+            f"{hub_id}: expected a repository with {FILE}, it has none; other formats (pickles above all) are not "
+            "loaded; write it with `quest weights push`"
+        ) from error
+    except LocalEntryNotFoundError as error:
+        raise WeightsError(
+            f"{hub_id}: {constants.ENDPOINT} cannot be reached, and the cache ({constants.HF_HUB_CACHE}) has no copy "
+            "(and no file or folder here is called so); connect once, or pass the path of a file"
+        ) from error
+    except HFValidationError as error:
+        raise WeightsError(f"{hub_id}: not an id of the hub ({error}); expected owner/name") from error
+    except LocalTokenNotFoundError as error:
+        raise WeightsError(f"{hub_id}: nobody is logged in; log in with `hf auth login`") from error
+    except HfHubHTTPError as error:
+        status = error.response.status_code
+        advice = "log in with `hf auth login` as someone who may" if status in (401, 403) else "try again later"
+        raise WeightsError(f"{hub_id}: the hub answered with status {status} ({_line(error)}); {advice}") from error
+    except (OSError, TransportError) as error:  # the connection broke on the way, or the disk is full
+        raise WeightsError(f"{hub_id}: cannot be fetched or sent ({_line(error)}); connect and try again") from error
+
+
+def _line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__

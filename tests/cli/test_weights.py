@@ -1,0 +1,80 @@
+"""``quest weights tune`` and ``calibrate`` on objects that are in no part of the split."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from quest.cli.weights import CalibrateWeights, TuneWeights
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.evaluation import calibrate, stream_record, tuning
+from quest.evaluation.calibrate import FitConfig
+from quest.evaluation.stream_record import StreamRecord
+from quest.evaluation.tuning import Tuned
+from quest.model.weights import load_network, save_network
+from quest.monitor import Calibration
+from quest.track import Tracker, TrackerConfig
+from quest.types import Take
+from tests.monitor.streams import make_stream
+from tests.synthetic import make_take
+from tests.tiny import make_network
+
+TAKES = 30
+
+
+@pytest.fixture(scope="module")
+def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Takes of one object of the user's own, and one each of a training and a test object."""
+    store = TakeStore(tmp_path_factory.mktemp("takes") / "mine")
+    base = make_take(frames=2, views=1, entities=1, size=(16, 16))
+    for seed in range(TAKES):
+        info = replace(base.info, name=f"toolbox-{seed}", object_id="toolbox", source="own", seed=seed)
+        store.write(replace(base, info=info))
+    for seed in (1, 110_001):
+        store.write(replace(base, info=replace(base.info, name=f"panels-{seed}", object_id=f"panels-{seed}")))
+    return Path(store.url)
+
+
+@pytest.fixture
+def weights(tmp_path: Path) -> Path:
+    """Weights that say more than a tracker needs."""
+    path = tmp_path / "weights.safetensors"
+    save_network(path, make_network(), settings="{}", about="a test", licence="MIT", version="3")
+    return path
+
+
+def test_own_objects_choose_the_settings(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
+    chosen = {}
+
+    def tuned(tracker, store, takes, *, report):
+        chosen.update(takes)
+        return Tuned(TrackerConfig(jump=0.3), (), 1.0)
+
+    monkeypatch.setattr(tuning, "tune", tuned)
+    assert TuneWeights(weights, takes=str(takes)).run() == 0
+    assert chosen == {f"toolbox-{seed}": "validation" for seed in range(TAKES)}
+    loaded = load_network(weights)
+    assert TrackerConfig.from_json(loaded.settings).jump == 0.3
+    assert (loaded.about, loaded.licence, loaded.version) == ("a test", "MIT", "3")
+
+
+def test_own_takes_calibrate_the_monitor(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
+    def made_up(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
+        stream = make_stream(take.info.seed, frames=40, part=part)
+        return replace(stream, take=take.info.name, view=view, object_id=take.info.object_id)
+
+    monkeypatch.setattr(stream_record, "record_stream", made_up)
+    monkeypatch.setattr(calibrate, "FitConfig", lambda: FitConfig(folds=2, hidden=(0,), decay=(0.1,), epochs=2))
+    command = CalibrateWeights(weights, (str(takes),), weights.parent / "records")
+    with pytest.raises(ConfigError, match="objects to fit on"):
+        command.run()  # one object says nothing about other objects
+    assert replace(command, unit="take").run() == 0
+    loaded = load_network(weights)
+    assert loaded.monitor is not None
+    about = Calibration.from_json(loaded.monitor).about
+    assert "as many other takes" in about
+    assert about.endswith("all of the same objects")
+    assert (loaded.licence, loaded.version) == ("MIT", "3")

@@ -1,0 +1,53 @@
+"""The examples, as far as they can be tried without a renderer: the commands that they run exist."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from quest.cli.main import parse
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+
+
+def example(name: str) -> Any:
+    """An example as a module."""
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("procedural", [0, 3])
+def test_fine_tuning_runs_commands_that_exist(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, procedural: int):
+    module, commands = example("fine_tune"), []
+    monkeypatch.setattr(subprocess, "run", lambda command, check: commands.append(command[3:]))
+    monkeypatch.setattr(module.FineTune, "compare", lambda self: None)
+    (tmp_path / "takes" / "held-out" / "one.zarr").mkdir(parents=True)
+    module.FineTune(out=tmp_path, procedural=procedural).run()
+    names = [words[0] for words in commands]
+    generate = ["generate"] * (4 if procedural else 3)
+    assert names == [*generate, "eval", "train", "weights", "eval"]
+    for words in commands:
+        parse(words)
+    train: Any = parse(commands[names.index("train")])
+    assert len(train.data) == (2 if procedural else 1)
+    assert train.training.learning_rate < 4e-4
+    held_out = str(tmp_path / "takes" / "held-out")
+    assert held_out not in (*train.data, *train.validation)
+    evaluated: list[Any] = [parse(words) for words in commands if words[0] == "eval"]
+    assert [command.takes for command in evaluated] == [held_out, held_out]
+
+
+def test_the_tool_chest_has_three_handles():
+    text = (EXAMPLES / "toolbox" / "toolbox.urdf").read_text(encoding="utf-8")
+    assert text.count('type="prismatic"') == 2
+    assert text.count('type="revolute"') == 1
