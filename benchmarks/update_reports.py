@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ class Table:
             report itself is the only row.
         columns: headings and where in a row the value is, as keys joined by dots; ``%`` before it for percent.
         each: key of a list in a row of which every entry makes a line; its values come after ``each.``.
+        only: values that a row must have; the others are in the report alone.
     """
 
     file: str
@@ -37,6 +38,14 @@ class Table:
     rows: str
     columns: dict[str, str]
     each: str = ""
+    only: dict[str, Any] = field(default_factory=dict)
+
+
+def _ablation(file: str, title: str, columns: dict[str, str]) -> Table:
+    """A table of variants, moved entities alone; Δ is the difference from the variant's reference."""
+    about = {"objects": "source", "suite": "suite", "protocol": "protocol", "level": "level", "variant": "variant"}
+    counts = {"objects/takes/tracks": "objects/takes/tracks"}
+    return Table(f"ablations/{file}.json", title, "rows", about | counts | columns, only={"reading": "moved"})
 
 
 OBJECTS = {"objects": "source", "part": "part"}
@@ -49,7 +58,29 @@ ON_OFF = {
     "off ": "well_seen.off",
     "difference": "well_seen.difference",
 }
+PARTS = {
+    "APE": "metrics.ape",
+    "D@100": "metrics.d100",
+    "Acc": "metrics.acc",
+    "recall": "metrics.recall",
+    "ΔAPE": "difference.ape",
+    "ΔD@100": "difference.d100",
+    "ΔAcc": "difference.acc",
+}
+SIZES = {
+    "APE_2d": "metrics.ape_2d",
+    "D@100": "metrics.d100",
+    "Acc": "metrics.acc",
+    "ΔAPE_2d": "difference.ape_2d",
+    "ΔD@100": "difference.d100",
+    "ΔAcc": "difference.acc",
+}
 TABLES = (
+    _ablation("parts", "What queries, 3D, smoothness, joints and anchors are worth", PARTS),
+    _ablation("window", "Windows of T frames", SIZES),
+    _ablation("slots", "K learned queries", SIZES),
+    _ablation("losses", "Every loss left out by itself", PARTS),
+    _ablation("design", "Heatmap against regression, anchors against learned queries, 3D position codes", PARTS),
     Table(
         "monitor/test.json",
         "Drift per frame: the monitor beside plainer rules",
@@ -186,7 +217,7 @@ class UpdateReports:
 def page(folder: Path) -> str:
     """All reports of a folder as Markdown; those that are not there are left out."""
     parts = [
-        "# Results of monitor, grounding, suites and simulator",
+        "# Results of ablations, monitor, grounding, suites and simulator",
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
         "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
         "Validation objects chose settings; test objects did not.",
@@ -201,6 +232,7 @@ def _section(table: Table, path: Path) -> str:
     rows = report[table.rows] if table.rows else [report]
     if isinstance(rows, dict):
         rows = [{"key": key, **row} for key, row in rows.items()]
+    rows = [row for row in rows if all(row[key] == value for key, value in table.only.items())]
     for row in rows:
         for entry in row[table.each] if table.each else [{}]:
             lines.append(_line([_cell(row | {"each": entry}, where) for where in table.columns.values()]))
@@ -208,6 +240,9 @@ def _section(table: Table, path: Path) -> str:
     notes = [f"`{run['command']}`, commit {run['commit']}."]
     if "n_takes" in report and "machine" in report:
         notes.insert(0, f"n = {report['n_takes']} takes, {report['machine']}.")
+    if "steps" in report:
+        seeds = ", ".join(map(str, report["seeds"]))
+        notes.append(f"{report['steps']} steps of {report['batch']} windows each, on frozen features; seeds {seeds}.")
     if "calibration" in report:
         notes.append(f"Calibration: {report['calibration']}.")
     return "\n".join([f"## {table.title}", "", *lines, "", *notes])

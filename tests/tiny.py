@@ -24,10 +24,22 @@ DEFAULT = NetworkConfig(
     decoder_layers=1,
     token_layers=1,
     slots=6,
+    intents=True,
+    map_layers=1,
 )
 """The preset ``default``, tiny."""
 
-PAPER = replace(DEFAULT, preset="paper", queries="learned", head="regression", token_layers=0, slots=5, points3d=False)
+PAPER = replace(
+    DEFAULT,
+    preset="paper",
+    queries="learned",
+    head="regression",
+    token_layers=0,
+    slots=5,
+    points3d=False,
+    intents=False,
+    map_layers=0,
+)
 """The preset ``paper``, tiny."""
 
 

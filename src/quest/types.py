@@ -1,8 +1,8 @@
 """Cameras, frames, clips, queries, tracks and takes: the records that every room exchanges.
 
-All records are frozen dataclasses over numpy arrays. Pixels are ``(x, y)`` with centres at
-half-integers, so that an image spans ``[0, W] x [0, H]``. Camera axes are OpenCV's (x right, y down,
-z forward). Lengths are metres, angles radians, times seconds. Depth is along +z; 0 means missing.
+All records are frozen dataclasses over numpy arrays. Pixels are ``(x, y)`` with centres at half-integers, so that an
+image spans ``[0, W] x [0, H]``. Camera axes are OpenCV's (x right, y down, z forward). Lengths are metres, angles
+radians, times seconds. Depth is along +z; 0 means missing.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from quest.errors import InputError
 
 LABELS = ("handle", "knob", "rim", "front")
 """Labels of the entities that a tracker follows, in the order of the network's outputs."""
+INTENTS = ("open", "lift")
+"""What one takes hold of an entity for: to move its joint, or to lift the whole thing by its base."""
 
 
 class State(StrEnum):
@@ -50,7 +52,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not all(np.isfinite(values)) or self.fx <= 0 or self.fy <= 0:
+        if not np.isfinite(values).all() or min(self.fx, self.fy) <= 0:
             raise InputError(f"camera: expected finite intrinsics with fx, fy > 0, got fx, fy, cx, cy = {values}")
         if self.width <= 0 or self.height <= 0:
             raise InputError(f"camera: expected a positive image size, got {self.width} x {self.height}")
@@ -63,8 +65,7 @@ class Camera:
     @classmethod
     def from_opencv(cls, matrix: Float[np.ndarray, "3 3"], *, width: int, height: int) -> Camera:
         """Camera from an OpenCV or ROS matrix, whose pixel centres lie at integers (0.5 is added)."""
-        m = np.asarray(matrix, dtype=np.float64)
-        fx, fy, cx, cy = (float(m[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+        fx, cx, fy, cy = np.asarray(matrix, dtype=np.float64)[[0, 0, 1, 1], [0, 2, 1, 2]].tolist()
         return cls(fx, fy, cx + 0.5, cy + 0.5, width, height)
 
     @property
@@ -151,6 +152,7 @@ class Query:
         label: one of :data:`LABELS`, or None if unknown.
         frame: frame index of a point query.
         uv_px: pixel of a point query, in the source image.
+        intent: one of :data:`INTENTS`, or None for either.
     """
 
     kind: Literal["slot", "semantic", "point"]
@@ -158,10 +160,12 @@ class Query:
     label: str | None = None
     frame: int = 0
     uv_px: tuple[float, float] | None = None
+    intent: str | None = None
 
     def __post_init__(self) -> None:
-        if self.label is not None and self.label not in LABELS:
-            raise InputError(f"query: label {self.label!r} is unknown; expected one of {', '.join(LABELS)}")
+        for what, said, known in (("label", self.label, LABELS), ("intent", self.intent, INTENTS)):
+            if said is not None and said not in known:
+                raise InputError(f"query: {what} {said!r} is unknown; expected one of {', '.join(known)}")
         if (self.kind == "point") != (self.uv_px is not None):
             raise InputError("query: a point query needs a pixel, the other kinds take none")
         if self.uv_px is not None and not np.isfinite(self.uv_px).all():
@@ -175,9 +179,9 @@ class Query:
         return cls("slot", name)
 
     @classmethod
-    def semantic(cls, label: str, name: str = "") -> Query:
-        """Follow the most confident entity of a label."""
-        return cls("semantic", name, label)
+    def semantic(cls, label: str, name: str = "", *, intent: str | None = None) -> Query:
+        """Follow the most confident entity of a label, and of an intent if one is given."""
+        return cls("semantic", name, label, intent=intent)
 
     @classmethod
     def point(cls, frame: int, x: float, y: float, *, name: str = "", label: str | None = None) -> Query:
@@ -210,18 +214,17 @@ class Tracks:
 
     Attributes:
         names: name per query.
-        labels: label per query, one of :data:`LABELS`, or None.
+        labels: label per query, or None.
         uv_px: pixel in the source image; NaN before a query is bound.
         point_world: world point in metres; NaN before binding and where it cannot be lifted.
         confidence: probability that the identity is still right, 0 before binding.
         visible: whether the entity is seen.
         state: :class:`State` value per frame and query.
         stamp_s: times in seconds.
-        frame_flags: degradations that apply to whole frames or the whole clip, in words.
-        lost_p: calibrated probability that the identity is lost, NaN where it is not known; None for trackers that do
-            not watch themselves.
+        frame_flags: degradations of whole frames or of the whole clip, in words.
+        lost_p: calibrated probability that the identity is lost, NaN where unknown; None without a monitor.
         alarm: whether an alarm is open; None likewise.
-        joints: what explains the tracks at the end; None for trackers that do not ground them.
+        joints: what explains the tracks at the end; None without grounding.
     """
 
     names: tuple[str, ...]
@@ -283,8 +286,7 @@ class Entity:
         name: unique within the object, such as ``link_0/handle``.
         label: one of :data:`LABELS`, or ``hinge`` (reported apart, never scored).
         link: index of its link in the take's link arrays; 0 is the base, which never moves.
-        joint: index of the joint that moves it in the take's joint arrays; -1 if it is fixed in the base, such as the
-            rim of a laptop's base. Ask :attr:`fixed` before indexing with it.
+        joint: index of its joint in the take's joint arrays; -1 if it is fixed in the base (see :attr:`fixed`).
     """
 
     name: str
@@ -294,12 +296,12 @@ class Entity:
 
     @property
     def fixed(self) -> bool:
-        """Whether it is fixed in the base, so that no joint moves it."""
+        """Whether no joint moves it, such as the rim of a laptop's base."""
         return self.joint < 0
 
     @property
-    def intent(self) -> Literal["open", "lift"]:
-        """What one takes hold of it for: ``open`` what a joint moves, ``lift`` the whole thing by its base."""
+    def intent(self) -> str:
+        """What one takes hold of it for (see :data:`INTENTS`): ``open`` what a joint moves, ``lift`` what is fixed."""
         return "lift" if self.fixed else "open"
 
 
@@ -314,9 +316,9 @@ class TakeInfo:
         category: such as ``StorageFurniture``.
         level: how many joints move one after the other.
         seed: seed of everything random in the take.
-        half_diagonal_m: half the diagonal of the object's bounding box at rest; distances divided by it are normalised.
+        half_diagonal_m: half the diagonal of the object's bounding box at rest, the unit of normalised distances.
         frames_per_s: frame rate that the time stamps follow.
-        entities: what can be followed; hinges come last.
+        entities: what can be followed; hinges last.
         joints: moving joints.
         moved_joints: the joints that move in this take, in order, as indices into ``joints``.
         provenance: commit, versions of the packages that made the data, renderer, command.

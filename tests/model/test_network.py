@@ -98,8 +98,9 @@ def test_later_frames_do_not_change_earlier_answers(config: NetworkConfig):
     assert not torch.allclose(before["embedding"][:, 2:], after["embedding"][:, 2:], atol=1e-4)
 
 
-def test_earlier_frames_do_change_later_answers():
-    network, frames = make_network(), make_frames()
+@BOTH
+def test_earlier_frames_do_change_later_answers(config: NetworkConfig):
+    network, frames = make_network(config), make_frames(config)
     anchor = bound(network, frames)
     short = answers(network, anchor, frames.during(slice(3, 4)))
     assert not torch.allclose(answers(network, anchor, frames)["embedding"][:, 3:], short["embedding"], atol=1e-4)
@@ -165,6 +166,53 @@ def test_learned_queries_cannot_be_bound():
         network.bind(observed, some, torch.zeros(2, 1, 3), torch.zeros(2, 1).long(), torch.ones(2, 1, dtype=torch.bool))
 
 
+def test_learned_queries_begin_a_stream_as_they_begin_a_window():
+    """The answer for a window's i-th frame is that of a stream that has given i frames."""
+    network, frames = make_network(PAPER), make_frames(PAPER)
+    slots = network.slots(2)
+    whole = answers(network, slots, frames)
+    for t in range(1, 4):
+        assert_same(answers(network, slots, frames.during(slice(0, t))), {n: v[:, :t] for n, v in whole.items()})
+
+
+def test_slots_do_not_begin_alike():
+    """Before any training: what they read from the tokens is the same, so it must not drown what they are."""
+    torch.manual_seed(0)
+    network, frames = QuestNetwork(PAPER).eval(), make_frames(PAPER, batch=1)
+    x = network.embed(network.slots(1), network.observe(frames))[0, -1]
+    cosine = torch.nn.functional.cosine_similarity(x[:, None], x[None], dim=-1)
+    assert (cosine - torch.eye(PAPER.slots)).max() < 0.7
+
+
+def test_time_reaches_the_tokens_that_learned_queries_look_at():
+    network, frames = make_network(PAPER), make_frames(PAPER)
+    again = frames.during([2, 2, 2, 2])
+    same = network.decode(network.slots(2), network.observe(again), again).embedding
+    assert not torch.allclose(same[:, 1:], same[:, :-1], atol=1e-4)
+    torch.nn.init.zeros_(network.age)
+    still = network.decode(network.slots(2), network.observe(again), again).embedding
+    torch.testing.assert_close(still[:, 1:], still[:, :-1])
+
+
+def test_the_newest_answer_alone_is_that_of_the_window():
+    network, frames = make_network(PAPER), make_frames(PAPER)
+    slots, observed, newest = network.slots(2), network.observe(frames), slice(-1, None)
+    x = network.embed(slots, observed)[:, newest]
+    got = network.answer(x, slots, observed.during(newest), frames.during(newest))
+    whole = answers(network, slots, frames)
+    assert_same({n: getattr(got, n) for n in whole}, {n: v[:, newest] for n, v in whole.items()})
+
+
+def test_labels_are_read_off_what_slots_see():
+    network, frames = make_network(PAPER), make_frames(PAPER)
+    logits = network.labels(network.decode(network.slots(2), network.observe(frames), frames))
+    assert logits.shape == (2, 4, PAPER.slots, len(LABELS))
+    assert not torch.allclose(logits[0], logits[1], atol=1e-3)
+    default, other = make_network(), make_frames()
+    with pytest.raises(ConfigError, match="default"):
+        default.labels(default.decode(bound(default, other), default.observe(other), other))
+
+
 def test_the_answer_lies_around_the_best_cell():
     """The second look starts at the mean of the 3 x 3 cells and sees four close cells to every side."""
     network, frames = make_network(), make_frames()
@@ -216,7 +264,7 @@ def test_bilinear_samples_against_a_plain_loop():
 def test_slots_are_peaks_best_first_and_apart():
     network, frames = make_network(), make_frames(batch=1, frames=1)
     observed = network.observe(frames)
-    peaks = find_peaks(network, observed, radius_cells=1.5)
+    peaks = find_peaks(network, frames, observed, radius_cells=1.5)
     assert 1 <= len(peaks.uv) <= DEFAULT.slots
     assert (peaks.logit.diff() <= 0).all()
     assert ((peaks.label >= 0) & (peaks.label < len(LABELS))).all()
@@ -224,8 +272,17 @@ def test_slots_are_peaks_best_first_and_apart():
     # Coordinates are clamped to the image after the comparison.
     inside = ((peaks.uv > 0) & (peaks.uv < 1)).all(-1)
     assert (gap[inside][:, inside] >= 1.5 * 8 - 1e-3).all()
-    logits, _ = network.affordance(observed.fine)
-    assert peaks.logit[0] == logits.max()
+    assert peaks.logit[0] == network.afford(frames, observed).logits.max()
+    assert torch.isfinite(peaks.lift).all()
+
+
+def test_a_network_without_intents_and_trunk_reads_its_map_off_its_cells():
+    network, frames = make_network(intents=False, map_layers=0), make_frames(batch=1, frames=1)
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
+    assert len(peaks.uv) >= 1
+    assert torch.isnan(peaks.lift).all()
+    with pytest.raises(ConfigError, match="no affordance map"):
+        make_network(PAPER).afford(frames, network.observe(frames))
 
 
 @pytest.mark.slow

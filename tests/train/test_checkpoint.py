@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from quest.errors import WeightsError
 from quest.model.network import QuestNetwork
-from quest.train.checkpoint import Progress, check_same_network, load_checkpoint, save_checkpoint
+from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, save_checkpoint
 from tests.tiny import DEFAULT, make_network
 
 PROGRESS = Progress(7, 0.25, 5, 2, "{}", DEFAULT.to_json())
@@ -119,6 +119,6 @@ def test_another_network_is_refused(tmp_path: Path):
     folder = saved(tmp_path / "last")
     with pytest.raises(WeightsError, match="do not fit"):
         load_checkpoint(folder, make_network(width=64), None)
-    check_same_network(PROGRESS, DEFAULT, folder)
+    check_same_run(PROGRESS, DEFAULT, "stage-1", folder)
     with pytest.raises(WeightsError, match="another network"):
-        check_same_network(PROGRESS, replace(DEFAULT, slots=7), folder)
+        check_same_run(PROGRESS, replace(DEFAULT, slots=7), "stage-1", folder)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from quest.errors import ConfigError
@@ -61,3 +63,25 @@ def test_objects_never_change_sides(tmp_path: Path):
 def test_no_take_teaches_and_chooses(tmp_path: Path):
     with pytest.raises(ConfigError, match="twice"):
         opened(tmp_path, (UNLISTED,), (UNLISTED,))
+
+
+def test_mirror_images_teach_beside_the_takes_or_instead(tmp_path: Path):
+    store, chosen = (make_store(tmp_path / n, [seed], frames=4).root for n, seed in (("a", TRAIN), ("b", VALIDATION)))
+    open_mirrored = partial(
+        open_dataset,
+        make_network(),
+        validation_stores=[],
+        mirrored_stores=[store],
+        cache=tmp_path / "cache",
+        windows=WindowConfig(),
+        device=CPU,
+        report=lambda *_: None,
+    )
+    both = open_mirrored(stores=[store, chosen])
+    assert (both.training_takes, both.validation_takes) == (2, 1)
+    alone = open_mirrored(stores=[chosen])
+    assert (alone.training_takes, alone.validation_takes) == (1, 1)
+    mirrored = alone.training.views[0]
+    view = next(v for v in both.training.views if v.name not in {m.name for m in alone.training.views})
+    np.testing.assert_array_equal(mirrored.rgb[:, :, ::-1], view.rgb)
+    np.testing.assert_allclose(mirrored.uv_px[..., 0], 64 - view.uv_px[..., 0], atol=1e-4)

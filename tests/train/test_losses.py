@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
 from quest.train import losses
 
@@ -264,8 +265,9 @@ def test_affordance_loss():
     logits, offset = torch.randn(B, C * C, 4, requires_grad=True), torch.randn(B, C * C, 2, requires_grad=True)
     uv, label = torch.rand(B, K, 2), torch.tensor([[0, 0, 3], [1, 2, 2]])
     visible = torch.tensor([[True, True, False], [True, False, True]])
+    intent, lift = torch.tensor([[0, 1, 0], [0, 0, 1]]), torch.randn(B, C * C, requires_grad=True)
     uv[~visible] = math.nan
-    total, positives, residuals = 0.0, 0, []
+    total, positives, residuals, purposes = 0.0, 0, [], []
     p = logits.detach().sigmoid()
     for b in range(B):
         for i in range(C * C):
@@ -283,25 +285,29 @@ def test_affordance_loss():
         for k in range(K):
             if visible[b, k]:
                 px, py = (uv[b, k] * C).tolist()
-                at = offset[b, int(py) * C + int(px)].tolist()
+                cell = int(py) * C + int(px)
+                at, purpose = offset[b, cell].tolist(), float(lift[b, cell].detach().sigmoid())
                 residuals.append(abs(at[0] - (px % 1 - 0.5)) + abs(at[1] - (py % 1 - 0.5)))
-    loss = losses.affordance_loss(logits, offset, uv, label, visible, cells=C)
-    assert float(loss.detach()) == pytest.approx(total / positives + 0.5 * mean(residuals), rel=1e-4)
-    lives(loss, logits, offset)
+                purposes.append(-math.log(purpose if intent[b, k] else 1 - purpose))
+    found = AffordanceMap(logits[:, None], offset[:, None], lift[:, None])
+    loss = losses.affordance_loss(found, uv[:, None], label, intent, visible[:, None])
+    expected = total / positives + 0.5 * mean(residuals) + 0.3 * mean(purposes)
+    assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
+    lives(loss, logits, offset, lift)
 
 
 def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
-    uv, label = torch.tensor([[[0.3, 0.7]]]), torch.tensor([[2]])
-    none = torch.tensor([[False]])
-    quiet = torch.full((1, C * C, 4), -20.0)
-    offset = torch.zeros(1, C * C, 2)
-    assert losses.affordance_loss(quiet, offset, uv, label, none, cells=C) == pytest.approx(0, abs=1e-6)
-    perfect = quiet.clone()
-    perfect[0, 5 * C + 2, 2] = 20.0
-    offset[0, 5 * C + 2] = torch.tensor([0.4 - 0.5, 0.6 - 0.5])
-    seen = torch.tensor([[True]])
-    assert losses.affordance_loss(perfect, offset, uv, label, seen, cells=C) == pytest.approx(0, abs=1e-4)
-    assert losses.affordance_loss(quiet, offset, uv, label, seen, cells=C) > 1
+    uv, label, intent = torch.tensor([[[[0.3, 0.7]]]]), torch.tensor([[2]]), torch.tensor([[0]])
+    quiet = AffordanceMap(
+        torch.full((1, 1, C * C, 4), -20.0), torch.zeros(1, 1, C * C, 2), torch.full((1, 1, C * C), math.nan)
+    )
+    perfect = AffordanceMap(*(values.clone() for values in (quiet.logits, quiet.offset, quiet.lift)))
+    perfect.logits[0, 0, 5 * C + 2, 2] = 20.0
+    perfect.offset[0, 0, 5 * C + 2] = torch.tensor([0.4 - 0.5, 0.6 - 0.5])
+    none, seen = torch.tensor([[[False]]]), torch.tensor([[[True]]])
+    assert losses.affordance_loss(quiet, uv, label, intent, none) == pytest.approx(0, abs=1e-6)
+    assert losses.affordance_loss(perfect, uv, label, intent, seen) == pytest.approx(0, abs=1e-4)
+    assert losses.affordance_loss(quiet, uv, label, intent, seen) > 1
 
 
 def joints() -> tuple[JointBelief, Tensor, Tensor, Tensor, Tensor]:

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import linear_sum_assignment
 
 from quest.model.config import NetworkConfig
+from quest.model.decoder import RegressionHead
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
-from quest.train.objective import LossTerms, is_right, match_slots, roll_out, stage_one
+from quest.train.objective import LossTerms, is_right, roll_out, stage_one
 from quest.train.settings import LossWeights
 from quest.train.windows import WindowSampler, WindowTruth
 from tests.tiny import DEFAULT, PAPER, make_network
@@ -99,26 +99,6 @@ def test_the_total_weighs_every_term():
     assert [f.name for f in fields(LossTerms)] == [f.name for f in fields(LossWeights)]
 
 
-def test_match_slots():
-    torch.manual_seed(0)
-    uv, target = torch.rand(3, 5, 2), torch.rand(3, 4, 2)
-    wanted = torch.tensor([[True, True, False, True], [False, False, False, False], [False, True, False, False]])
-    target[~wanted] = torch.nan
-    slot, matched = match_slots(uv, target, wanted)
-    assert (matched == wanted).all()
-    for b in range(3):
-        rows = wanted[b].nonzero().flatten()
-        cost = torch.cdist(target[b, rows], uv[b]).numpy()
-        best = linear_sum_assignment(cost)[1]
-        assert slot[b, rows].tolist() == best.tolist()
-        assert len(set(slot[b, rows].tolist())) == len(rows)
-
-
-def test_more_entities_than_slots():
-    _, matched = match_slots(torch.rand(1, 2, 2), torch.rand(1, 4, 2), torch.ones(1, 4, dtype=torch.bool))
-    assert matched.sum() == 2
-
-
 def test_is_right_against_a_plain_loop(samplers):
     _, _, truth = draw(samplers, DEFAULT)
     b, s, k = truth.visible.shape
@@ -162,16 +142,34 @@ def test_a_tiny_set_can_be_learned_by_heart(samplers, config: NetworkConfig):
     assert np.mean(history[-3:]) < 0.7 * history[0]
 
 
-def test_learned_queries_keep_their_slot_in_the_window(samplers):
+def test_learned_queries_keep_their_slot_from_the_anchor_frame_on(samplers):
     network, frames, truth = draw(samplers, PAPER)
     roll = roll_out(network, frames, truth)
+    slots, observed = network.slots(3), network.observe(frames)
     with torch.no_grad():
-        every = network.decode(
-            network.slots(3), network.observe(frames).during(slice(1, None)), frames.during(slice(1, None))
-        )
+        every = network.decode(slots, observed.during(slice(1, None)), frames.during(slice(1, None)))
+        start = network.decode(slots, observed.during(slice(0, 1)), frames.during(slice(0, 1)))
+    assert roll.slots is not None
+    assert (roll.asked == truth.bound).all()
+    for b in range(3):
+        taken = [int(roll.slots.slot[b, k]) for k in truth.bound[b].nonzero().flatten()]
+        assert len(set(taken)) == len(taken)
     for b, k in truth.bound.nonzero().tolist():
-        same = (every.uv[b] - roll.prediction.uv[b, :, k : k + 1]).abs().amax(dim=(0, 2))
-        assert int((same < 1e-6).sum()) == 1
+        slot = int(roll.slots.slot[b, k])
+        torch.testing.assert_close(roll.prediction.uv[b, :, k].detach(), every.uv[b, :, slot])
+        torch.testing.assert_close(roll.slots.prediction.uv[b, 0, slot].detach(), start.uv[b, 0, slot])
+
+
+def test_a_hidden_entity_teaches_no_lifting_of_what_hides_it(samplers):
+    network, frames, truth = draw(samplers, PAPER)
+    assert isinstance(network.head, RegressionHead)
+    for parameter in network.head.mlp[-1].parameters():  # every slot answers the middle, where there is depth
+        torch.nn.init.zeros_(parameter)
+    terms, roll = stage_one(network, frames, truth)
+    assert roll.prediction.point.isfinite().all()
+    hidden = torch.cat((truth.visible[:, :1], torch.zeros_like(truth.visible[:, 1:])), dim=1)
+    assert terms.point > 0
+    assert stage_one(network, frames, replace(truth, visible=hidden))[0].point == 0
 
 
 def test_prepared_views_keep_their_files(tmp_path: Path):

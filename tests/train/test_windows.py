@@ -94,13 +94,14 @@ def test_windows_are_in_order_with_one_stride(views: list[CachedView]):
     s, rng = sampler(views), np.random.default_rng(7)
     strides = set()
     for _ in range(60):
-        view, (anchor, *window) = s._pick(views[0], rng)
+        view, (anchor, *window), following = s._pick(views[0], rng)
         assert view.visible[anchor].any()
         assert all(0 <= t < len(view) for t in window)
         steps = np.diff(window)
         inner = steps[(np.array(window[1:]) > 0) & (np.array(window[1:]) < len(view) - 1)]
         assert len(set(inner)) <= 1 or (steps >= 0).all() or (steps <= 0).all()
         strides |= set(steps.tolist())
+        assert following == -1 or abs(following - window[-1]) <= s.config.max_stride
     assert strides >= {-3, -1, 0, 1, 3}
 
 

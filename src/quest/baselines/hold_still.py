@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
-from jaxtyping import Float32
 
-from quest.baselines.point_queries import check_point_queries, depth_flags, lift_pixels, query_names
-from quest.geometry import project, transform
+from quest.baselines.point_queries import check_point_queries, depth_flags, lift_pixels, project_points, query_names
 from quest.types import Clip, Query, State, Tracks
 
 
@@ -45,7 +42,7 @@ class HoldStill:
         at_first = lift_pixels(clip, uv_px)[first, np.arange(k)]
         point_world = np.where(asked[..., None], at_first, np.nan).astype(np.float32)
         flags = depth_flags(clip, queries, point_world)
-        seen = _project(clip, point_world)
+        seen = project_points(clip, point_world)
         uv_px = np.where(np.isfinite(seen), seen, uv_px)
         return Tracks(
             names=query_names(queries),
@@ -58,10 +55,3 @@ class HoldStill:
             stamp_s=clip.stamp_s,
             frame_flags=flags,
         )
-
-
-def _project(clip: Clip, point_world: Float32[np.ndarray, "T K 3"]) -> Float32[np.ndarray, "T K 2"]:
-    """Pixels of world points in each frame; NaN where there is no point in front of the camera."""
-    cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).to(torch.float64)
-    point_cam = transform(cam_from_world[:, None], torch.from_numpy(point_world).to(torch.float64))
-    return project(point_cam, clip.camera).numpy().astype(np.float32)

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Float32, Int
 
 from quest.errors import ConfigError, InputError
-from quest.geometry import invert, lift, transform
+from quest.geometry import invert, lift, project, transform
 from quest.types import Clip, Query
 
 NO_DEPTH = "clip without depth: world points are missing"
@@ -83,6 +83,13 @@ def lift_pixels(clip: Clip, uv_px: Float32[np.ndarray, "T K 2"], *, window_px: i
     world_from_cam = invert(torch.from_numpy(np.ascontiguousarray(clip.cam_from_world))).to(torch.float64)
     point_world = transform(world_from_cam[:, None], point_cam.to(torch.float64))
     return point_world.numpy().astype(np.float32)
+
+
+def project_points(clip: Clip, point_world: Float32[np.ndarray, "T K 3"]) -> Float32[np.ndarray, "T K 2"]:
+    """Pixels of world points in each frame; NaN where there is no point in front of the camera."""
+    cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).to(torch.float64)
+    point_cam = transform(cam_from_world[:, None], torch.from_numpy(point_world).to(torch.float64))
+    return project(point_cam, clip.camera).numpy().astype(np.float32)
 
 
 def depth_flags(clip: Clip, queries: Sequence[Query], point_world: Float32[np.ndarray, "T K 3"]) -> tuple[str, ...]:

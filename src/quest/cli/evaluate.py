@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -21,26 +21,40 @@ if TYPE_CHECKING:
     from quest.evaluation.runner import Evaluated
     from quest.evaluation.selection import SplitPart
 
-TrackerName = Literal["quest", "quest-ungrounded", "lk", "hold-still"]
+TrackerName = Literal[
+    "quest",
+    "quest-ungrounded",
+    "quest-pixels",
+    "redetect",
+    "redetect-1",
+    "flow-chain",
+    "flow-chain-0.01",
+    "flow-chain-0.02",
+    "flow-chain-0.05",
+    "lk",
+    "hold-still",
+]
 
 
 @dataclass(frozen=True)
 class Eval:
     """Evaluate trackers on takes: a table in the terminal and, with --out, a result file.
 
-    The protocol point always has the tracker hold-still for comparison. Baselines do not have the protocol semantic.
+    The protocol point always has the tracker hold-still for comparison; lk and hold-still do not have the protocol
+    semantic.
 
     Attributes:
         takes: folder of the take store.
         protocol: point (the true pixel is given) and semantic (nothing is given).
-        trackers: what to compare; quest-ungrounded is quest without joints.
-        weights: name or file of the weights of the tracker quest.
+        trackers: what to compare; quest-ungrounded is quest without joints, quest-pixels without depth, redetect and
+            flow-chain its network without queries or anchors (docs/metrics.md).
+        weights: name or file of the weights of all trackers but lk and hold-still.
         split: parts of the object split; training objects are reported only if train is named here.
         level: levels to evaluate; all by default.
         objects: object ids to evaluate; all by default.
         same_objects: keep only objects that have takes of every level, so that levels compare.
         resamples: of the bootstrap over objects.
-        seed: of the bootstrap.
+        seed: of the bootstrap and of the noise of chained flow.
         out: result file (.json); the per-frame records go beside it (.records.parquet).
     """
 
@@ -83,7 +97,7 @@ class Eval:
         chosen = select_takes(
             store.infos(), split=self.split, levels=self.level, objects=self.objects, same_objects=self.same_objects
         )
-        trackers = self._load_trackers()
+        trackers = self._load_trackers(store)
         console = Console(stderr=True)
         found = self._evaluate(store, chosen, trackers, console)
         results = self._results(found, broken, self._run(store, chosen, trackers, start_s))
@@ -108,25 +122,13 @@ class Eval:
             )
         return store, sorted(store.problems())
 
-    def _load_trackers(self) -> list[ClipTracker]:
-        from quest.baselines import HoldStill, LucasKanade
-        from quest.evaluation.memory import remember_frames
+    def _load_trackers(self, store: TakeStore) -> list[ClipTracker]:
+        from quest.evaluation.lineup import line_up, units_of
 
-        names = list(dict.fromkeys(self.trackers))
-        if "point" in self.protocol and "hold-still" not in names:
+        names: list[str] = list(self.trackers)
+        if "point" in self.protocol:
             names.append("hold-still")
-        trackers: dict[str, ClipTracker] = {"lk": LucasKanade(), "hold-still": HoldStill()}
-        if any(name.startswith("quest") for name in names):
-            import quest
-
-            tracker = quest.load(self.weights)
-            remember_frames(tracker.network, capacity=1000)  # all protocols and settings see the same frames
-            trackers["quest"] = tracker
-            if "quest-ungrounded" in names:
-                trackers["quest-ungrounded"] = tracker.with_config(
-                    replace(tracker.config, ground=False), name="quest-ungrounded"
-                )
-        return [trackers[name] for name in names]
+        return list(line_up(names, weights=self.weights, unit_m=units_of([store]), seed=self.seed))
 
     def _evaluate(
         self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], console: Console
@@ -166,7 +168,7 @@ class Eval:
         from quest.data.provenance import code_commit, combined_hash, file_hash, machine, package_versions
         from quest.evaluation.results import Run
 
-        with_quest = "quest" in self.trackers
+        with_quest = any(name not in ("lk", "hold-still") for name in self.trackers)
         known = next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None)
         return Run(
             command=shlex.join(["quest", *sys.argv[1:]]),

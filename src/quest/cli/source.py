@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.console import Console
@@ -31,8 +31,9 @@ class Source:
     """Name of shipped weights or a file."""
     point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An entity by pixel, as FRAME,X,Y or FRAME,X,Y,NAME; give it again for each entity."""
-    label: tyro.conf.UseAppendAction[tuple[Literal["handle", "knob", "rim", "front"], ...]] = ()
-    """The most confident entity of a label; give it again for more."""
+    label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """The most confident entity of a label: handle, knob, rim or front, such as rim:lift or rim:open to say what it is
+    taken hold of for; give it again for more."""
     view: int = 0
     """Which camera of a take."""
     depth: Path | None = None
@@ -90,7 +91,7 @@ class Source:
             clip: in which it was asked; frames beyond its end are refused where its length is known.
 
         Raises:
-            InputError: a point is not written as expected, or its frame is not in the clip.
+            InputError: a point or label is not written as expected, or its frame is not in the clip.
         """
         from quest.errors import InputError
         from quest.types import Clip, Query
@@ -108,7 +109,9 @@ class Source:
             if length is not None and frame >= length:
                 raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {length - 1}, got {frame}")
             queries.append(Query.point(frame, x, y, name=parts[3] if len(parts) > 3 else ""))
-        queries += [Query.semantic(label) for label in self.label]
+        for text in self.label:
+            label, _, intent = text.partition(":")
+            queries.append(Query.semantic(label, intent=intent or None))
         return queries or None
 
     def tracker(self) -> Tracker:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -22,13 +22,41 @@ from rich.progress import (
 from quest.train.settings import LossWeights, TrainingConfig, WindowConfig
 
 if TYPE_CHECKING:
+    import torch
+
+    from quest.model.config import NetworkConfig
     from quest.model.network import QuestNetwork
+    from quest.train.dataset import Dataset
     from quest.train.loop import StepReport
+    from quest.train.stage import Objective
+
+
+@dataclass(frozen=True)
+class NetworkChanges:
+    """What is to be different from the preset, as in an ablation; what is left out stays as it is."""
+
+    window: int | None = None
+    """T, frames that the decoder sees together."""
+    slots: int | None = None
+    """K, most entities that discovery returns, and number of learned queries."""
+    decoder_layers: int | None = None
+    """Layers of the decoder."""
+    points3d: bool | None = None
+    """Whether depth is seen: position codes of lifted 3D points, and details of depth."""
+    intents: bool | None = None
+    """Whether entities to open are told from entities to lift."""
+
+    def apply(self, preset: NetworkConfig) -> NetworkConfig:
+        """The preset with the changes."""
+        return replace(preset, **{name: value for name, value in asdict(self).items() if value is not None})
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network on takes; run again with the same --out to go on."""
+    """Train a network on takes; run again with the same --out to go on.
+
+    On several GPUs of a machine: --training.devices N (or auto). On several machines: torchrun --no-python quest train.
+    """
 
     data: tuple[str, ...]
     """Folders of take stores; the committed object split says which takes teach and which choose."""
@@ -40,8 +68,14 @@ class Train:
     """Start from these trained weights (a name or a file) instead, to fit your own objects."""
     validation: tuple[str, ...] = ()
     """Stores to choose by, for objects that are in no split."""
+    stage: Literal[1, 2] = 1
+    """1 trains everything but the encoder; 2 trains the flow head of --weights and nothing else."""
+    mirrored: tuple[str, ...] = ()
+    """Stores whose training takes teach by their mirror images; name a store in --data too to use both."""
     preset: Literal["default", "paper"] = "default"
     """Network to train, unless --weights is given."""
+    network: NetworkChanges = field(default_factory=NetworkChanges)
+    """What is different from the preset."""
     cache: Path | None = None
     """Folder of the feature cache; default: OUT/cache."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -55,62 +89,106 @@ class Train:
         """Prepare, train, write the file."""
         import torch
 
-        from quest.model.weights import save_network
-        from quest.track.tracker import pick_device
-        from quest.train.checkpoint import load_checkpoint
-        from quest.train.dataset import open_dataset
+        from quest.train.devices import launch
         from quest.train.loop import fit
 
-        console = Console(stderr=True, highlight=False)
+        fabric = launch(self.training)
+        first = fabric.is_global_zero
+        console = Console(stderr=True, highlight=False, quiet=not first)
         torch.manual_seed(self.training.seed)
-        network, settings = self._start()
+        start = self._start()
         self.out.mkdir(parents=True, exist_ok=True)
-        with Progress(*_columns(), console=console) as progress:
-            dataset = open_dataset(
-                network,
-                stores=self.data,
-                validation_stores=self.validation,
-                cache=self.cache or self.out / "cache",
-                windows=self.windows,
-                device=pick_device("auto"),
-                report=_feature_bar(progress),
-            )
+        with Progress(*_columns(), console=console, disable=not first) as progress:
+            # The first process prepares features; then the others find them.
+            with fabric.rank_zero_first():
+                dataset = self._dataset(start.network, fabric.device, progress)
             best = fit(
-                network,
+                self._objective(start.network),
                 dataset.training,
                 dataset.validation,
                 self.training,
-                self.losses,
                 out=self.out,
                 report=_training_bar(progress, self.training.steps),
+                fabric=fabric,
             )
-        network.cpu()
-        load_checkpoint(best, network, None)
-        file = self.out / "weights.safetensors"
-        about = f"quest train --preset {network.config.preset}, {dataset.training_takes} training takes"
-        save_network(file, network, settings=settings, about=about)
-        console.print(f"weights: {escape(str(file))}")
+        if first:
+            file = self._write(best, start, dataset.training_takes)
+            console.print(f"weights: {escape(str(file))}")
         return 0
 
-    def _start(self) -> tuple[QuestNetwork, str]:
-        """The network to train, and the tracker's settings to store with it, as JSON text."""
+    def _start(self) -> _Start:
+        """What to train, and what to store with it."""
         from quest.errors import ConfigError
         from quest.model.config import PRESETS
         from quest.model.network import QuestNetwork
         from quest.model.weights import load_network
         from quest.track.settings import TrackerConfig
         from quest.train.dataset import load_initial_encoder
+        from quest.train.flow import with_flow_head, without_flow_head
 
         if self.weights is not None:
+            if self.network != NetworkChanges():
+                raise ConfigError("train: trained weights have a network of their own; leave --network.* away")
             loaded = load_network(self.weights)
-            return loaded.network.train(), loaded.settings
+            network = loaded.network.train()
+            if self.stage == 2:
+                # Tracking stays as it is, and so does what the monitor was calibrated on.
+                about = f"{loaded.about}; "
+                return _Start(with_flow_head(network), loaded.settings, loaded.monitor, about, loaded.licence)
+            return _Start(without_flow_head(network), loaded.settings, licence=loaded.licence)
+        if self.stage == 2:
+            raise ConfigError("train: stage 2 needs --weights, a network that stage 1 has trained")
         if self.encoder is None:
             raise ConfigError(
                 "train: pass --encoder FILE to start anew, or --weights NAME to start from trained weights"
             )
-        network = QuestNetwork(PRESETS[self.preset])
+        network = QuestNetwork(self.network.apply(PRESETS[self.preset]))
         load_initial_encoder(network, self.encoder)
-        return network, TrackerConfig().to_json()
+        return _Start(network, TrackerConfig().to_json())
+
+    def _dataset(self, network: QuestNetwork, device: torch.device, progress: Progress) -> Dataset:
+        from quest.train.dataset import open_dataset
+
+        return open_dataset(
+            network,
+            stores=self.data,
+            validation_stores=self.validation,
+            mirrored_stores=self.mirrored,
+            cache=self.cache or self.out / "cache",
+            windows=self.windows,
+            device=device,
+            report=_feature_bar(progress),
+        )
+
+    def _objective(self, network: QuestNetwork) -> Objective:
+        from quest.train.flow import StageTwo
+        from quest.train.stage import StageOne
+
+        return StageOne(network, self.losses) if self.stage == 1 else StageTwo(network)
+
+    def _write(self, best: Path, start: _Start, takes: int) -> Path:
+        """The best checkpoint as a file that the tracker loads."""
+        from quest.model.weights import save_network
+        from quest.train.checkpoint import load_checkpoint
+
+        network = start.network.cpu()
+        load_checkpoint(best, network, None)
+        file = self.out / "weights.safetensors"
+        how = f"--stage {self.stage}" if self.stage == 2 else f"--preset {network.config.preset}"
+        about = f"{start.about}quest train {how}, {takes} training takes"
+        save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=start.licence)
+        return file
+
+
+@dataclass(frozen=True)
+class _Start:
+    """What to train; settings of the tracker and calibration of the monitor to store with it, as JSON text; licence."""
+
+    network: QuestNetwork
+    settings: str
+    monitor: str | None = None
+    about: str = ""
+    licence: str = ""
 
 
 def _columns() -> tuple[ProgressColumn, ...]:
@@ -138,10 +216,6 @@ def _training_bar(progress: Progress, steps: int) -> Callable[[StepReport], None
     def stepped(report: StepReport) -> None:
         progress.update(bar, completed=report.step, description=f"loss {report.loss:.3f}, best {report.best:.4f}")
         if report.scores is not None:
-            s = report.scores
-            progress.console.print(
-                f"step {report.step}: median {s.median_px:.2f} px, 3D distance {s.mean_distance:.4f}, "
-                f"right {s.right:.1%}, discovery F1 {s.discovery_f1:.3f} (n = {s.answers})"
-            )
+            progress.console.print(f"step {report.step}: {report.scores}")
 
     return stepped

@@ -110,5 +110,5 @@ def _notes(unscored: list[Unscored], moving: list[str], protocols: Sequence[Prot
         shown = ", ".join(moving[:3]) + (", ..." if len(moving) > 3 else "")
         notes.append(f"{len(moving)} takes already move in frames 0 to 7, against the protocol: {shown}")
     if "semantic" in protocols:
-        notes.append("baselines only have the protocol point; hold-still has no row in semantic")
+        notes.append("lk and hold-still only have the protocol point; they have no row in semantic")
     return tuple(notes)

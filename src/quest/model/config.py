@@ -31,6 +31,9 @@ class NetworkConfig:
         slots: K, most entities that discovery returns (and number of learned queries).
         points3d: whether tokens and queries carry the position code of their 3D point, and details of depth.
         cell_px: side of a cell of the heatmap, pixels of the network's input.
+        intents: whether queries and the affordance map tell entities to open from entities to lift.
+        map_layers: transformer layers of the affordance map's own trunk; 0 reads it off what the decoder looks at.
+        flow: whether there is a flow head, which stage 2 trains.
     """
 
     preset: str = "default"
@@ -45,6 +48,9 @@ class NetworkConfig:
     slots: int = 32
     points3d: bool = True
     cell_px: int = 8
+    intents: bool = False
+    map_layers: int = 0
+    flow: bool = False
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
@@ -86,7 +92,7 @@ class NetworkConfig:
 
 
 PRESETS: dict[str, NetworkConfig] = {
-    "default": NetworkConfig(),
+    "default": NetworkConfig(intents=True, map_layers=4),
     "paper": NetworkConfig(
         preset="paper",
         queries="learned",

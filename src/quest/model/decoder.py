@@ -13,7 +13,7 @@ from quest.model.config import NetworkConfig
 from quest.model.layers import Attention, FeedForward, PointCode
 from quest.model.observation import Observation, Observer, cell_centres, gather_cells
 from quest.model.second_look import SecondLook
-from quest.types import LABELS
+from quest.types import INTENTS, LABELS
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ class Binder(nn.Module):
         self.place = nn.Linear(2, d)
         self.points = PointCode(d) if config.points3d else None
         self.label = nn.Embedding(len(LABELS) + 1, d)
+        self.intent = nn.Embedding(len(INTENTS) + 1, d) if config.intents else None
         self.context = nn.ModuleList(Attention(d, config.heads) for _ in range(2))
         self.mlp = nn.ModuleList(FeedForward(d) for _ in range(2))
 
@@ -86,6 +87,7 @@ class Binder(nn.Module):
         uv: Float[Tensor, "B K 2"],
         point: Float[Tensor, "B K 3"],
         label: Int[Tensor, "B K"],
+        intent: Int[Tensor, "B K"],
     ) -> Float[Tensor, "B K D"]:
         """Content of the anchors of queries that are bound at one frame.
 
@@ -94,11 +96,14 @@ class Binder(nn.Module):
             uv: where, in [0, 1]^2 of the input.
             point: lifted position in the reference frame, NaN if unknown.
             label: index into LABELS, or ``len(LABELS)`` if unknown.
+            intent: index into INTENTS, or ``len(INTENTS)`` if unknown.
         """
         tokens = observed.tokens[:, 0]
         coarse = sample_grid(tokens, uv, self.config.encoder.grid)
         fine = sample_grid(observed.fine[:, 0], uv, self.config.cells)
         x = self.content(torch.cat((coarse, fine), dim=-1)) + self.place(2 * uv - 1) + self.label(label)
+        if self.intent is not None:
+            x = x + self.intent(intent)
         if self.points is not None:
             x = x + self.points(point)
         for attention, mlp in zip(self.context, self.mlp, strict=True):
@@ -108,13 +113,13 @@ class Binder(nn.Module):
 
 
 class DecoderLayer(nn.Module):
-    """Queries look at one frame, at themselves in earlier frames, and at each other."""
+    """Queries look at one frame, at each other, and at themselves in earlier frames."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         d, heads = config.width, config.heads
         self.look = Attention(d, heads)
-        self.remember = Attention(d, heads) if config.queries == "anchored" else None
+        self.remember = Attention(d, heads)
         self.compare = Attention(d, heads)
         self.mlp = FeedForward(d)
 
@@ -129,11 +134,10 @@ class DecoderLayer(nn.Module):
         mask = valid[:, None, :] | torch.eye(k, dtype=torch.bool, device=x.device)
         flat = flat + self.compare(flat, mask=mask.repeat_interleave(t, dim=0))
         x = flat.unflatten(0, (b, t))
-        if self.remember is not None:
-            causal = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
-            per_query = x.transpose(1, 2).flatten(0, 1)
-            per_query = per_query + self.remember(per_query, mask=causal)
-            x = per_query.unflatten(0, (b, k)).transpose(1, 2)
+        causal = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
+        per_query = x.transpose(1, 2).flatten(0, 1)
+        per_query = per_query + self.remember(per_query, mask=causal)
+        x = per_query.unflatten(0, (b, k)).transpose(1, 2)
         return x + self.mlp(x)
 
 
@@ -209,12 +213,16 @@ class HeatmapHead(nn.Module):
 
 
 class RegressionHead(nn.Module):
-    """One shared MLP to coordinates and one confidence, as published."""
+    """One shared MLP to coordinates and one confidence, as published, and what a slot takes its entity for.
+
+    The publication has no labels; the protocol that gives no point asks for them.
+    """
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         d = config.width
         self.mlp = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
+        self.label = nn.Linear(d, len(LABELS))
 
     def forward(self, x: Float[Tensor, "B T K D"], observed: Observation) -> Prediction:
         """Raw coordinates; the point is lifted by the network, which knows the depth."""
@@ -224,25 +232,9 @@ class RegressionHead(nn.Module):
         peak = torch.zeros(out.shape[:-1], dtype=torch.long, device=out.device)
         return Prediction(x, empty, peak, out[..., :2] + 0.5, nowhere, out[..., 2], out[..., 2])
 
-
-class AffordanceHead(nn.Module):
-    """Per cell a score for every label and a sub-cell offset; its peaks seed the slots.
-
-    Reference: Zhou et al., Objects as Points, 2019, section 3.
-    """
-
-    def __init__(self) -> None:
-        super().__init__()
-        f = Observer.fine_width
-        self.mlp = nn.Sequential(nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, len(LABELS) + 2))
-        final = self.mlp[-1]
-        assert isinstance(final, nn.Linear)
-        nn.init.constant_(final.bias[: len(LABELS)], -4.0)
-
-    def forward(self, fine: Float[Tensor, "B T C F"]) -> tuple[Float[Tensor, "B T C L"], Float[Tensor, "B T C 2"]]:
-        """Label logits, and the offset from the cell's centre in cells."""
-        out = self.mlp(fine).float()
-        return out[..., : len(LABELS)], out[..., len(LABELS) :]
+    def labels(self, x: Float[Tensor, "B T K D"]) -> Float[Tensor, "B T K L"]:
+        """Score of every label for the entity that a query answers for in every frame."""
+        return self.label(x).float()
 
 
 def sample_grid(cells: Float[Tensor, "B N D"], uv: Float[Tensor, "B K 2"], side: int) -> Float[Tensor, "B K D"]:

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from quest.model.network import QuestNetwork
-from quest.model.observation import Observation, cell_centres
+from quest.model.observation import FrameBatch, Observation, cell_centres
 from quest.types import LABELS
 
 
@@ -22,30 +22,32 @@ class Peaks:
         uv: coordinates in [0, 1]^2 of the network's input.
         label: index into LABELS.
         logit: score of the affordance map.
+        lift: above zero where the thing is to be lifted by it rather than opened; NaN if the network does not know.
     """
 
     uv: Float[Tensor, "K 2"]
     label: Int[Tensor, " K"]
     logit: Float[Tensor, " K"]
+    lift: Float[Tensor, " K"]
 
 
-def find_peaks(network: QuestNetwork, observed: Observation, *, radius_cells: float) -> Peaks:
+def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float) -> Peaks:
     """Peaks of one frame (B = 1, T = 1), at most as many as the network has slots.
 
     A peak is the best of its 3 x 3 cells and label; of peaks of any label closer than ``radius_cells`` the best stays.
     """
     side, cell = network.config.cells, network.config.cell_px
-    logits, offset = network.affordance(observed.fine)
-    scores = logits[0, 0].T.reshape(len(LABELS), side, side)
+    found = network.afford(frames, observed)
+    scores = found.logits[0, 0].T.reshape(len(LABELS), side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
     flat = torch.where(is_peak, scores, -torch.inf).flatten()
     value, index = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
     label, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
-    uv_px = cell_centres(network.config, device=place.device)[place] + cell * offset[0, 0][place]
+    uv_px = cell_centres(network.config, device=place.device)[place] + cell * found.offset[0, 0][place]
     keep: list[int] = []
     for i in range(len(value)):
         near = bool(keep) and bool(((uv_px[keep] - uv_px[i]).norm(dim=-1) < radius_cells * cell).any())
         if not near and len(keep) < network.config.slots:
             keep.append(i)
     uv = (uv_px / network.config.encoder.image_size).clamp(0, 1)
-    return Peaks(uv[keep], label[keep], value[keep])
+    return Peaks(uv[keep], label[keep], value[keep], found.lift[0, 0][place][keep])

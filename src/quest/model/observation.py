@@ -43,7 +43,7 @@ class FrameBatch:
     center: Float[Tensor, "B 3"]
     scale: Float[Tensor, " B"]
 
-    def during(self, frames: slice) -> FrameBatch:
+    def during(self, frames: slice | list[int]) -> FrameBatch:
         """Some of the frames."""
         return replace(
             self,
@@ -53,6 +53,14 @@ class FrameBatch:
             cell_depth_m=self.cell_depth_m[:, frames],
             ref_from_cam=self.ref_from_cam[:, frames],
         )
+
+    def of(self, batch: slice) -> FrameBatch:
+        """Some of the batch."""
+        return FrameBatch(**{f.name: getattr(self, f.name)[batch] for f in fields(self)})
+
+    def ends(self) -> FrameBatch:
+        """The first and the last frame."""
+        return self.during([0, -1])
 
     def to(self, device: torch.device) -> FrameBatch:
         """The same on a device."""

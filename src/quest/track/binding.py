@@ -14,13 +14,14 @@ from torch import Tensor
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
 from quest.model.decoder import Anchor
-from quest.model.discovery import find_peaks
-from quest.model.network import UNKNOWN_LABEL, QuestNetwork
+from quest.model.discovery import Peaks, find_peaks
+from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.track.following import Following
 from quest.track.grounded import Ground
 from quest.track.settings import TrackerConfig
-from quest.types import LABELS, Query
+from quest.track.slots import Slots, slots_at
+from quest.types import INTENTS, LABELS, Query
 
 PATIENCE = 8
 """Frames in which a label or slot looks for its entity."""
@@ -64,7 +65,7 @@ class Binding:
         numbered: how many numbers have been given.
 
     Raises:
-        InputError: a point query lies outside the image.
+        InputError: a point query lies outside the image, or asks for an intent of a network that knows none.
     """
 
     def __init__(
@@ -84,8 +85,15 @@ class Binding:
         """Ask for one more entity from a frame on; returns the query's number.
 
         Raises:
-            InputError: a point query lies outside the image or in a frame that has passed.
+            InputError: a point query lies outside the image or in a frame that has passed, or a query asks for an
+                intent of a network that knows none.
         """
+        network = self._network.config
+        if query.intent is not None and not (network.intents and network.queries == "anchored"):
+            raise InputError(
+                f"query {query.name or query.kind!r}: these weights cannot tell what to {query.intent}; leave the "
+                "intent away or use weights of the default preset"
+            )
         camera = self._letterbox.source
         if query.uv_px is not None:
             x, y = query.uv_px
@@ -118,7 +126,12 @@ class Binding:
         return found[0]
 
     def bind(
-        self, frame: int, observed: Observation, frames: FrameBatch, following: Sequence[Following]
+        self,
+        frame: int,
+        observed: Observation,
+        frames: FrameBatch,
+        following: Sequence[Following],
+        slots: Slots | None = None,
     ) -> list[Following]:
         """Queries that find their entity in this frame.
 
@@ -127,20 +140,22 @@ class Binding:
             observed: the frame as observed (T = 1).
             frames: the frame.
             following: queries that have found theirs.
+            slots: what learned queries say of the frame, for networks that have them.
         """
-        if self._network.config.queries == "learned":
-            return self._bind_learned(frame, observed, frames)
+        if slots is not None:
+            return self._bind_learned(frame, slots, following)
         found = self._bind_slots(frame, observed, frames, following)
         due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
-            label = torch.tensor([LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due])
-            self._join(observed, frames, self._canvas(due), label)
+            label = [LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due]
+            intent = [INTENTS.index(w.query.intent) if w.query.intent else UNKNOWN_INTENT for w in due]
+            self._join(observed, frames, self._canvas(due), torch.tensor(label), torch.tensor(intent))
             found += [self._begin(w, w.query.name or f"point {w.number}", w.query.label) for w in due]
         return found
 
     def keep(self, rows: Sequence[int]) -> None:
         """Drop the anchors of all rows but these."""
-        if self.anchor is not None and self._network.config.queries != "learned":
+        if self.anchor is not None:
             index = torch.tensor(list(rows), dtype=torch.long, device=self.anchor.content.device)
             self.anchor = self.anchor.select(index) if len(index) else None
 
@@ -163,9 +178,9 @@ class Binding:
         if not (looking or self.discover):
             return []
         config = self._config
-        slots = find_peaks(self._network, observed, radius_cells=config.slot_radius_cells)
+        slots = find_peaks(self._network, frames, observed, radius_cells=config.slot_radius_cells)
         existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
-        label = [LABELS[int(n)] for n in slots.label]
+        label, intent = [LABELS[int(n)] for n in slots.label], _intents(slots)
         free = [i for i in range(len(label)) if not self._taken(slots.uv[i], frames, following)]
         found: list[Following] = []
         chosen: list[int] = []
@@ -173,17 +188,24 @@ class Binding:
             chosen = [i for i in free if existence[i] > config.slot_threshold]
             for i in chosen:
                 number = self._next_number()
-                found.append(self._begin(Waiting(number, Query.slot(), frame), f"{label[i]} {number}", label[i]))
+                lift = " (lift)" if intent[i] == "lift" else ""
+                name = f"{label[i]} {number}{lift}"
+                found.append(self._begin(Waiting(number, Query.slot(), frame), name, label[i]))
             self.discover = False
         for waiting in looking:
             query = waiting.query
-            fits = [i for i in free if i not in chosen and query.label in (None, label[i])]
+            fits = [
+                i
+                for i in free
+                if i not in chosen and query.label in (None, label[i]) and query.intent in (None, intent[i])
+            ]
             if fits and existence[fits[0]] > config.prompt_threshold:
                 chosen.append(fits[0])
                 name = query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]]))
         if chosen:
-            self._join(observed, frames, slots.uv[chosen], slots.label[chosen])
+            told = [UNKNOWN_INTENT if intent[i] is None else INTENTS.index(intent[i]) for i in chosen]
+            self._join(observed, frames, slots.uv[chosen], slots.label[chosen], torch.tensor(told))
         return found
 
     def _taken(self, uv: Tensor, frames: FrameBatch, following: Sequence[Following]) -> bool:
@@ -196,37 +218,43 @@ class Binding:
         gap_px = (frames.from_reference(at[None, None])[0, 0] - uv * size).norm(dim=-1)
         return bool((gap_px < self._config.slot_radius_cells * self._network.config.cell_px).any())
 
-    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor) -> None:
+    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor, intent: Tensor) -> None:
         """Bind more queries; the anchors of the others stay as they are."""
-        device = frames.depth_m.device
-        uv, label = uv[None].to(device), label[None].to(device)
+        uv, label, intent = (values[None].to(frames.depth_m.device) for values in (uv, label, intent))
         uv_px = uv[:, None] * self._network.config.encoder.image_size
         point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
-        valid = torch.ones(label.shape, dtype=torch.bool, device=device)
-        anchor = self._network.bind(observed, uv, point, label, valid)
+        valid = torch.ones_like(label, dtype=torch.bool)
+        anchor = self._network.bind(observed, uv, point, label, valid, intent)
         self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)
 
-    def _bind_learned(self, frame: int, observed: Observation, frames: FrameBatch) -> list[Following]:
-        """Learned queries are there from the start; a point is answered by the slot nearest to it when it is asked."""
-        if self.anchor is None:
-            self.anchor = self._network.slots(1)
+    def _bind_learned(self, frame: int, slots: Slots, following: Sequence[Following]) -> list[Following]:
+        """Queries take slots and keep them; the thresholds are those of anchored queries."""
+        config, existence, label = self._config, slots.existence(self._config), slots.label
         found: list[Following] = []
-        label = [LABELS[int(n)] for n in self._network.learned_label(self.anchor.content)[0].argmax(dim=-1)]
+        free = sorted(range(len(label)), key=lambda i: -existence[i])
+        free = [i for i in free if i not in {f.slot for f in following}]
         if self.discover:
-            for i, name in enumerate(label):
-                found.append(self._begin(Waiting(self._next_number(), Query.slot(), frame), f"slot {i}", name, i))
+            for i in [i for i in free if existence[i] > config.slot_threshold]:
+                number = self._next_number()
+                waiting = Waiting(number, Query.slot(), frame)
+                found.append(self._begin(waiting, f"{label[i]} {number}", label[i], i))
+                free.remove(i)
             self.discover = False
-        for waiting in [w for w in self.waiting if w.query.kind != "point" and w.since <= frame]:
-            used = {f.slot for f in found}
-            fits = [i for i, k in enumerate(label) if i not in used and waiting.query.label in (None, k)]
-            if fits:
-                name = waiting.query.name or f"slot {fits[0]}"
+        for waiting in [w for w in self.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]:
+            fits = [i for i in free if waiting.query.label in (None, label[i])]
+            if fits and existence[fits[0]] > config.prompt_threshold:
+                name = waiting.query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]], fits[0]))
+                free.remove(fits[0])
         due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
-            answered = self._network.decode(self.anchor, observed, frames).uv[0, -1]
-            for waiting, uv in zip(due, self._canvas(due), strict=True):
-                slot = int((answered - uv.to(answered)).norm(dim=-1).argmin())
+            chosen = slots_at(slots, self._canvas(due), [w.query.label for w in due], [*following, *found])
+            for waiting, slot in zip(due, chosen, strict=True):
                 name = waiting.query.name or f"point {waiting.number}"
                 found.append(self._begin(waiting, name, waiting.query.label, slot))
         return found
+
+
+def _intents(slots: Peaks) -> list[str | None]:
+    """What each slot is for; None where the network does not tell."""
+    return [None if lift != lift else INTENTS[int(lift > 0)] for lift in slots.lift.tolist()]

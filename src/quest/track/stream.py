@@ -15,7 +15,7 @@ from torch import Tensor
 from quest.errors import InputError
 from quest.geometry import invert, transform
 from quest.grounding import Joint, LinkGroups
-from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.monitor import SIGNALS, Alarm, Monitor, Signals, Verdict
@@ -29,6 +29,7 @@ from quest.track.measuring import measure, no_signals
 from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
 from quest.track.settings import TrackerConfig
 from quest.track.sharing import SIGMA, share
+from quest.track.slots import Slots, decode_slots, place_slots
 from quest.track.state import StreamState
 from quest.types import Camera, Query, State
 
@@ -178,16 +179,19 @@ class Stream:
                 self._links = LinkGroups(SIGMA)
                 for following in self._following:
                     following.forget_places(self._config)
-            observed = self._network.observe(frames)
-            while len(self._ring) < self._network.config.window - 1:
+            observed, slots = self._network.observe(frames), None
+            learned = self._network.config.queries == "learned"
+            while not learned and len(self._ring) < self._network.config.window - 1:
                 self._ring.append(observed)
             self._ring.append(observed)
-            for found in self._binding.bind(self._t, observed, frames, self._following):
+            if learned:
+                slots = decode_slots(self._network, Observation.stack(list(self._ring)), frames)
+            for found in self._binding.bind(self._t, observed, frames, self._following, slots):
                 self._following.append(found)
                 if self._monitor is not None:
                     self._monitor.watch(found.query, found.name)
             self._stamp_s, self._has_depth = stamp_s, bool((frames.depth_m > 0).any())
-            self._answer(frames)
+            self._answer(frames, slots)
         self._t += 1
         return self._state()
 
@@ -242,16 +246,15 @@ class Stream:
         if self._monitor is not None:
             self._monitor.restore(part(arrays, "monitor."))
 
-    def _answer(self, frames: FrameBatch) -> None:
+    def _answer(self, frames: FrameBatch, slots: Slots | None) -> None:
         """Place every query in the newest frame, judge it, and keep the answers."""
         following = self._following
-        if not following or self._binding.anchor is None:
+        if slots is not None and following:
+            self._keep(*place_slots(slots, following, has_depth=self._has_depth), no_signals(len(following)))
+        if slots is not None or not following or self._binding.anchor is None:
             return
         window = Observation.stack(list(self._ring))
         newest = window.during(slice(-1, None))
-        if not isinstance(self._network.head, HeatmapHead):
-            self._answer_learned(newest, frames)
-            return
         prediction = match(
             self._network, self._config, self._binding.anchor, window, following, elapsed=self._intake.elapsed
         )
@@ -275,16 +278,6 @@ class Stream:
         at = torch.from_numpy(point).to(frames.depth_m)
         uv = frames.from_reference(at[None, None])[0, 0] / self._network.config.encoder.image_size
         return torch.where(torch.isfinite(uv).all(dim=-1, keepdim=True), uv, prediction.uv[0, 0])
-
-    def _answer_learned(self, newest: Observation, frames: FrameBatch) -> None:
-        assert self._binding.anchor is not None
-        prediction = self._network.decode(self._binding.anchor, newest, frames)
-        index = torch.tensor([f.slot for f in self._following])
-        seen, right = (as_array(p[0, 0, index].sigmoid()) for p in (prediction.visible_logit, prediction.right_logit))
-        point, unknown = as_array(prediction.point[0, 0, index]), np.full(len(index), np.nan)
-        no = np.zeros(len(index), bool)
-        placed = Placed(point, point, seen, no, no, unknown, unknown)
-        self._keep(prediction.uv[0, 0, index], placed, right, no_signals(len(index)))
 
     def _keep(
         self,

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
+from jaxtyping import UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import nn
@@ -18,6 +20,8 @@ from torch import nn
 from quest.errors import WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
+
+_GENERATOR = "generator."
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,7 @@ class Progress:
         stale: validations since the best.
         rng: state of the generator that draws windows, as JSON.
         network: the network's configuration, as JSON.
+        objective: name of what is learned.
     """
 
     step: int
@@ -39,16 +44,32 @@ class Progress:
     stale: int
     rng: str
     network: str
+    objective: str = "stage-1"
 
 
-def save_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Optimizer, progress: Progress) -> None:
-    """Write or replace a checkpoint."""
+def save_checkpoint(
+    folder: Path,
+    network: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    progress: Progress,
+    generators: Mapping[str, UInt8[torch.Tensor, "R N"]] | None = None,
+) -> None:
+    """Write or replace a checkpoint.
+
+    Args:
+        folder: where.
+        network: what is trained; its encoder is left out.
+        optimizer: its state is needed to go on.
+        progress: where the run stands.
+        generators: states of torch's generators, by the kind of device, one row per process.
+    """
     partial = folder.with_name(f".partial-{folder.name}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     save_file(_trained(network), partial / "weights.safetensors")
     state = optimizer.state_dict()
     tensors = {f"{i}.{key}": value.contiguous() for i, entry in state["state"].items() for key, value in entry.items()}
+    tensors |= {f"{_GENERATOR}{kind}": rows.contiguous() for kind, rows in (generators or {}).items()}
     save_file(tensors, partial / "optimizer.safetensors")
     groups = [{k: v for k, v in group.items() if k != "params"} for group in state["param_groups"]]
     (partial / "progress.json").write_text(json.dumps({"progress": asdict(progress), "groups": groups}))
@@ -67,9 +88,7 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
     Raises:
         WeightsError: the checkpoint is missing, torn, or of another network.
     """
-    if not folder.exists():
-        # The process was killed between the two renames of a replacement.
-        folder = folder.with_name(f".old-{folder.name}")
+    folder = _present(folder)
     try:
         text = json.loads((folder / "progress.json").read_text())
         progress, saved_groups = Progress(**text["progress"]), text["groups"]
@@ -80,8 +99,20 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
     own = {name: tensor for name, tensor in network.state_dict().items() if name.startswith("encoder.")}
     load_exactly(network, {**own, **weights}, what=f"checkpoint {folder}")
     if optimizer is not None:
-        _load_optimizer(optimizer, tensors, saved_groups, folder)
+        state = {name: tensor for name, tensor in tensors.items() if not name.startswith(_GENERATOR)}
+        _load_optimizer(optimizer, state, saved_groups, folder)
     return progress
+
+
+def load_generators(folder: Path) -> dict[str, UInt8[torch.Tensor, "R N"]]:
+    """States of torch's generators in a checkpoint that can be read, by the kind of device, one row per process."""
+    tensors = load_file(_present(folder) / "optimizer.safetensors")
+    return {name.removeprefix(_GENERATOR): rows for name, rows in tensors.items() if name.startswith(_GENERATOR)}
+
+
+def _present(folder: Path) -> Path:
+    """The checkpoint, or the one before if the process was killed between the two renames of a replacement."""
+    return folder if folder.exists() else folder.with_name(f".old-{folder.name}")
 
 
 def _load_optimizer(
@@ -101,13 +132,18 @@ def _load_optimizer(
         ) from error
 
 
-def check_same_network(progress: Progress, config: NetworkConfig, folder: Path) -> None:
-    """Refuse to resume with another network.
+def check_same_run(progress: Progress, config: NetworkConfig, objective: str, folder: Path) -> None:
+    """Refuse to resume with another network or another objective.
 
     Raises:
-        WeightsError: the checkpoint's configuration differs.
+        WeightsError: the checkpoint's differs.
     """
-    if progress.network != config.to_json():
+    if progress.objective != objective:
+        raise WeightsError(
+            f"{folder}: expected a run of {objective}, got one of {progress.objective}; use another --out"
+        )
+    # Parsed, so that a run that was started before a setting came up goes on with its default.
+    if NetworkConfig.from_json(progress.network) != config:
         raise WeightsError(f"{folder}: this run was started with another network; use another --out or its settings")
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from quest.data.mirror import mirrored_name
 from quest.data.split import split_of
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, WeightsError
@@ -34,11 +35,27 @@ class Dataset:
     validation_takes: int
 
 
+@dataclass(frozen=True)
+class _Wanted:
+    """A take that teaches or chooses."""
+
+    store: TakeStore
+    name: str
+    part: str
+    mirrored: bool
+
+    @property
+    def entry(self) -> str:
+        """Its name in the feature cache."""
+        return mirrored_name(self.name) if self.mirrored else self.name
+
+
 def open_dataset(
     network: QuestNetwork,
     *,
     stores: Sequence[str | Path],
     validation_stores: Sequence[str | Path],
+    mirrored_stores: Sequence[str | Path] = (),
     cache: Path,
     windows: WindowConfig,
     device: torch.device,
@@ -54,6 +71,8 @@ def open_dataset(
         network: network with the encoder that the features come from.
         stores: take stores, folders or URLs.
         validation_stores: take stores to choose by; may be empty.
+        mirrored_stores: take stores whose training takes teach by their mirror images; one that is in ``stores`` too
+            teaches both ways.
         cache: folder of the feature cache.
         windows: how windows are drawn.
         device: where the encoder runs.
@@ -62,36 +81,37 @@ def open_dataset(
     Raises:
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
     """
-    wanted: list[tuple[TakeStore, str, str]] = []
-    for folders, role in ((stores, "train"), (validation_stores, "validation")):
+    wanted: list[_Wanted] = []
+    for folders, role, mirrored in (
+        (stores, "train", False),
+        (mirrored_stores, "train", True),
+        (validation_stores, "validation", False),
+    ):
         for folder in folders:
             store = TakeStore(folder)
             for name, info in store.infos().items():
                 part = _part(info)
                 if part == "unlisted":
                     part = role if validation_stores else "none"
-                if part == role or (not validation_stores and part == "validation"):
-                    wanted.append((store, name, part))
-    takes = {part: [(s, n) for s, n, p in wanted if p == part] for part in ("train", "validation")}
+                if part == role or (not validation_stores and not mirrored and part == "validation"):
+                    wanted.append(_Wanted(store, name, part, mirrored))
+    takes = {part: [w.entry for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
         if not found:
             raise ConfigError(
                 f"training: no {part} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
                 "name a store of your own objects with --validation"
             )
-    names = [name for _, name, _ in wanted]
+    names = [w.entry for w in wanted]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ConfigError(f"training: takes {', '.join(twice[:3])} are wanted twice; name each take in one store only")
     features = FeatureCache(cache, network.config, network.encoder)
     frames = 0
-    for done, (store, name, _) in enumerate(wanted, start=1):
-        frames += sum(features.build(store, [name], device=device))
+    for done, w in enumerate(wanted, start=1):
+        frames += sum(features.build(w.store, [w.name], device=device, mirrored=w.mirrored))
         report(done, len(wanted), frames)
-    samplers = {
-        part: WindowSampler(features.views([n for _, n in found]), network.config, windows)
-        for part, found in takes.items()
-    }
+    samplers = {part: WindowSampler(features.views(found), network.config, windows) for part, found in takes.items()}
     return Dataset(samplers["train"], samplers["validation"], len(takes["train"]), len(takes["validation"]))
 
 

@@ -19,6 +19,7 @@ import torch
 from jaxtyping import Bool, Float16, Float32, Int8, UInt8, UInt16
 
 from quest.data.letterbox import Letterbox
+from quest.data.mirror import mirror_take, mirrored_name
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
@@ -118,25 +119,28 @@ class FeatureCache:
             digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
         self.encoder_hash = digest.hexdigest()
 
-    def build(self, store: TakeStore, names: list[str], *, device: torch.device) -> Iterator[int]:
+    def build(
+        self, store: TakeStore, names: list[str], *, device: torch.device, mirrored: bool = False
+    ) -> Iterator[int]:
         """Make what is missing or stale; yields the number of frames of every view that is ready.
 
         Args:
             store: where the takes are.
             names: takes to prepare.
             device: where the encoder runs.
+            mirrored: prepare their mirror images instead (see :func:`quest.data.mirror.mirror_take`).
         """
         self.root.mkdir(parents=True, exist_ok=True)
         self.encoder.to(device)
         for name in names:
             stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
-            entries = self._entries(name)
+            entries = self._entries(mirrored_name(name) if mirrored else name)
             if self._complete(entries, stamp):
                 yield from (len(np.load(e / "visible.npy", mmap_mode="r")) for e in entries)
                 continue
             for entry in entries:
                 shutil.rmtree(entry)  # also of views that the take no longer has
-            take = store.read(name)
+            take = mirror_take(store.read(name)) if mirrored else store.read(name)
             for view in range(len(take.views)):
                 yield self._write(take, view, stamp, device)
 

@@ -1,25 +1,36 @@
-"""The one training loop."""
+"""The one training loop, for every stage, on one device or many."""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from contextlib import closing, nullcontext
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from quest.errors import ConfigError
 from quest.extras import require
 from quest.model.network import QuestNetwork
-from quest.train.checkpoint import Progress, check_same_network, load_checkpoint, save_checkpoint
-from quest.train.objective import LossTerms, stage_one
-from quest.train.settings import LossWeights, TrainingConfig
-from quest.train.validation import WindowScores, validate
+from quest.train.batches import Batch, MicroBatch, stream_batches
+from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
+from quest.train.devices import deterministic_algorithms, divide, generator_states, launch, restore_generators
+from quest.train.pooling import Tally, pooling
+from quest.train.settings import TrainingConfig
+from quest.train.stage import Objective, Scores
 from quest.train.windows import WindowSampler
+
+if TYPE_CHECKING:
+    from lightning_fabric import Fabric
+    from torch.utils.tensorboard import SummaryWriter
+
+_LOG_EVERY = 10
 
 
 @dataclass(frozen=True)
@@ -35,78 +46,187 @@ class StepReport:
 
     step: int
     loss: float
-    scores: WindowScores | None
+    scores: Scores | None
     best: float
 
 
 def fit(
-    network: QuestNetwork,
+    objective: Objective,
     training: WindowSampler,
     validation: WindowSampler,
     config: TrainingConfig,
-    weights: LossWeights,
     *,
     out: Path,
     report: Callable[[StepReport], None],
+    fabric: Fabric | None = None,
 ) -> Path:
-    """Train everything but the encoder; goes on from ``out/last`` where there is one.
+    """Train what the objective trains; goes on from ``out/last`` where there is one, as if never interrupted.
+
+    Only the first process writes and reports.
 
     Args:
-        network: the network; its encoder stays as it is.
+        objective: what is learned, of which network.
         training: windows to learn from.
         validation: windows of other objects; the same ones are drawn at every validation.
         config: how to train.
-        weights: weight of every loss.
         out: folder for the checkpoints ``last`` and ``best`` and the curves.
         report: called after every step.
+        fabric: devices and processes that :func:`~quest.train.devices.launch` started; started here if None.
 
     Returns:
         Folder of the best checkpoint.
 
     Raises:
-        WeightsError: ``out`` holds a run of another network.
+        ConfigError: the loss became infinite, or the batch cannot be divided among the processes.
+        WeightsError: ``out`` holds a run of another network or stage.
         MissingExtraError: Lightning Fabric or TensorBoard is not installed.
     """
-    fabric = require("lightning_fabric").Fabric(accelerator="auto", devices=1, precision=config.precision)
     require("tensorboard")
-    from torch.utils.tensorboard import SummaryWriter
-
-    network.encoder.requires_grad_(False)
-    optimizer = torch.optim.AdamW(network.trainable(), lr=config.learning_rate, weight_decay=config.weight_decay)
-    rng = np.random.default_rng(config.seed)
-    progress = _resume(network, optimizer, rng, config, out)
-    _, optimizer = fabric.setup(network, optimizer)
-    writer = SummaryWriter(str(out / "curves"), purge_step=progress.step)
-    while progress.step < config.steps and progress.stale < config.patience:
-        step = progress.step + 1
-        for group in optimizer.param_groups:
-            group["lr"] = config.learning_rate * _schedule(step, config)
-        frames, truth = training.draw(rng)
-        frames, truth = frames.to(fabric.device), truth.to(fabric.device)
-        with fabric.autocast():
-            terms, _ = stage_one(network, frames, truth)
-        loss = terms.total(weights)
-        if not torch.isfinite(loss):
-            raise ConfigError(f"training: the loss became {loss.item()} at step {step}; lower the learning rate")
-        optimizer.zero_grad(set_to_none=True)
-        fabric.backward(loss)
-        torch.nn.utils.clip_grad_norm_(network.trainable(), config.clip_norm)
-        optimizer.step()
-        _log(writer, terms, loss, step)
-        scores = None
-        progress = _advance(progress, step=step, rng=rng)
-        if step % config.validate_every == 0 or step == config.steps:
-            with fabric.autocast():
-                scores = validate(network, validation, batches=config.validation_batches, device=fabric.device)
-            for f in fields(scores):
-                writer.add_scalar(f"validation/{f.name}", getattr(scores, f.name), step)
-            progress = _judge(progress, scores)
-            save_checkpoint(out / "last", network, optimizer, progress)
-            if progress.best_step == step:
-                save_checkpoint(out / "best", network, optimizer, progress)
-        report(StepReport(step, float(loss.detach()), scores, progress.best))
-    writer.close()
+    fabric = launch(config) if fabric is None else fabric
+    parts = divide(
+        training.config.batch, rank=fabric.global_rank, processes=fabric.world_size, accumulate=config.accumulate
+    )
+    with deterministic_algorithms(config.deterministic):
+        learner = _Learner(objective, config, fabric)
+        rng = np.random.default_rng(config.seed)
+        progress = learner.resume(rng, out)
+        writer = _writer(fabric, out, progress)
+        with writer or nullcontext(), closing(stream_batches(training, rng, parts)) as batches:
+            while progress.step < config.steps and progress.stale < config.patience:
+                step = progress.step + 1
+                batch = next(batches)
+                values = learner.learn(batch, step)
+                progress = replace(progress, step=step, rng=batch.rng)
+                scores = None
+                if step % config.validate_every == 0 or step == config.steps:
+                    scores = learner.validate(validation)
+                    progress = _judge(progress, scores)
+                if scores is not None or step % config.checkpoint_every == 0:
+                    learner.save(progress, out)
+                if writer is not None:
+                    _log(writer, objective, values, scores, step)
+                if fabric.is_global_zero:
+                    report(StepReport(step, float(values[0]), scores, progress.best))
+    fabric.barrier()
     return out / "best"
+
+
+class _Step(nn.Module):
+    """The objective as a module, which is what DDP wraps."""
+
+    def __init__(self, objective: Objective) -> None:
+        super().__init__()
+        self.network = objective.network
+        self._losses = objective.losses
+
+    def forward(self, batch: MicroBatch) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
+        return self._losses(batch.frames, batch.truth)
+
+
+class _Learner:
+    """One process's share of every step."""
+
+    def __init__(self, objective: Objective, config: TrainingConfig, fabric: Fabric) -> None:
+        self.objective = objective
+        self.config = config
+        self.fabric = fabric
+        self.trained = objective.trained()
+        chosen = {id(p) for p in self.trained}
+        for parameter in objective.network.parameters():
+            parameter.requires_grad_(id(parameter) in chosen)
+        self.optimizer = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+
+    def resume(self, rng: np.random.Generator, out: Path) -> Progress:
+        """Take up the last checkpoint of a folder, or start, and hand everything to the devices."""
+        network = self.objective.network
+        if self.config.compile:
+            _compile(network)
+        # First to the devices: the optimiser's state is loaded to where the parameters are.
+        self.module, self.fabric_optimizer = self.fabric.setup(_Step(self.objective), self.optimizer)
+        start = Progress(0, math.inf, 0, 0, _state(rng), network.config.to_json(), self.objective.name)
+        generators = {}
+        if (out / "last").exists() or (out / ".old-last").exists():
+            start = load_checkpoint(out / "last", network, self.optimizer)
+            check_same_run(start, network.config, self.objective.name, out)
+            rng.bit_generator.state = json.loads(start.rng)
+            generators = load_generators(out / "last")
+        network.train()
+        self.fabric.barrier()  # nobody writes before everybody has read
+        restore_generators(self.fabric, generators)
+        return start
+
+    def learn(self, batch: Batch, step: int) -> Float[Tensor, " N"]:
+        """One step of the optimiser.
+
+        Returns:
+            The loss of the whole batch, then its terms, on the CPU.
+        """
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.config.learning_rate * _schedule(step, self.config)
+        self.optimizer.zero_grad(set_to_none=True)
+        fabric, parts = self.fabric, [part.to(self.fabric.device) for part in batch.parts]
+        tally = self._count(parts) if len(parts) > 1 else None
+        pool = tally.read if tally else self._sum if fabric.world_size > 1 else None
+        shares = []
+        for i, part in enumerate(parts):
+            if tally:
+                tally.restart()
+            with fabric.no_backward_sync(self.module, enabled=i + 1 < len(parts)):
+                with pooling(pool):
+                    loss, terms = self.module(part)
+                # DDP takes the mean over processes, but these are parts of a sum.
+                fabric.backward(loss * fabric.world_size)
+            shares.append(torch.cat((loss.detach()[None], terms)).float())
+        values = torch.stack(shares).sum(0)
+        values = (self._sum(values) if fabric.world_size > 1 else values).cpu()
+        if not torch.isfinite(values[0]):
+            raise ConfigError(f"training: the loss became {values[0].item()} at step {step}; lower the learning rate")
+        torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip_norm)
+        self.fabric_optimizer.step()
+        return values
+
+    def validate(self, sampler: WindowSampler) -> Scores:
+        """Scores, which the first process finds out and tells the others."""
+        scores = None
+        if self.fabric.is_global_zero:
+            batches = self.config.validation_batches
+            with self.fabric.autocast():
+                scores = self.objective.validate(sampler, batches=batches, device=self.fabric.device)
+        scores = self.fabric.broadcast(scores)
+        assert scores is not None
+        return scores
+
+    def save(self, progress: Progress, out: Path) -> None:
+        """Write the last checkpoint, and the best one where it is."""
+        generators = generator_states(self.fabric)
+        if self.fabric.is_global_zero:
+            # The best first: a run that is killed in between does this step again, and finds the same.
+            for name in ("best", "last") if progress.best_step == progress.step else ("last",):
+                save_checkpoint(out / name, self.objective.network, self.optimizer, progress, generators)
+        self.fabric.barrier()
+
+    def _count(self, parts: list[MicroBatch]) -> Tally:
+        """How much counts in all micro-batches of all processes."""
+        tally = Tally()
+        with torch.no_grad(), self.fabric.autocast(), pooling(tally.add):
+            for part in parts:
+                tally.restart()
+                self.objective.losses(part.frames, part.truth)
+        if self.fabric.world_size > 1:
+            tally.sum_over(self._sum)
+        return tally
+
+    def _sum(self, value: Tensor) -> Tensor:
+        total = self.fabric.all_reduce(value.clone(), reduce_op="sum")
+        assert isinstance(total, Tensor)
+        return total
+
+
+def _compile(network: QuestNetwork) -> None:
+    """Compile what does most of the work; binding and heads branch too much to gain by it."""
+    network.observer.compile()
+    for layer in network.layers:
+        layer.compile()
 
 
 def _schedule(step: int, config: TrainingConfig) -> float:
@@ -116,44 +236,31 @@ def _schedule(step: int, config: TrainingConfig) -> float:
     return 0.05 + 0.95 * 0.5 * (1 + math.cos(math.pi * done))
 
 
-def _resume(
-    network: QuestNetwork,
-    optimizer: torch.optim.Optimizer,
-    rng: np.random.Generator,
-    config: TrainingConfig,
-    out: Path,
-) -> Progress:
-    if not (out / "last").exists() and not (out / ".old-last").exists():
-        return Progress(0, math.inf, 0, 0, _rng_state(rng), network.config.to_json())
-    progress = load_checkpoint(out / "last", network, optimizer)
-    check_same_network(progress, network.config, out)
-    rng.bit_generator.state = json.loads(progress.rng)
-    return progress
-
-
-def _advance(progress: Progress, *, step: int, rng: np.random.Generator) -> Progress:
-    return Progress(step, progress.best, progress.best_step, progress.stale, _rng_state(rng), progress.network)
-
-
-def _judge(progress: Progress, scores: WindowScores) -> Progress:
+def _judge(progress: Progress, scores: Scores) -> Progress:
     # The first score is the best so far whatever it is, so that there always is a best checkpoint.
-    better = scores.mean_distance < progress.best or progress.best_step == 0
-    return Progress(
-        progress.step,
-        scores.mean_distance if better else progress.best,
-        progress.step if better else progress.best_step,
-        0 if better else progress.stale + 1,
-        progress.rng,
-        progress.network,
-    )
+    if scores.score < progress.best or progress.best_step == 0:
+        return replace(progress, best=scores.score, best_step=progress.step, stale=0)
+    return replace(progress, stale=progress.stale + 1)
 
 
-def _rng_state(rng: np.random.Generator) -> str:
+def _state(rng: np.random.Generator) -> str:
     return json.dumps(rng.bit_generator.state)
 
 
-def _log(writer, terms: LossTerms, loss: Tensor, step: int) -> None:
-    if step % 10 == 0 or step == 1:
-        writer.add_scalar("loss/total", float(loss.detach()), step)
-        for f in fields(terms):
-            writer.add_scalar(f"loss/{f.name}", float(getattr(terms, f.name).detach()), step)
+def _writer(fabric: Fabric, out: Path, progress: Progress) -> SummaryWriter | None:
+    if not fabric.is_global_zero:
+        return None
+    from torch.utils.tensorboard import SummaryWriter
+
+    return SummaryWriter(str(out / "curves"), purge_step=progress.step)
+
+
+def _log(
+    writer: SummaryWriter, objective: Objective, values: Float[Tensor, " N"], scores: Scores | None, step: int
+) -> None:
+    if step % _LOG_EVERY == 0 or step == 1:
+        for name, value in zip(("total", *objective.terms), values.tolist(), strict=True):
+            writer.add_scalar(f"loss/{name}", value, step)
+    if scores is not None:
+        for name, value in asdict(scores).items():  # type: ignore[call-overload]
+            writer.add_scalar(f"validation/{name}", value, step)

@@ -6,19 +6,27 @@ and 3D offset, discovery its focal loss. Each is a function of predictions and t
 
 from __future__ import annotations
 
+import math
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
-from quest.types import LABELS
+from quest.train.pooling import pooled
+from quest.types import INTENTS, LABELS
 
 
 def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
-    """Mean of the values where the mask is, weighted by it; 0 where it is nowhere. NaN outside it does no harm."""
+    """Mean of the values where the mask is, weighted by it; 0 where it is nowhere. NaN outside it does no harm.
+
+    In a part of a batch, the part's share of the mean over the whole (see :mod:`quest.train.pooling`).
+    """
     weight = mask.to(value.dtype)
-    return (torch.where(weight > 0, value, torch.zeros_like(value)) * weight).sum() / weight.sum().clamp(min=1e-6)
+    total = (torch.where(weight > 0, value, torch.zeros_like(value)) * weight).sum()
+    return total / pooled(weight.sum()).clamp(min=1e-6)
 
 
 def coordinate_loss(
@@ -89,11 +97,9 @@ def confidence_loss(
     return masked_mean(F.binary_cross_entropy_with_logits(logit, target.to(logit.dtype), reduction="none"), mask)
 
 
-def label_loss(
-    logits: Float[Tensor, "B K L"], label: Int[Tensor, "B K"], mask: Bool[Tensor, "B K"]
-) -> Float[Tensor, ""]:
+def label_loss(logits: Float[Tensor, "*B L"], label: Int[Tensor, "*B"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
     """Cross-entropy of the label of learned queries, which take the place of a dense map."""
-    return masked_mean(F.cross_entropy(logits.transpose(1, 2), label, reduction="none"), mask)
+    return masked_mean(-logits.log_softmax(-1).gather(-1, label.unsqueeze(-1)).squeeze(-1), mask)
 
 
 def bound_loss(uv: Float[Tensor, "*B 2"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
@@ -186,18 +192,24 @@ def joint_loss(
 
 
 def affordance_loss(
-    logits: Float[Tensor, "B C L"],
-    offset: Float[Tensor, "B C 2"],
-    uv: Float[Tensor, "B K 2"],
+    found: AffordanceMap,
+    uv: Float[Tensor, "B T K 2"],
     label: Int[Tensor, "B K"],
-    visible: Bool[Tensor, "B K"],
-    *,
-    cells: int,
+    intent: Int[Tensor, "B K"],
+    visible: Bool[Tensor, "B T K"],
 ) -> Float[Tensor, ""]:
-    """Focal loss of the dense map and L1 of its offsets at the true cells.
+    """Focal loss of the dense map; at the true cells, L1 of its offsets and cross-entropy of what they are taken for.
 
     Reference: Law and Deng, CornerNet, ECCV 2018, equations 1 and 2.
+
+    Args:
+        found: the map.
+        uv: true coordinates in [0, 1]^2.
+        label: index into LABELS.
+        intent: index into INTENTS.
+        visible: which entities are seen.
     """
+    cells = math.isqrt(found.logits.shape[2])
     place = torch.where(visible.unsqueeze(-1), uv, torch.full_like(uv, 0.5)).clamp(0, 1 - 1e-6) * cells
     centre = torch.arange(cells, device=uv.device) + 0.5
     x = torch.exp(-0.5 * ((centre - place[..., :1]) / 0.8) ** 2)
@@ -205,13 +217,16 @@ def affordance_loss(
     blob = (y.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2) * visible.unsqueeze(-1)
     cell = place[..., 1].long() * cells + place[..., 0].long()
     blob = blob.scatter(-1, cell.unsqueeze(-1), visible.to(blob.dtype).unsqueeze(-1))
-    one_hot = F.one_hot(label, len(LABELS)).to(blob.dtype)
-    target = (blob.unsqueeze(-1) * one_hot.unsqueeze(-2)).amax(dim=1)
-    log_p, log_not = F.logsigmoid(logits), F.logsigmoid(-logits)
-    p = logits.sigmoid()
+    one_hot = F.one_hot(label, len(LABELS)).to(blob.dtype)[:, None, :, None]
+    target = (blob.unsqueeze(-1) * one_hot).amax(dim=2)
+    log_p, log_not = F.logsigmoid(found.logits), F.logsigmoid(-found.logits)
+    p = found.logits.sigmoid()
     positive = target >= 1
     loss = torch.where(positive, -((1 - p) ** 2) * log_p, -((1 - target) ** 4) * p**2 * log_not)
-    focal = loss.sum() / positive.sum().clamp(min=1)
-    at_cell = offset.gather(1, cell.unsqueeze(-1).expand(-1, -1, 2))
+    focal = loss.sum() / pooled(positive.sum().to(loss.dtype)).clamp(min=1)
+    at_cell = found.offset.gather(2, cell.unsqueeze(-1).expand(-1, -1, -1, 2))
     residual = (at_cell - (place - place.floor() - 0.5)).abs().sum(-1)
-    return focal + 0.5 * masked_mean(residual, visible)
+    lift = found.lift.gather(2, cell)
+    wanted = (intent == INTENTS.index("lift"))[:, None].expand_as(visible)
+    taken = confidence_loss(lift, wanted, visible & torch.isfinite(lift))
+    return focal + 0.5 * masked_mean(residual, visible) + 0.3 * taken

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from quest.errors import ConfigError
@@ -16,12 +14,19 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.train import losses
 from quest.train.settings import LossWeights
+from quest.train.slots import (
+    CONFIDENT_PX,
+    SlotAnswers,
+    answer_slots,
+    at_window,
+    slot_confidence_loss,
+    slot_label_loss,
+)
 from quest.train.windows import WindowTruth
 
 _OCCLUDED_WEIGHT = 0.3
 _MOVED_WEIGHT = 3.0
 _RIGHT_DISTANCE = 0.1
-_CONFIDENT_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -59,8 +64,8 @@ class Rollout:
         mask: which answers count at all.
         observed: the window's observation.
         anchor_observed: the anchor frame's observation.
-        anchor: what the queries are bound to.
-        content: the query that answers for each entity, before the decoder.
+        asked: entities that have a query: those that it was bound to, or that a slot was matched to.
+        slots: answers of all slots, for networks that have them.
     """
 
     prediction: Prediction
@@ -71,96 +76,81 @@ class Rollout:
     mask: Bool[Tensor, "B T K"]
     observed: Observation
     anchor_observed: Observation
-    anchor: Anchor
-    content: Float[Tensor, "B K D"]
+    asked: Bool[Tensor, "B K"]
+    slots: SlotAnswers | None = None
 
 
-def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> Rollout:
-    """Bind at the anchor frame (index 0) and answer the frames after it."""
+def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth, *, whole: bool = False) -> Rollout:
+    """Bind at the anchor frame (index 0) and answer the frames after it.
+
+    Args:
+        network: the network.
+        frames: the anchor frame and the window.
+        truth: what is true of them.
+        whole: whether learned slots are matched by the window too, to learn from it
+            (see :func:`~quest.train.slots.answer_slots`).
+    """
     observed = network.observe(frames)
     first, window = observed.during(slice(0, 1)), observed.during(slice(1, None))
-    rest = frames.during(slice(1, None))
     uv, point, visible = truth.uv[:, 1:], truth.point[:, 1:], truth.visible[:, 1:]
+    slots = None
     if network.config.queries == "anchored":
-        anchor = bind_at(network, frames, first, truth.anchor_uv, truth.told, truth.bound)
-        prediction = network.decode(anchor, window, rest)
+        anchor = bind_at(network, frames, first, truth)
+        prediction = network.decode(anchor, window, frames.during(slice(1, None)))
         taught = _teach(network, anchor, prediction, window, uv)
-        mask = truth.bound[:, None].expand_as(visible)
-        content = anchor.content
+        asked = truth.bound
     else:
-        anchor = network.slots(len(truth.unit))
-        prediction = taught = network.decode(anchor, window, rest)
-        with torch.no_grad():
-            at_first = network.decode(anchor, first, frames.during(slice(0, 1)))
-            slot, matched = match_slots(at_first.uv[:, 0], truth.uv[:, 0], truth.bound)
-        prediction = taught = _select(prediction, slot)
-        content = anchor.content.gather(1, slot.unsqueeze(-1).expand(-1, -1, anchor.content.shape[-1]))
-        mask = matched[:, None].expand_as(visible)
-    inside = ((uv >= 0) & (uv <= 1)).all(-1)
-    return Rollout(prediction, taught, uv, point, visible, mask & inside, window, first, anchor, content)
+        slots = answer_slots(network, observed, frames, truth, whole=whole)
+        prediction = taught = at_window(slots.of_entities)
+        asked = slots.matched
+    mask = asked[:, None].expand_as(visible) & ((uv >= 0) & (uv <= 1)).all(-1)
+    return Rollout(prediction, taught, uv, point, visible, mask, window, first, asked, slots)
 
 
-def bind_at(
-    network: QuestNetwork,
-    frames: FrameBatch,
-    observed: Observation,
-    uv: Float[Tensor, "B K 2"],
-    label: Int[Tensor, "B K"],
-    valid: Bool[Tensor, "B K"],
-) -> Anchor:
-    """Bind queries to pixels of the first frame of a batch; their 3D points come from its depth."""
+def bind_at(network: QuestNetwork, frames: FrameBatch, observed: Observation, truth: WindowTruth) -> Anchor:
+    """Bind queries to their pixels of the first frame of a batch; their 3D points come from its depth."""
     first = frames.during(slice(0, 1))
-    uv_px = uv.unsqueeze(1) * network.config.encoder.image_size
+    uv_px = truth.anchor_uv.unsqueeze(1) * network.config.encoder.image_size
     point = first.to_reference(uv_px, first.near_depth_at(uv_px)).squeeze(1)
-    return network.bind(observed, uv, point, label, valid)
-
-
-def match_slots(
-    uv: Float[Tensor, "B Q 2"], target: Float[Tensor, "B K 2"], wanted: Bool[Tensor, "B K"]
-) -> tuple[Int[Tensor, "B K"], Bool[Tensor, "B K"]]:
-    """Assign slots to entities by least total distance (Hungarian), once for all frames of a window."""
-    slot = torch.zeros(wanted.shape, dtype=torch.long)
-    matched = torch.zeros_like(wanted)
-    distance = torch.cdist(target.nan_to_num(), uv).cpu().numpy()
-    for b in range(len(wanted)):
-        entities = np.flatnonzero(wanted[b].cpu().numpy())
-        rows, columns = linear_sum_assignment(distance[b, entities])
-        slot[b, entities[rows]] = torch.from_numpy(columns)
-        matched[b, entities[rows]] = True
-    return slot.to(uv.device), matched
+    return network.bind(observed, truth.anchor_uv, point, truth.told, truth.bound, truth.told_intent)
 
 
 def stage_one(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> tuple[LossTerms, Rollout]:
     """All losses of stage 1 on one batch."""
-    roll = roll_out(network, frames, truth)
+    roll = roll_out(network, frames, truth, whole=True)
     free, taught, mask = roll.prediction, roll.taught, roll.mask
     seen = mask & roll.visible
     # An entity that moved is what a tracker is asked about; most of them stand still in most windows.
     importance = torch.where(has_moved(truth), _MOVED_WEIGHT, 1.0)
     weight = mask * importance * torch.where(roll.visible, 1.0, _OCCLUDED_WEIGHT)
     zero = free.uv.sum() * 0
-    px = (free.uv - roll.truth_uv).norm(dim=-1) * network.config.encoder.image_size
-    heat = affordance = joint = zero
-    if network.config.head == "heatmap":
+    heat = joint = zero
+    if roll.slots is None:
+        px = (free.uv - roll.truth_uv).norm(dim=-1) * network.config.encoder.image_size
         heat = losses.heatmap_loss(free.logits, roll.truth_uv, weight, cells=network.config.cells)
         conf = losses.confidence_loss(free.visible_logit, roll.visible, mask)
         right, judged = is_right(free.point.detach(), truth, px.detach())
         conf = conf + losses.confidence_loss(free.right_logit, right, mask & judged)
-        affordance = _affordance(network, roll, truth)
+        affordance = _affordance(network, frames, roll, truth)
         belief = network.joint(free.embedding)
         joint = losses.joint_loss(belief, roll.truth_point, truth.axis, truth.revolute, mask)
+        aff = losses.coordinate_loss(taught.uv, roll.truth_uv, seen * importance)
+        lifted = mask
     else:
-        conf = losses.confidence_loss(free.right_logit, roll.visible & (px.detach() < _CONFIDENT_PX), mask)
-        affordance = losses.label_loss(network.learned_label(roll.content), truth.label, mask[:, 0])
+        conf = slot_confidence_loss(roll.slots, truth, image_size=network.config.encoder.image_size)
+        affordance = slot_label_loss(roll.slots, truth)
+        aff = _slot_coordinates(roll.slots, truth, importance)
+        # A hidden entity's pixel shows what hides it: no coordinates lift it to where the entity is.
+        lifted = seen
     terms = LossTerms(
-        aff=losses.coordinate_loss(taught.uv, roll.truth_uv, seen * importance),
+        aff=aff,
         heat=heat,
-        point=losses.point_loss(taught.point, roll.truth_point, truth.unit, mask * importance),
+        point=losses.point_loss(taught.point, roll.truth_point, truth.unit, lifted * importance),
         vel=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=1),
         acc=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=2),
         conf=conf,
         bound=losses.bound_loss(taught.uv, mask),
-        feat=losses.feature_loss(free.embedding, truth.bound) if free.embedding.shape[1] > 1 else zero,
+        feat=losses.feature_loss(free.embedding, roll.asked) if free.embedding.shape[1] > 1 else zero,
         geo=losses.manifold_loss(taught.point, truth.point[:, 0], truth.axis, truth.revolute, truth.unit, seen),
         map=affordance,
         joint=joint,
@@ -190,19 +180,15 @@ def is_right(
     distance = distance.unflatten(0, point.shape[:2]) / truth.unit[:, None, None, None]
     own = distance.diagonal(dim1=-2, dim2=-1)
     right = (own <= distance.amin(-1) + 1e-6) & (own < _RIGHT_DISTANCE)
-    return torch.where(lifted, right, px < _CONFIDENT_PX), torch.isfinite(px)
+    return torch.where(lifted, right, px < CONFIDENT_PX), torch.isfinite(px)
 
 
-def _affordance(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> Tensor:
+def _affordance(network: QuestNetwork, frames: FrameBatch, roll: Rollout, truth: WindowTruth) -> Tensor:
     # The anchor frame and the newest one: the frames between differ little from them.
-    fine = torch.cat((roll.anchor_observed.fine, roll.observed.fine[:, -1:]), dim=1)
-    logits, offset = network.affordance(fine)
-    uv = truth.uv[:, [0, -1]].flatten(0, 1)
-    visible = (truth.visible & truth.exists[:, None])[:, [0, -1]].flatten(0, 1)
-    label = truth.label.repeat_interleave(2, dim=0)
-    return losses.affordance_loss(
-        logits.flatten(0, 1), offset.flatten(0, 1), uv, label, visible, cells=network.config.cells
-    )
+    ends = frames.ends()
+    found = network.afford(ends, Observation.stack([roll.anchor_observed, roll.observed.during(slice(-1, None))]))
+    visible = (truth.visible & truth.exists[:, None])[:, [0, -1]]
+    return losses.affordance_loss(found, truth.uv[:, [0, -1]], truth.label, truth.intent, visible)
 
 
 def _teach(
@@ -219,13 +205,9 @@ def _teach(
     return replace(prediction, peak=cell, uv=taught_uv, point=point)
 
 
-def _select(prediction: Prediction, slot: Int[Tensor, "B K"]) -> Prediction:
-    """The answers of one slot per entity."""
-    values = {}
-    for f in fields(prediction):
-        value = getattr(prediction, f.name)
-        index = slot[:, None].expand(-1, value.shape[1], -1)
-        if value.ndim == 4:
-            index = index.unsqueeze(-1).expand(-1, -1, -1, value.shape[-1])
-        values[f.name] = value.gather(2, index)
-    return Prediction(**values)
+def _slot_coordinates(slots: SlotAnswers, truth: WindowTruth, importance: Float[Tensor, "B T K"]) -> Tensor:
+    """L_aff of matched slots, at the anchor frame too: there the tracker chooses them."""
+    inside = ((truth.uv >= 0) & (truth.uv <= 1)).all(-1)
+    seen = slots.matched[:, None] & truth.visible & inside
+    weight = seen * torch.cat((torch.ones_like(importance[:, :1]), importance), dim=1)
+    return losses.coordinate_loss(slots.of_entities.uv, truth.uv, weight)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from quest.errors import ConfigError
 
@@ -17,11 +18,19 @@ class TrainingConfig:
         weight_decay: of AdamW.
         warmup_steps: steps of the warm-up.
         clip_norm: largest norm of the gradient.
-        validate_every: steps between validations and checkpoints.
+        validate_every: steps between validations.
+        checkpoint_every: steps between checkpoints, beside those at validations: what a kill can cost.
         validation_batches: fixed batches per validation.
         patience: validations without a better score before training stops.
         seed: seed of windows and of initial weights.
         precision: ``bf16-mixed`` or ``32-true``.
+        accelerator: ``cpu``, ``cuda``, ``mps``, or ``auto`` for the best there is.
+        devices: processes on this machine, each with a device of its own, or ``auto`` for as many as there are GPUs.
+            Under ``torchrun`` its number of processes counts, and this does not.
+        accumulate: micro-batches that a step is divided into, to save memory. The batch stays what it is, and so does
+            the gradient; that takes an additional forward pass.
+        compile: whether to compile the parts of the network that do most of the work, which takes minutes at first.
+        deterministic: whether to use deterministic algorithms alone, with a warning where there is none.
     """
 
     steps: int = 3000
@@ -30,14 +39,24 @@ class TrainingConfig:
     warmup_steps: int = 100
     clip_norm: float = 1.0
     validate_every: int = 250
+    checkpoint_every: int = 100
     validation_batches: int = 12
     patience: int = 15
     seed: int = 0
     precision: str = "bf16-mixed"
+    accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    devices: int | Literal["auto"] = 1
+    accumulate: int = 1
+    compile: bool = False
+    deterministic: bool = False
 
     def __post_init__(self) -> None:
-        if min(self.steps, self.validate_every, self.validation_batches, self.patience) < 1:
-            raise ConfigError("training: steps, validate_every, validation_batches and patience must be at least 1")
+        counts = ("steps", "validate_every", "checkpoint_every", "validation_batches", "patience", "accumulate")
+        for name in counts:
+            if getattr(self, name) < 1:
+                raise ConfigError(f"training: expected {name} to be at least 1, got {getattr(self, name)}")
+        if self.devices != "auto" and self.devices < 1:
+            raise ConfigError(f"training: expected at least one device or 'auto', got devices {self.devices}")
         if self.precision not in ("bf16-mixed", "32-true"):
             raise ConfigError(f"training: expected precision bf16-mixed or 32-true, got {self.precision!r}")
 
@@ -47,7 +66,7 @@ class WindowConfig:
     """How windows are drawn and disturbed.
 
     Attributes:
-        batch: windows per step.
+        batch: windows per step, of all processes and micro-batches together.
         max_stride: largest step between the frames of a window, in stored frames (0 repeats one frame).
         first_frame_share: how often the anchor is the first frame in which most entities are seen.
         point_jitter_px: standard deviation of the anchor's pixel, pixels of the input.

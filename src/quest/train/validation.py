@@ -11,7 +11,7 @@ from torch import Tensor
 
 from quest.model.discovery import find_peaks
 from quest.model.network import QuestNetwork
-from quest.model.observation import Observation
+from quest.model.observation import FrameBatch, Observation
 from quest.train.objective import Rollout, is_right, roll_out
 from quest.train.windows import WindowSampler, WindowTruth
 
@@ -37,6 +37,17 @@ class WindowScores:
     discovery_f1: float
     answers: int
 
+    @property
+    def score(self) -> float:
+        """What a checkpoint is chosen by; less is better."""
+        return self.mean_distance
+
+    def __str__(self) -> str:
+        return (
+            f"median {self.median_px:.2f} px, 3D distance {self.mean_distance:.4f}, right {self.right:.1%}, "
+            f"discovery F1 {self.discovery_f1:.3f} (n = {self.answers})"
+        )
+
 
 def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, device: torch.device) -> WindowScores:
     """Scores on the same windows at every call; the network is left in training mode."""
@@ -52,7 +63,7 @@ def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, dev
             for values, value in zip((px, distance, right), _score(network, roll, truth), strict=True):
                 values.append(value)
             if network.config.queries == "anchored":
-                found += _discovery(network, roll.anchor_observed, truth)
+                found += _discovery(network, frames.during(slice(0, 1)), roll.anchor_observed, truth)
     network.train()
     all_px, hits, proposed, present = torch.cat(px), *found
     return WindowScores(
@@ -72,11 +83,12 @@ def _score(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> tuple[Te
     return px[roll.mask & roll.visible], distance[roll.mask].float(), right[roll.mask].float()
 
 
-def _discovery(network: QuestNetwork, observed: Observation, truth: WindowTruth) -> np.ndarray:
+def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation, truth: WindowTruth) -> np.ndarray:
     """Slots that hit an entity of their label, slots, and visible entities at the anchor frames."""
     counts = np.zeros(3)
     for b in range(len(truth.unit)):
-        peaks = find_peaks(network, observed.of(slice(b, b + 1)), radius_cells=1.5)
+        one = slice(b, b + 1)
+        peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=1.5)
         keep = peaks.logit > _PEAK_LOGIT
         present = truth.visible[b, 0] & truth.exists[b]
         gap = torch.cdist(truth.uv[b, 0, present], peaks.uv[keep]) * network.config.encoder.image_size

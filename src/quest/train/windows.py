@@ -12,9 +12,10 @@ from torch import Tensor
 from quest.errors import ConfigError
 from quest.geometry import transform
 from quest.model.config import NetworkConfig
-from quest.model.network import UNKNOWN_LABEL
+from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL
 from quest.model.observation import FrameBatch, reference_of
 from quest.train.feature_cache import CachedView
+from quest.train.plan import Disturbance, Pick, WindowPlan, draw_disturbance
 from quest.train.settings import WindowConfig
 
 _DEPTH_UNIT_M = 1e-4
@@ -32,10 +33,14 @@ class WindowTruth:
         bound: entities that were seen at the anchor frame and are asked for.
         label: index into LABELS.
         told: label given to the query, or ``len(LABELS)``.
+        intent: index into INTENTS.
+        told_intent: intent given to the query, or ``len(INTENTS)``.
         anchor_uv: disturbed coordinates of the anchor.
         unit: reference units per normalised unit.
         revolute: whether the entity's joint turns.
         axis: origin and direction of its joint's axis in the reference frame.
+        flow: true displacement from the newest frame to the one after it, reference units. After it means at the
+            window's own step between frames, back in time for a window that runs backwards; NaN where the view ends.
     """
 
     uv: Float[Tensor, "B S K 2"]
@@ -45,10 +50,13 @@ class WindowTruth:
     bound: Bool[Tensor, "B K"]
     label: Int[Tensor, "B K"]
     told: Int[Tensor, "B K"]
+    intent: Int[Tensor, "B K"]
+    told_intent: Int[Tensor, "B K"]
     anchor_uv: Float[Tensor, "B K 2"]
     unit: Float[Tensor, " B"]
     revolute: Bool[Tensor, "B K"]
     axis: Float[Tensor, "B K 6"]
+    flow: Float[Tensor, "B K 3"]
 
     def to(self, device: torch.device) -> WindowTruth:
         """The same on a device."""
@@ -76,14 +84,26 @@ class WindowSampler:
 
     def draw(self, rng: np.random.Generator, *, disturb: bool = True) -> tuple[FrameBatch, WindowTruth]:
         """One batch; ``disturb`` turns on everything that is random beyond the choice of frames."""
-        picks = []
-        for _ in range(self.config.batch):
-            picks.append(self._pick(self.views[rng.integers(len(self.views))], rng))
-        frames = self._frames(picks, rng, disturb=disturb)
-        return frames, self._truth(picks, frames, rng, disturb=disturb)
+        return self.load(self.plan(rng, disturb=disturb))
 
-    def _pick(self, view: CachedView, rng: np.random.Generator) -> tuple[CachedView, list[int]]:
-        """A view and its frames: the anchor first, then the window, oldest first."""
+    def plan(self, rng: np.random.Generator, *, disturb: bool = True) -> WindowPlan:
+        """The windows of one batch, all that is random about them drawn and nothing large read."""
+        chosen = [self._pick(self.views[rng.integers(len(self.views))], rng) for _ in range(self.config.batch)]
+        entities = max(view.visible.shape[1] for view, *_ in chosen)
+        return WindowPlan(
+            picks=tuple((view, frames) for view, frames, _ in chosen),
+            following=tuple(following for *_, following in chosen),
+            entities=entities,
+            disturbance=draw_disturbance(rng, self.config, windows=len(chosen), entities=entities) if disturb else None,
+        )
+
+    def load(self, plan: WindowPlan) -> tuple[FrameBatch, WindowTruth]:
+        """Read what a plan, or a part of one, names."""
+        frames = self._frames(plan.picks, plan.disturbance)
+        return frames, self._truth(plan, frames)
+
+    def _pick(self, view: CachedView, rng: np.random.Generator) -> tuple[CachedView, list[int], int]:
+        """A view, its frames (the anchor first, then the window, oldest first), and the frame after them or -1."""
         seen = np.flatnonzero(view.visible.any(axis=1))
         if rng.random() < self.config.first_frame_share:
             anchor = int(view.visible[: max(1, len(view) // 4)].sum(axis=1).argmax())
@@ -93,23 +113,21 @@ class WindowSampler:
         stride = int(rng.integers(0, self.config.max_stride + 1)) * (1 if rng.random() < 0.5 else -1)
         end = int(rng.integers(len(view)))
         window = [int(np.clip(end - stride * back, 0, len(view) - 1)) for back in range(self.network.window)]
-        return view, [anchor, *reversed(window)]
+        following = end + stride if 0 <= end + stride < len(view) else -1
+        return view, [anchor, *reversed(window)], following
 
-    def _frames(
-        self, picks: list[tuple[CachedView, list[int]]], rng: np.random.Generator, *, disturb: bool
-    ) -> FrameBatch:
+    def _frames(self, picks: tuple[Pick, ...], disturbance: Disturbance | None) -> FrameBatch:
         def gather(name: str) -> np.ndarray:
             return np.stack([getattr(view, name)[index] for view, index in picks])
 
         depth_m = torch.from_numpy(gather("depth").astype(np.float32) * _DEPTH_UNIT_M)
         cell_depth_m = torch.from_numpy(gather("cell_depth_m"))
         rgb = gather("rgb")
-        if disturb:
-            dropped = torch.from_numpy(rng.random(len(picks)) < self.config.depth_drop_share)
+        if disturbance is not None:
+            dropped = torch.from_numpy(disturbance.no_depth)
             depth_m[dropped] = 0
             cell_depth_m[dropped] = 0
-            gain = 1 + self.config.colour_jitter * rng.uniform(-1, 1, (len(picks), 1, 1, 1, 3)).astype(np.float32)
-            rgb = np.clip(rgb * gain, 0, 255).astype(np.uint8)
+            rgb = np.clip(rgb * disturbance.gain, 0, 255).astype(np.uint8)
         cameras = [view.camera for view, _ in picks]
         intrinsics = torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float32)
         poses = torch.from_numpy(gather("cam_from_world")).double()
@@ -125,10 +143,8 @@ class WindowSampler:
             scale=scale,
         )
 
-    def _truth(
-        self, picks: list[tuple[CachedView, list[int]]], frames: FrameBatch, rng: np.random.Generator, *, disturb: bool
-    ) -> WindowTruth:
-        b, most = len(picks), max(view.visible.shape[1] for view, _ in picks)
+    def _truth(self, plan: WindowPlan, frames: FrameBatch) -> WindowTruth:
+        picks, b, most, disturbance = plan.picks, len(plan), plan.entities, plan.disturbance
 
         def padded(name: str, *, per_frame: bool) -> Tensor:
             sample = [getattr(v, name)[i] if per_frame else getattr(v, name) for v, i in picks]
@@ -145,20 +161,22 @@ class WindowSampler:
         bound = visible[:, 0] & exists
         uv = padded("uv_px", per_frame=True) / self.network.encoder.image_size
         label = padded("label", per_frame=False).long()
-        told = label.clone()
+        axis = padded("axis_world", per_frame=False)
+        # What no joint moves is there to be lifted by (see quest.types.Entity.intent).
+        intent = (axis[..., 3:] == 0).all(-1).long()
+        told, told_intent = label.clone(), intent.clone()
         anchor_uv = uv[:, 0].clone()
-        if disturb:
-            told[torch.from_numpy(rng.random((b, most)) >= self.config.label_share)] = UNKNOWN_LABEL
-            noise = rng.normal(0, self.config.point_jitter_px, (b, most, 2)) / self.network.encoder.image_size
-            anchor_uv += torch.from_numpy(noise.astype(np.float32))
-            dropped = torch.from_numpy(rng.random((b, most)) < self.config.query_drop_share)
+        if disturbance is not None:
+            told[torch.from_numpy(disturbance.untold)] = UNKNOWN_LABEL
+            told_intent[torch.from_numpy(disturbance.untold_intent)] = UNKNOWN_INTENT
+            anchor_uv += torch.from_numpy(disturbance.noise_px) / self.network.encoder.image_size
+            dropped = torch.from_numpy(disturbance.left_out)
             bound &= ~dropped | ((bound & ~dropped).sum(dim=1, keepdim=True) == 0)
         else:
-            told[:] = UNKNOWN_LABEL
+            told[:], told_intent[:] = UNKNOWN_LABEL, UNKNOWN_INTENT
         ref_from_world = torch.from_numpy(np.stack([v.cam_from_world[i[0]] for v, i in picks])).float()
         center, scale = frames.center[:, None], frames.scale[:, None, None]
         point = transform(ref_from_world[:, None, None], padded("point_world", per_frame=True))
-        axis = padded("axis_world", per_frame=False)
         origin = (transform(ref_from_world[:, None], axis[..., :3]) - center) / scale
         direction = (ref_from_world[:, None, :3, :3] @ axis[..., 3:, None]).squeeze(-1)
         half = torch.tensor([view.half_diagonal_m for view, _ in picks], dtype=torch.float32)
@@ -170,8 +188,20 @@ class WindowSampler:
             bound=bound,
             label=label,
             told=told,
+            intent=intent,
+            told_intent=told_intent,
             anchor_uv=anchor_uv.nan_to_num(0.5).clamp(0, 1),
             unit=half / frames.scale,
             revolute=padded("revolute", per_frame=False),
             axis=torch.cat((origin, direction), dim=-1),
+            flow=_flow(plan, ref_from_world) / scale,
         )
+
+
+def _flow(plan: WindowPlan, ref_from_world: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B K 3"]:
+    """Displacements to the frame after each window in the reference axes, metres."""
+    out = np.full((len(plan), plan.entities, 3), np.nan, np.float32)
+    for i, ((view, frames), following) in enumerate(zip(plan.picks, plan.following, strict=True)):
+        if following >= 0:
+            out[i, : view.visible.shape[1]] = view.point_world[following] - view.point_world[frames[-1]]
+    return (ref_from_world[:, None, :3, :3] @ torch.from_numpy(out).unsqueeze(-1)).squeeze(-1)

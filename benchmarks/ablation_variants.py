@@ -1,0 +1,162 @@
+"""The variants of the ablation tables (see ablations.py, and docs/metrics.md for what every row is)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+from quest.model.config import PRESETS, NetworkConfig
+from quest.train.settings import LossWeights, WindowConfig
+
+TableName = Literal["parts", "window", "slots", "losses", "design"]
+PresetName = Literal["default", "paper"]
+TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "design")
+
+LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
+"""Losses that know of 3D; the others are of pixels, features and confidences."""
+
+NOISES = ("0.01", "0.02", "0.05")
+"""Of chained flow, normalised units."""
+
+LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
+    "default": ("aff", "heat", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map", "joint"),
+    "paper": ("aff", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map"),
+}
+"""Losses that are not zero by construction."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What is trained.
+
+    Attributes:
+        name: of its folder.
+        network: what it is.
+        losses: their weights.
+        windows: how windows are drawn.
+        flow: whether stage 2 trains a flow head.
+        no_depth: whether it never sees depth.
+    """
+
+    name: str
+    network: NetworkConfig
+    losses: LossWeights = field(default_factory=LossWeights)
+    windows: WindowConfig = field(default_factory=WindowConfig)
+    flow: bool = False
+    no_depth: bool = False
+
+
+@dataclass(frozen=True)
+class Line:
+    """One row of a table.
+
+    Attributes:
+        label: what the table calls it.
+        variant: whose weights.
+        tracker: which tracker uses them (:mod:`quest.evaluation.lineup`).
+        reference: label of the row that it is compared with; None for the reference.
+    """
+
+    label: str
+    variant: Variant
+    tracker: str = "quest"
+    reference: str | None = None
+
+
+def full(preset: PresetName) -> Variant:
+    """A preset as it is; the default one has a flow head, which changes nothing else."""
+    return Variant(preset, PRESETS[preset], flow=preset == "default")
+
+
+def changed(preset: PresetName, name: str, **fields: object) -> Variant:
+    """A preset with other fields of the network."""
+    network = replace(PRESETS[preset], **fields)  # type: ignore[arg-type]
+    return full(preset) if network == PRESETS[preset] else Variant(f"{preset}-{name}", network)
+
+
+def without(preset: PresetName, name: str, *losses: str) -> Variant:
+    """A preset trained without some losses."""
+    return Variant(f"{preset}-no-{name}", PRESETS[preset], losses=replace(LossWeights(), **dict.fromkeys(losses, 0.0)))
+
+
+def no_3d(preset: PresetName) -> Variant:
+    """Pixel losses alone, and no depth in the network: neither as position codes nor as a window's input."""
+    flat = without(preset, "3d", *LOSSES_3D)
+    network = replace(flat.network, points3d=False)
+    return replace(flat, network=network, windows=WindowConfig(depth_drop_share=1.0), no_depth=True)
+
+
+def lines_of(table: TableName, presets: Sequence[PresetName]) -> tuple[Line, ...]:
+    """The rows of a table; every variant of a preset is compared with that preset as it is."""
+    rows = {"parts": _parts, "window": _window, "slots": _slots, "losses": _losses, "design": _design}[table]
+    return tuple(line for preset in presets for line in rows(preset))
+
+
+def _parts(preset: PresetName) -> list[Line]:
+    whole, own = full(preset), f"{preset}: full"
+    lines = [Line(own, whole)]
+    if preset == "default":
+        lines += [
+            Line(f"{preset}: no queries", whole, "redetect", own),
+            Line(f"{preset}: no queries, detected in every frame", whole, "redetect-1", own),
+        ]
+    # The paper's network never sees depth and is not grounded: shown depth or not, only the lifting would differ.
+    blind = "quest-pixels" if preset == "default" else "quest"
+    lines.append(Line(f"{preset}: no 3D", no_3d(preset), blind, own))
+    lines.append(Line(f"{preset}: no smoothness", without(preset, "smoothness", "vel", "acc"), "quest", own))
+    if preset == "default":
+        lines += [
+            Line(f"{preset}: no grounding", whole, "quest-ungrounded", own),
+            Line(f"{preset}: flow chain", whole, "flow-chain", own),
+            *(
+                Line(f"{preset}: flow chain, noise {n}", whole, f"flow-chain-{n}", own)
+                for n in ("0.01", "0.02", "0.05")
+            ),
+        ]
+    return [*lines, Line(f"{preset}: hold still", whole, "hold-still", own)]
+
+
+def _window(preset: PresetName) -> list[Line]:
+    own = f"{preset}: T = {PRESETS[preset].window}"
+    labels = {t: f"{preset}: T = {t}" for t in (2, 4, 8)}
+    return [
+        Line(label, changed(preset, f"window-{t}", window=t), reference=None if label == own else own)
+        for t, label in labels.items()
+    ]
+
+
+def _slots(preset: PresetName) -> list[Line]:
+    """Learned queries are as many as there are slots; anchored ones are as many as are asked for."""
+    if preset != "paper":
+        return []
+    own = f"{preset}: K = {PRESETS[preset].slots}"
+    labels = {k: f"{preset}: K = {k}" for k in (4, 8, 16)}
+    return [
+        Line(label, changed(preset, f"slots-{k}", slots=k), reference=None if label == own else own)
+        for k, label in labels.items()
+    ]
+
+
+def _losses(preset: PresetName) -> list[Line]:
+    own = f"{preset}: all losses"
+    lines = [Line(own, full(preset))]
+    return lines + [
+        Line(f"{preset}: no {loss}", without(preset, loss, loss), "quest", own) for loss in LOSSES_OF[preset]
+    ]
+
+
+def _design(preset: PresetName) -> list[Line]:
+    own = f"{preset}: as it is"
+    lines = [Line(own, full(preset))]
+    if preset == "default":
+        codes = changed(preset, "no-points3d", points3d=False)
+        learned = changed(preset, "learned", queries="learned", head="regression")
+        lines += [
+            Line(f"{preset}: no 3D position codes", codes, "quest", own),
+            Line(f"{preset}: learned queries, coordinates by regression", learned, "quest", own),
+        ]
+    else:
+        codes = changed(preset, "points3d", points3d=True)
+        lines.append(Line(f"{preset}: 3D position codes", codes, "quest", own))
+    return lines

@@ -1,0 +1,377 @@
+"""Rebuild the ablation tables: train every variant for a fixed number of steps on frozen features, evaluate, tabulate.
+
+    python benchmarks/ablations.py --train TAKES/train --validation TAKES/validation --test TAKES/test \
+        --work runs/ablations --encoder encoder.safetensors --steps 1500
+
+One run is one variant and seed: a folder with checkpoints and `weights.safetensors`. One feature cache serves all
+variants, in training and in evaluation. Everything goes on where it stopped: interrupt the script and run it again with
+the same arguments, or run it for some --tables, --presets or --seeds first and for all of them in the end.
+
+Every run has the same steps, windows and schedule, and its last weights count: nothing is chosen by validation but the
+threshold of discovery, for every run alike (best F1 in the first frames of the validation takes). docs/metrics.md says
+what every row is. The tables rest on the runs that are there: rows and seeds that were not asked for are left out.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import torch
+import tyro
+from ablation_variants import TABLES, Line, PresetName, TableName, Variant, lines_of
+from rich.console import Console
+
+from quest.baselines import HoldStill
+from quest.data.provenance import code_commit, combined_hash, file_hash
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.evaluation.ablation import Answers, ablation_rows
+from quest.evaluation.cached_encoder import CachedEncoder
+from quest.evaluation.lineup import units_of, variant
+from quest.evaluation.memory import remember_frames
+from quest.evaluation.pixels_only import PixelsOnly
+from quest.evaluation.protocols import ClipTracker, ProtocolName
+from quest.evaluation.records import read_records
+from quest.evaluation.report import provenance, write_report
+from quest.evaluation.results import Results, Run, read_results, records_path, write_results
+from quest.evaluation.runner import evaluate, has_protocol
+from quest.evaluation.selection import SplitPart, select_takes
+from quest.evaluation.tuning import discovery_bias
+from quest.model.network import QuestNetwork
+from quest.model.weights import load_network, save_network
+from quest.track import Tracker, TrackerConfig, load
+from quest.track.tracker import pick_device
+from quest.train.checkpoint import load_checkpoint
+from quest.train.dataset import Dataset, load_initial_encoder, open_dataset
+from quest.train.feature_cache import FeatureCache
+from quest.train.flow import StageTwo, with_flow_head
+from quest.train.loop import StepReport, fit
+from quest.train.settings import TrainingConfig
+from quest.train.stage import Objective, StageOne
+
+ROOT = Path(__file__).parents[1]
+
+
+@dataclass(frozen=True)
+class Ablations:
+    """Train, evaluate and tabulate variants of the network and of its training."""
+
+    train: tuple[str, ...]
+    """Stores with takes of training objects; thinned ones will do."""
+    validation: tuple[str, ...]
+    """Stores with takes of validation objects, for the threshold of discovery."""
+    test: tuple[str, ...]
+    """Stores with whole takes to evaluate on."""
+    mirrored: tuple[str, ...] = ()
+    """Stores whose training takes teach by their mirror images; name a store in --train too to use both."""
+    work: Path = ROOT / "runs" / "ablations"
+    """Folder for features, runs and answers."""
+    encoder: Path | None = None
+    """Initial weights of the frozen encoder (quest weights import-encoder); by default those in the shipped weights."""
+    tables: tuple[TableName, ...] = TABLES
+    """Tables to rebuild."""
+    presets: tuple[PresetName, ...] = ("default", "paper")
+    """Presets whose variants take part."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of every variant."""
+    steps: int = 1500
+    """Steps of every run."""
+    flow_steps: int = 500
+    """Steps of stage 2, for the flow head that is chained."""
+    batch: int = 16
+    """Windows per step."""
+    learning_rate: float = 4e-4
+    """Peak of the schedule."""
+    split: tuple[SplitPart, ...] = ("test",)
+    """Parts of the object split to evaluate on."""
+    level: tuple[int, ...] = ()
+    """Levels to evaluate; all by default."""
+    same_objects: bool = False
+    """Keep only objects that have takes of every level, so that levels compare."""
+    protocols: tuple[ProtocolName, ...] = ("point", "semantic")
+    """Protocols to evaluate under, as far as a tracker has them."""
+    resamples: int = 1000
+    """Of the bootstrap over objects."""
+    out: Path = ROOT / "benchmarks" / "results" / "ablations"
+    """Folder of the tables."""
+
+    def run(self) -> int:
+        """Every run, every answer, every table."""
+        console = Console(highlight=False)
+        lines = {table: lines_of(table, self.presets) for table in self.tables}
+        test = TestTakes.open(self)
+        encoder = self._first_network().encoder.state_dict()
+        cached = self._test_features(test, console)
+        needed = list(dict.fromkeys(line.variant for each in lines.values() for line in each))
+        for seed in self.seeds:
+            for number, item in enumerate(needed, start=1):
+                console.print(f"seed {seed}, variant {number}/{len(needed)}: {item.name}")
+                weights = self._trained(item, seed, encoder, console)
+                names = {line.tracker for each in lines.values() for line in each if line.variant == item}
+                self._answer(item, seed, weights, sorted(names), test, cached, console)
+        for table, each in lines.items():
+            self._write(table, each, test)
+            console.print(f"wrote {self.out / f'{table}.json'}")
+        return 0
+
+    # Training
+
+    def _first_network(self) -> QuestNetwork:
+        """A network whose encoder is the frozen one of all runs."""
+        if self.encoder is None:
+            return load_network("quest-s16").network
+        network = QuestNetwork(load_network("quest-s16").network.config)
+        load_initial_encoder(network, self.encoder)
+        return network
+
+    def _trained(self, item: Variant, seed: int, encoder: dict[str, torch.Tensor], console: Console) -> Path:
+        """The weights of one run, trained as far as they are not yet."""
+        folder = self.work / "runs" / item.name / f"seed-{seed}"
+        weights = folder / "weights.safetensors"
+        self._check(folder, self._settings(item, seed))
+        if weights.exists():
+            return weights
+        torch.manual_seed(seed)
+        network = QuestNetwork(item.network)
+        network.encoder.load_state_dict(encoder)
+        dataset = self._dataset(network, item)
+        network = self._fit(StageOne(network, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
+        if item.flow:
+            torch.manual_seed(seed)
+            network = with_flow_head(network)
+            network = self._fit(StageTwo(network), dataset, self.flow_steps, seed, folder / "stage-2", console)
+        settings = self._settings_of_tracker(network, item)
+        about = f"ablation {item.name}, seed {seed}, {self.steps} steps of {self.batch} windows"
+        save_network(weights, network, settings=settings.to_json(), about=about)
+        return weights
+
+    def _dataset(self, network: QuestNetwork, item: Variant) -> Dataset:
+        return open_dataset(
+            network,
+            stores=self.train,
+            validation_stores=self.validation,
+            mirrored_stores=self.mirrored,
+            cache=self.work / "features",
+            windows=replace(item.windows, batch=self.batch),
+            device=pick_device("auto"),
+            report=lambda done, total, frames: None,
+        )
+
+    def _fit(
+        self, objective: Objective, dataset: Dataset, steps: int, seed: int, out: Path, console: Console
+    ) -> QuestNetwork:
+        """Train for so many steps; the only validation is the last step's, so that the best are the last weights."""
+
+        def report(done: StepReport) -> None:
+            if done.step % 100 == 0 or done.scores is not None:
+                console.print(f"  {out.name} step {done.step}: loss {done.loss:.3f} {done.scores or ''}")
+
+        out.mkdir(parents=True, exist_ok=True)
+        config = TrainingConfig(
+            steps=steps,
+            learning_rate=self.learning_rate,
+            warmup_steps=max(1, min(100, steps // 10)),
+            validate_every=steps,
+            validation_batches=2,  # for the eye: nothing is chosen by them
+            seed=seed,
+        )
+        best = fit(objective, dataset.training, dataset.validation, config, out=out, report=report)
+        network = objective.network.cpu()
+        load_checkpoint(best, network, None)
+        return network.eval()
+
+    def _settings_of_tracker(self, network: QuestNetwork, item: Variant) -> TrackerConfig:
+        """The tracker's settings as they come, but for the threshold of discovery."""
+        config = TrackerConfig()
+        if network.config.head != "heatmap":
+            return config
+        tracker = Tracker(network, config, device=pick_device("auto"))
+        tracker = PixelsOnly.without_depth(tracker) if item.no_depth else tracker
+        scores = []
+        for path in self.validation:
+            store = TakeStore(path)
+            names = list(select_takes(store.infos(), split=("validation", "unlisted")))
+            scores.append((len(names), discovery_bias(tracker, store, names)[0]))
+        bias = sum(n * b for n, b in scores) / sum(n for n, _ in scores)
+        return replace(config, slot_bias=bias)
+
+    def _settings(self, item: Variant, seed: int) -> dict[str, Any]:
+        return {
+            "variant": item.name,
+            "seed": seed,
+            "steps": self.steps,
+            "flow_steps": self.flow_steps if item.flow else 0,
+            "batch": self.batch,
+            "learning_rate": self.learning_rate,
+            "network": json.loads(item.network.to_json()),
+            "losses": asdict(item.losses),
+            "windows": asdict(item.windows),
+            "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
+            "training_hash": self.training_hash,
+        }
+
+    def _check(self, folder: Path, settings: dict[str, Any]) -> None:
+        """Refuse to mix runs of other settings; note the commit that began a run."""
+        file = folder / "settings.json"
+        if not file.exists():
+            write_report(settings | {"commit": code_commit()}, file)
+            return
+        known = json.loads(file.read_text(encoding="utf-8"))
+        for name, value in settings.items():
+            if known.get(name) != value:
+                raise ConfigError(
+                    f"{folder}: this run was made with {name} {known.get(name)}, now it is {value}; use another "
+                    "--work, or remove the folder"
+                )
+
+    # Evaluation
+
+    def _test_features(self, test: TestTakes, console: Console) -> CachedEncoder:
+        """Features of the takes to evaluate on, in the same cache."""
+        network = self._first_network()
+        cache = FeatureCache(self.work / "features", network.config, network.encoder)
+        frames, views = 0, []
+        for store, takes in test.parts:
+            frames += sum(cache.build(store, list(takes), device=pick_device("auto")))
+            views += cache.views(list(takes))
+        console.print(f"features of {frames} frames to evaluate on")
+        return CachedEncoder(views)
+
+    def _answer(
+        self,
+        item: Variant,
+        seed: int,
+        weights: Path,
+        names: Sequence[str],
+        test: TestTakes,
+        cached: CachedEncoder,
+        console: Console,
+    ) -> None:
+        """Every tracker's answers with these weights, as far as they are not there yet."""
+        missing = [name for name in names if not self._answered(item, seed, name, weights, test)]
+        if not missing:
+            return
+        tracker = load(weights)
+        cached.serve(tracker.network)
+        remember_frames(tracker.network, capacity=1000)
+        for name in missing:
+            start_s = time.monotonic()
+            one = self._tracker(tracker, name, test, seed)
+            protocols: list[ProtocolName] = [p for p in self.protocols if has_protocol(one, p)]
+            found = [evaluate(s, takes, [one], protocols=protocols) for s, takes in test.parts] if protocols else []
+            made = provenance()
+            run = Run(
+                command=made["command"],
+                commit=made["commit"],
+                data_hash=test.data_hash,
+                weights=item.name,
+                weights_hash=file_hash(weights),
+                resamples=self.resamples,
+                seed=seed,
+                machine=made["machine"],
+                versions=made["versions"],
+                stamp=made["stamp"],
+                seconds=round(time.monotonic() - start_s, 1),
+            )
+            records = tuple(record for each in found for record in each.records)
+            discoveries = tuple(discovery for each in found for discovery in each.discoveries)
+            write_results(Results(run, (), discoveries), self._answers_file(item, seed, name), records=records)
+            console.print(f"  {name}: {len(records)} answers")
+
+    def _tracker(self, tracker: Tracker, name: str, test: TestTakes, seed: int) -> ClipTracker:
+        if name == "quest":
+            return tracker
+        if name == "hold-still":
+            return HoldStill()
+        return variant(tracker, name, unit_m=test.unit_m, seed=seed)
+
+    def _answers_file(self, item: Variant, seed: int, tracker: str) -> Path:
+        return self.work / "runs" / item.name / f"seed-{seed}" / "answers" / f"{tracker}.json"
+
+    def _answered(self, item: Variant, seed: int, tracker: str, weights: Path, test: TestTakes) -> bool:
+        file = self._answers_file(item, seed, tracker)
+        if not file.exists():
+            return False
+        run = read_results(file).run
+        return run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
+
+    # Tables
+
+    def _write(self, table: str, lines: Sequence[Line], test: TestTakes) -> None:
+        answers, commits = [], set()
+        for line, seed, file in self._answered_lines(lines):
+            records = read_records(records_path(file)) if records_path(file).exists() else ()
+            answers.append(Answers(line.label, seed, records, read_results(file).discoveries, line.reference))
+            settings = json.loads((file.parents[1] / "settings.json").read_text(encoding="utf-8"))
+            commits |= {settings["commit"], read_results(file).run.commit}
+        rows = ablation_rows(answers, resamples=self.resamples, seed=0)
+        report = provenance() | {
+            "steps": self.steps,
+            "flow_steps": self.flow_steps,
+            "batch": self.batch,
+            "learning_rate": self.learning_rate,
+            "seeds": list(self.seeds),
+            "run_commits": sorted(commits),
+            "n_takes": test.takes,
+            "data_hash": test.data_hash,
+            "training_hash": self.training_hash,
+            "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
+            "resamples": self.resamples,
+            "rows": [asdict(row) for row in rows],
+        }
+        write_report(report, self.out / f"{table}.json")
+
+    def _answered_lines(self, lines: Sequence[Line]) -> Iterator[tuple[Line, int, Path]]:
+        for line in lines:
+            for seed in self.seeds:
+                yield line, seed, self._answers_file(line.variant, seed, line.tracker)
+
+    @cached_property
+    def training_hash(self) -> str:
+        """One hash over all takes that may teach or choose a threshold."""
+        roles = {"train": self.train, "mirrored": self.mirrored, "validation": self.validation}
+        stores = [(role, TakeStore(path)) for role, paths in roles.items() for path in paths]
+        return combined_hash(
+            (f"{role}/{name}", store.data_hash(name)) for role, store in stores for name in store.names()
+        )
+
+
+@dataclass(frozen=True)
+class TestTakes:
+    """What is evaluated on: takes by store, how large their objects are, and one hash over all."""
+
+    parts: tuple[tuple[TakeStore, dict[str, SplitPart]], ...]
+    unit_m: Callable[..., float]
+    data_hash: str
+
+    @property
+    def takes(self) -> int:
+        """How many."""
+        return sum(len(takes) for _, takes in self.parts)
+
+    @classmethod
+    def open(cls, asked: Ablations) -> TestTakes:
+        """Choose the takes.
+
+        Raises:
+            ConfigError: none is left.
+        """
+        stores = [TakeStore(path) for path in asked.test]
+        infos = {name: info for store in stores for name, info in store.infos().items()}
+        chosen = select_takes(infos, split=asked.split, levels=asked.level, same_objects=asked.same_objects)
+        parts: list[tuple[TakeStore, dict[str, SplitPart]]] = [
+            (store, {name: chosen[name] for name in store.names() if name in chosen}) for store in stores
+        ]
+        kept = tuple(part for part in parts if part[1])
+        digest = combined_hash((name, store.data_hash(name)) for store, takes in kept for name in takes)
+        return cls(kept, units_of(stores), digest)
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(Ablations).run())

@@ -1,0 +1,116 @@
+"""The frames of a recorded clip as a network takes them, for baselines that look at them with QueST's network."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor
+
+from quest.data.letterbox import Letterbox
+from quest.geometry import invert
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch, Observation, cell_depth, reference_of
+from quest.types import Clip
+
+
+class ClipFrames:
+    """Prepares and observes the frames of one clip in order, as the tracker does with a stream.
+
+    The reference frame is that of the first frame with depth; of the first frame if there is none.
+
+    Args:
+        network: whose input is prepared.
+        clip: the frames.
+        device: where the network runs.
+
+    Attributes:
+        letterbox: between the source image and the network's input.
+        scale_m: metres per unit of the reference frame.
+    """
+
+    def __init__(self, network: QuestNetwork, clip: Clip, *, device: torch.device) -> None:
+        self.letterbox = Letterbox(clip.camera, network.config.encoder.image_size)
+        self._network = network
+        self._clip = clip
+        self._device = device
+        self._window: deque[Observation] = deque(maxlen=network.config.window)
+        camera = self.letterbox.camera
+        self._intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=device)
+        first = 0
+        if clip.depth_m is not None:
+            first = int(np.argmax([bool(((d > 0) & np.isfinite(d)).any()) for d in clip.depth_m]))
+        cells = cell_depth(self._depth(first), network.config.cell_px)
+        self._center, self._scale = reference_of(cells, self._intrinsics, self.letterbox.size)
+        self._cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).double()
+        self._reference = self._cam_from_world[first]
+        self.scale_m = float(self._scale[0])
+
+    def see(self, t: int) -> tuple[FrameBatch, Observation]:
+        """Frame ``t`` (B = T = 1) and what the network observes in it.
+
+        Frames that are seen in order make up the window of :meth:`window`; some may be left out.
+        """
+        image = torch.from_numpy(np.ascontiguousarray(self.letterbox.rgb(self._clip.rgb[t]))).to(self._device)
+        depth = self._depth(t)
+        ref_from_cam = self._reference @ invert(self._cam_from_world[t])
+        frames = FrameBatch(
+            features=self._network.encode(image[None])[:, None].float(),
+            rgb=image[None, None],
+            depth_m=depth[None],
+            cell_depth_m=cell_depth(depth, self._network.config.cell_px)[None],
+            intrinsics=self._intrinsics,
+            ref_from_cam=ref_from_cam.float().to(self._device)[None, None],
+            center=self._center,
+            scale=self._scale,
+        )
+        observed = self._network.observe(frames)
+        while len(self._window) < self._network.config.window - 1:
+            self._window.append(observed)
+        self._window.append(observed)
+        return frames, observed
+
+    def window(self) -> Observation:
+        """The newest frames that were seen, oldest first; before there are enough the first one is repeated."""
+        return Observation.stack(list(self._window))
+
+    def to_source(self, uv: Float[Tensor, "K 2"]) -> Float32[np.ndarray, "K 2"]:
+        """Source pixels of coordinates in [0, 1]^2 of the input."""
+        uv_px = uv.float().cpu().numpy() * np.float32(self.letterbox.size)
+        return self.letterbox.to_source(uv_px).astype(np.float32)
+
+    def to_input(self, uv_px: Float32[np.ndarray, "K 2"]) -> Float[Tensor, "K 2"]:
+        """Coordinates in [0, 1]^2 of the input of source pixels."""
+        uv = self.letterbox.to_canvas(uv_px) / self.letterbox.size
+        return torch.from_numpy(uv.astype(np.float32)).to(self._device)
+
+    def to_world(self, displacement: Float[Tensor, "K 3"]) -> Float[np.ndarray, "K 3"]:
+        """Displacements of the reference frame in the world, metres."""
+        metric = displacement.double().cpu() * self.scale_m
+        return (metric @ self._reference[:3, :3]).numpy()  # the transposed rotation, from the right
+
+    def to_reference(self, point_world: Float[np.ndarray, "K 3"]) -> Float[Tensor, "K 3"]:
+        """World points in the reference frame."""
+        point = torch.from_numpy(point_world).double() @ self._reference[:3, :3].mT + self._reference[:3, 3]
+        return ((point - self._center[0].cpu().double()) / self.scale_m).float().to(self._device)
+
+    def _depth(self, t: int) -> Float[Tensor, "1 S S"]:
+        size = self.letterbox.size
+        depth_m = self._clip.depth_m
+        raw = np.zeros((size, size), np.float32) if depth_m is None else self.letterbox.depth(depth_m[t])
+        return torch.from_numpy(np.ascontiguousarray(raw)).to(self._device)[None]
+
+
+def single_frame(clip: Clip, t: int) -> Clip:
+    """A clip of one frame of a clip."""
+    frame = slice(t, t + 1)
+    return replace(
+        clip,
+        rgb=clip.rgb[frame],
+        depth_m=None if clip.depth_m is None else clip.depth_m[frame],
+        stamp_s=clip.stamp_s[frame],
+        cam_from_world=clip.cam_from_world[frame],
+    )

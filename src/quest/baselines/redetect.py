@@ -1,0 +1,259 @@
+"""No queries: entities are detected anew in every window and linked to the nearest previous one.
+
+The ablation of persistent queries. Detections are the peaks of the network's dense affordance map, the same that QueST
+binds its slots to; nothing of an entity is remembered but where it was.
+
+Reference: Bewley et al., Simple Online and Realtime Tracking, ICIP 2016, for linking detections by place alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from scipy.optimize import linear_sum_assignment
+
+from quest.baselines.clip_frames import ClipFrames, single_frame
+from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
+from quest.errors import WeightsError
+from quest.model.discovery import find_peaks
+from quest.model.network import QuestNetwork
+from quest.types import LABELS, Clip, Query, State, Tracks
+
+NOTHING_FOUND = "nothing was detected in the first frame"
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What the affordance map shows in one frame, best first.
+
+    Attributes:
+        uv_px: pixels of the source image.
+        point_world: lifted points, metres; NaN without depth.
+        label: one of :data:`quest.types.LABELS` each.
+        confidence: probability by the map's own score.
+    """
+
+    uv_px: Float32[np.ndarray, "N 2"]
+    point_world: Float32[np.ndarray, "N 3"]
+    label: tuple[str, ...]
+    confidence: Float32[np.ndarray, " N"]
+
+
+class Detector:
+    """Finds entities in single frames by a network's dense affordance map.
+
+    Args:
+        network: a network with a heatmap, in evaluation mode.
+        device: where it runs.
+        min_logit: least score of a detection.
+        radius_cells: of peaks closer than this the best stays.
+        depth_window_px: odd side of the window whose median depth lifts a pixel.
+        autocast: whether the network computes in bfloat16.
+
+    Raises:
+        WeightsError: the network has learned queries and no affordance map.
+    """
+
+    def __init__(
+        self,
+        network: QuestNetwork,
+        *,
+        device: torch.device,
+        min_logit: float = 0.0,
+        radius_cells: float = 1.5,
+        depth_window_px: int = 3,
+        autocast: bool = False,
+    ) -> None:
+        if network.config.head != "heatmap":
+            raise WeightsError(
+                f"detection: expected weights with a heatmap, got preset {network.config.preset!r} with learned "
+                "queries, which has no affordance map; use weights of preset default"
+            )
+        self.network = network.to(device).eval()
+        self.device = device
+        self.min_logit = min_logit
+        self.radius_cells = radius_cells
+        self.depth_window_px = depth_window_px
+        self.autocast = autocast
+
+    def frames(self, clip: Clip) -> ClipFrames:
+        """The clip's frames as the network takes them."""
+        return ClipFrames(self.network, clip, device=self.device)
+
+    def detect(self, clip: Clip, frames: ClipFrames, t: int) -> Detections:
+        """What is seen in frame ``t``."""
+        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
+            batch, observed = frames.see(t)
+            peaks = find_peaks(self.network, batch, observed, radius_cells=self.radius_cells)
+        kept = torch.nonzero(peaks.logit > self.min_logit)[:, 0]
+        uv_px = frames.to_source(peaks.uv[kept])
+        score = (peaks.logit[kept] - self.min_logit).sigmoid().float().cpu().numpy()
+        return Detections(
+            uv_px,
+            lift_pixels(single_frame(clip, t), uv_px[None], window_px=self.depth_window_px)[0],
+            tuple(LABELS[int(n)] for n in peaks.label[kept]),
+            score.astype(np.float32),
+        )
+
+
+class Redetect:
+    """Tracks by detection.
+
+    A point query binds to the nearest detection at its frame, without queries everything that is detected in frame 0 is
+    followed. From then on, in every ``every``-th frame, detections are linked to tracks one to one, nearest first in
+    all (Hungarian), by the distance of their points, or of their pixels where depth is missing. A track that nothing is
+    linked to stays where it was, and so do all of them between detections. Nothing is random.
+
+    Args:
+        detector: what finds entities.
+        every: frames from one detection to the next: T, the window of the network.
+        reach: farthest that a detection is linked, in half widths of the view at the scene's median depth, and at
+            which a point query binds, in half widths of the image.
+        name: what tables call it.
+    """
+
+    protocols = ("point", "semantic")
+
+    def __init__(self, detector: Detector, *, every: int = 4, reach: float = 0.25, name: str = "redetect") -> None:
+        self.detector = detector
+        self.every = every
+        self.reach = reach
+        self.name = name
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """Track point queries, or what is detected in frame 0.
+
+        Args:
+            clip: frames; depth is needed for world points.
+            queries: point queries; None follows all detections of frame 0.
+
+        Returns:
+            One track per query or detection; NaN before its frame. Visible means linked at the newest detection.
+
+        Raises:
+            ConfigError: a query that is not a point.
+            InputError: a query outside the clip.
+        """
+        if queries is None:
+            return self._discover(clip)
+        first, uv_first = check_point_queries(clip, queries, tracker=self.name)
+        frames = self.detector.frames(clip)
+        rows = _Rows(len(clip), len(queries))
+        for t in range(len(clip)):
+            rows.hold(t)
+            born = np.flatnonzero(first == t)
+            if len(born) or t % self.every == 0:
+                seen = self.detector.detect(clip, frames, t)
+                alive = np.flatnonzero(first < t)
+                if len(alive) and t % self.every == 0:
+                    self._link(rows, alive, seen, t, frames)
+                if len(born):
+                    self._bind(rows, born, uv_first[born], seen, clip, t)
+        flags = (NO_DEPTH,) if clip.depth_m is None else ()
+        return rows.tracks(clip, query_names(queries), tuple(q.label for q in queries), flags)
+
+    def _discover(self, clip: Clip) -> Tracks:
+        frames = self.detector.frames(clip)
+        start = self.detector.detect(clip, frames, 0)
+        rows = _Rows(len(clip), len(start.label))
+        every_row = np.arange(len(start.label))
+        rows.set(0, every_row, start, every_row)
+        for t in range(1, len(clip)):
+            rows.hold(t)
+            if t % self.every == 0 and len(every_row):
+                self._link(rows, every_row, self.detector.detect(clip, frames, t), t, frames)
+        names = tuple(f"{label} {k}" for k, label in enumerate(start.label))
+        flags = ((NO_DEPTH,) if clip.depth_m is None else ()) + (() if names else (NOTHING_FOUND,))
+        return rows.tracks(clip, names, start.label, flags)
+
+    def _bind(
+        self,
+        rows: _Rows,
+        born: np.ndarray,
+        uv_px: Float32[np.ndarray, "B 2"],
+        seen: Detections,
+        clip: Clip,
+        t: int,
+    ) -> None:
+        """Point queries begin at the nearest detection; one that has none in reach begins, and stays, at its pixel."""
+        own = single_frame(clip, t)
+        rows.uv_px[t, born] = uv_px
+        rows.point_world[t, born] = lift_pixels(own, uv_px[None], window_px=self.detector.depth_window_px)[0]
+        half_px = max(clip.camera.width, clip.camera.height) / 2
+        gap = np.linalg.norm(uv_px[:, None] - seen.uv_px[None], axis=-1) / half_px
+        which, detection = link(gap, self.reach)
+        rows.set(t, born[which], seen, detection)
+
+    def _link(self, rows: _Rows, alive: np.ndarray, seen: Detections, t: int, frames: ClipFrames) -> None:
+        rows.visible[t, alive] = False
+        half_px = frames.letterbox.size / frames.letterbox.scale / 2
+        in_image = np.linalg.norm(rows.uv_px[t, alive][:, None] - seen.uv_px[None], axis=-1) / half_px
+        in_space = np.linalg.norm(rows.point_world[t, alive][:, None] - seen.point_world[None], axis=-1)
+        gap = np.where(np.isfinite(in_space), in_space / frames.scale_m, in_image)
+        which, detection = link(gap, self.reach)
+        rows.set(t, alive[which], seen, detection)
+
+
+def link(gap: Float[np.ndarray, "K N"], reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Tracks and detections that belong together: as many pairs within reach as possible, then the least distance.
+
+    Returns:
+        Indices of tracks and, beside them, of detections.
+    """
+    allowed = gap <= reach
+    # One forbidden pair costs more than all allowed ones together.
+    cost = np.where(allowed, gap, 1.0 + reach * max(gap.shape, default=0))
+    rows, columns = linear_sum_assignment(cost)
+    kept = allowed[rows, columns]
+    return rows[kept], columns[kept]
+
+
+class _Rows:
+    """The answers of K tracks as they are filled in."""
+
+    def __init__(self, frames: int, tracks: int) -> None:
+        self.uv_px = np.full((frames, tracks, 2), np.nan, np.float32)
+        self.point_world = np.full((frames, tracks, 3), np.nan, np.float32)
+        self.confidence = np.zeros((frames, tracks), np.float32)
+        self.visible = np.zeros((frames, tracks), bool)
+
+    def hold(self, t: int) -> None:
+        """Begin a frame with the answers of the one before."""
+        if t > 0:
+            for values in (self.uv_px, self.point_world, self.confidence, self.visible):
+                values[t] = values[t - 1]
+
+    def set(self, t: int, tracks: np.ndarray, seen: Detections, detections: np.ndarray) -> None:
+        """Move tracks to detections; where depth is missing the last world point stays."""
+        self.uv_px[t, tracks] = seen.uv_px[detections]
+        point = seen.point_world[detections]
+        known = np.isfinite(point).all(axis=-1)
+        self.point_world[t, tracks[known]] = point[known]
+        self.confidence[t, tracks] = seen.confidence[detections]
+        self.visible[t, tracks] = True
+
+    def tracks(
+        self, clip: Clip, names: tuple[str, ...], labels: tuple[str | None, ...], flags: tuple[str, ...]
+    ) -> Tracks:
+        """The answers; a held world point is seen where the camera is by now."""
+        held = np.zeros(self.visible.shape, bool)
+        held[1:] = (self.point_world[1:] == self.point_world[:-1]).all(axis=-1)
+        projected = project_points(clip, self.point_world)
+        uv_px = np.where((held & np.isfinite(projected).all(axis=-1))[..., None], projected, self.uv_px)
+        begun = np.isfinite(self.uv_px).all(axis=-1)
+        state = np.where(self.visible, State.TRACKING.value, np.where(begun, State.HELD.value, State.LOST.value))
+        return Tracks(
+            names=names,
+            labels=labels,
+            uv_px=uv_px.astype(np.float32),
+            point_world=self.point_world,
+            confidence=self.confidence,
+            visible=self.visible,
+            state=state,
+            stamp_s=clip.stamp_s,
+            frame_flags=flags,
+        )

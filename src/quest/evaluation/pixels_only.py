@@ -1,0 +1,52 @@
+"""QueST without 3D: it is shown colours only, and its pixels are lifted afterwards, for the metric alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from quest.baselines.point_queries import hold_last, lift_pixels
+from quest.model.discovery import Peaks
+from quest.track.tracker import DEFAULT_ALPHA, Tracker
+from quest.types import Camera, Clip, Frame, Query, Tracks
+
+
+class PixelsOnly(Tracker):
+    """A tracker that never sees depth and is not grounded in joints; made by :meth:`without_depth`."""
+
+    name = "quest-pixels"
+
+    @classmethod
+    def without_depth(cls, tracker: Tracker, *, name: str = "quest-pixels") -> PixelsOnly:
+        """A tracker's network and settings without depth and without joints."""
+        other = cls(
+            tracker.network,
+            replace(tracker.config, ground=False),
+            device=tracker.device,
+            weights_hash=tracker.weights_hash,
+            calibration=tracker.calibration,
+        )
+        other.name = name
+        return other
+
+    def candidates(self, camera: Camera, frame: Frame) -> Peaks:
+        """As :meth:`quest.track.Tracker.candidates`, by colours alone."""
+        return super().candidates(camera, replace(frame, depth_m=None))
+
+    def track(
+        self, clip: Clip, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA
+    ) -> Tracks:
+        """As :meth:`quest.track.Tracker.track`, by colours alone.
+
+        Returns:
+            Pixels of the tracker. World points are these pixels lifted by the median of the valid depths in 3 x 3
+            pixels; where there are none, the last world point. The reference frame of the tracker has no depth either,
+            so that it knows of a moving camera only what it sees.
+        """
+        tracks = super().track(replace(clip, depth_m=None), queries, alpha=alpha)
+        begun = np.isfinite(tracks.uv_px).all(axis=-1)
+        first = np.where(begun.any(axis=0), begun.argmax(axis=0), len(clip))
+        lifted = hold_last(lift_pixels(clip, tracks.uv_px), first=first)
+        return replace(tracks, point_world=lifted.astype(np.float32))

@@ -1,0 +1,91 @@
+"""The dense affordance map: per cell a score for every label, an offset, and what one would take hold of it for.
+
+References: Law and Deng, CornerNet, ECCV 2018, for the map and its loss; Zhou et al., Objects as Points, 2019,
+section 3, for offsets at peaks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from quest.model.config import NetworkConfig
+from quest.model.layers import TokenLayer
+from quest.model.observation import FrameBatch, Observation, Observer
+from quest.types import LABELS
+
+
+@dataclass(frozen=True)
+class AffordanceMap:
+    """What could be taken hold of, per cell.
+
+    Attributes:
+        logits: score of every label.
+        offset: from the cell's centre to the entity, in cells.
+        lift: above zero where one would lift the thing there rather than open it; NaN if the network does not know.
+    """
+
+    logits: Float[Tensor, "B T C L"]
+    offset: Float[Tensor, "B T C 2"]
+    lift: Float[Tensor, "B T C"]
+
+    @property
+    def frames(self) -> int:
+        """T."""
+        return self.logits.shape[1]
+
+
+class AffordanceHead(nn.Module):
+    """Reads the map off the cells that queries are matched with."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        f = Observer.fine_width
+        self.intents = config.intents
+        self.mlp = nn.Sequential(nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, len(LABELS) + 2 + config.intents))
+        final = self.mlp[-1]
+        assert isinstance(final, nn.Linear)
+        nn.init.constant_(final.bias[: len(LABELS)], -4.0)
+
+    def forward(self, fine: Float[Tensor, "B T C F"]) -> AffordanceMap:
+        """The map of every frame."""
+        out = self.mlp(fine).float()
+        n = len(LABELS)
+        lift = out[..., n + 2] if self.intents else torch.full_like(out[..., 0], torch.nan)
+        return AffordanceMap(out[..., :n], out[..., n : n + 2], lift)
+
+
+class AffordanceTrunk(nn.Module):
+    """Observes frames for the map alone: more layers over tokens, and convolutions over cells.
+
+    What a query needs to be told from its neighbours and what makes a handle a handle are different things; with a
+    trunk of its own the map learns at its own pace. It runs only while something is to be discovered.
+    """
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.observer = Observer(config)
+        f = Observer.fine_width
+        self.layers = nn.ModuleList(TokenLayer(config.width, config.heads) for _ in range(config.map_layers))
+        self.grid, self.cells = config.encoder.grid, config.cells
+        self.up = nn.Linear(config.width, f)
+        self.mix = nn.ModuleList(nn.Conv2d(f, f, 3, padding=1) for _ in range(2))
+        self.norm = nn.ModuleList(nn.GroupNorm(8, f) for _ in range(2))
+
+    def forward(self, frames: FrameBatch) -> Float[Tensor, "B T C F"]:
+        """Cells of every frame."""
+        observed: Observation = self.observer(frames)
+        b, t = observed.tokens.shape[:2]
+        tokens = observed.tokens.flatten(0, 1)
+        for layer in self.layers:
+            tokens = layer(tokens)
+        h = self.up(tokens).transpose(1, 2).unflatten(2, (self.grid, self.grid))
+        h = F.interpolate(h, size=(self.cells, self.cells), mode="bilinear", align_corners=False)
+        h = h + observed.fine.flatten(0, 1).transpose(1, 2).unflatten(2, (self.cells, self.cells))
+        for mix, norm in zip(self.mix, self.norm, strict=True):
+            h = h + F.gelu(norm(mix(F.gelu(h))))
+        return h.flatten(2).transpose(1, 2).unflatten(0, (b, t))

@@ -1,0 +1,65 @@
+"""Batches in the order of a generator, the next one read while the present one is learned from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from quest.model.observation import FrameBatch
+from quest.train.plan import WindowPlan
+from quest.train.windows import WindowSampler, WindowTruth
+
+
+class MicroBatch:
+    """Windows that go through the network together."""
+
+    # No dataclass: Fabric looks into those that a module is called with and cannot copy frozen ones.
+
+    def __init__(self, frames: FrameBatch, truth: WindowTruth) -> None:
+        self.frames = frames
+        self.truth = truth
+
+    def to(self, device: torch.device) -> MicroBatch:
+        """The same on a device."""
+        return MicroBatch(self.frames.to(device), self.truth.to(device))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What one process learns from in one step.
+
+    Attributes:
+        parts: micro-batches.
+        rng: state of the generator after this batch was drawn and before the next one was, as JSON.
+    """
+
+    parts: tuple[MicroBatch, ...]
+    rng: str
+
+
+def stream_batches(
+    sampler: WindowSampler, rng: np.random.Generator, parts: Sequence[slice]
+) -> Generator[Batch, None, None]:
+    """Batches without end; close it to end the reading.
+
+    Args:
+        sampler: where they come from.
+        rng: generator that decides what is in them; every process has the same.
+        parts: windows of a batch that each micro-batch of this process takes.
+    """
+
+    def read(plan: WindowPlan) -> tuple[MicroBatch, ...]:
+        return tuple(MicroBatch(*sampler.load(plan.part(windows))) for windows in parts)
+
+    # One thread: the order of reading does not matter for what is read, but memory does.
+    with ThreadPoolExecutor(1, thread_name_prefix="batches") as reader:
+        ahead = reader.submit(read, sampler.plan(rng))
+        while True:
+            state = json.dumps(rng.bit_generator.state)
+            present, ahead = ahead, reader.submit(read, sampler.plan(rng))
+            yield Batch(present.result(), state)

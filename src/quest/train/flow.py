@@ -1,0 +1,150 @@
+"""Stage 2: the flow head learns where entities go next, behind a backbone that stays as stage 1 left it.
+
+The truth is the displacement from a window's newest frame to the frame after it at the window's own step, so time
+enters through the window alone (see :mod:`quest.model.flow_head`): steps of one, two and three stored frames, standing
+still and going backwards all ask for one more of the same. What is stored may be every sixth frame of a take; a stream
+that gives every frame then has shorter steps than those that were learned from, and the benchmark of scene flow
+measures both.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch
+from quest.train.losses import masked_mean
+from quest.train.objective import Rollout, has_moved, roll_out
+from quest.train.windows import WindowSampler, WindowTruth
+
+_MOVING = 0.005
+"""A displacement above this is motion rather than rest, normalised units per step."""
+_MOVING_WEIGHT = 3.0
+
+
+@dataclass(frozen=True)
+class FlowScores:
+    """EPE3D on fixed windows, normalised units per step of the window.
+
+    Attributes:
+        epe: mean 3D distance of the predicted from the true displacement.
+        epe_moving: the same where the true displacement is above 0.005.
+        zero: of saying that nothing moves.
+        zero_moving: the same where something does.
+        answers: how many displacements were judged.
+        moving: how many of them move.
+    """
+
+    epe: float
+    epe_moving: float
+    zero: float
+    zero_moving: float
+    answers: int
+    moving: int
+
+    @property
+    def score(self) -> float:
+        """What a checkpoint is chosen by; less is better."""
+        return self.epe
+
+    def __str__(self) -> str:
+        return (
+            f"EPE3D {self.epe:.4f} (zero flow {self.zero:.4f}), moving {self.epe_moving:.4f} "
+            f"({self.zero_moving:.4f}) (n = {self.answers}, {self.moving} moving)"
+        )
+
+
+class StageTwo:
+    """Stage 2: L1 on scene flow.
+
+    Args:
+        network: a network with a flow head (see :func:`with_flow_head`).
+    """
+
+    name = "stage-2"
+    terms: tuple[str, ...] = ("flow",)
+
+    def __init__(self, network: QuestNetwork) -> None:
+        self.network = network
+
+    def trained(self) -> list[nn.Parameter]:
+        """The flow head's parameters."""
+        assert self.network.flow is not None
+        return list(self.network.flow.parameters())
+
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
+        """L1 of the displacement; what moves counts three times, because most entities rest in most windows."""
+        roll, flow = self._answer(frames, truth)
+        mask = _judged(roll, truth)
+        moving = _length(truth) > _MOVING
+        weight = mask * torch.where(moving | has_moved(truth)[:, -1], _MOVING_WEIGHT, 1.0)
+        error = (flow - truth.flow.nan_to_num()).abs().sum(-1) / truth.unit[:, None]
+        loss = masked_mean(error, weight)
+        return loss, loss.detach()[None]
+
+    def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> FlowScores:
+        """EPE3D on the same windows at every call, beside zero flow."""
+        rng = np.random.default_rng(0)
+        self.network.eval()
+        epe, zero = [], []
+        with torch.no_grad():
+            for _ in range(batches):
+                frames, truth = sampler.draw(rng, disturb=False)
+                frames, truth = frames.to(device), truth.to(device)
+                roll, flow = self._answer(frames, truth)
+                mask = _judged(roll, truth)
+                error = (flow - truth.flow).norm(dim=-1) / truth.unit[:, None]
+                epe.append(error[mask].float().cpu())
+                zero.append(_length(truth)[mask].float().cpu())
+        self.network.train()
+        error, length = torch.cat(epe), torch.cat(zero)
+        moving = length > _MOVING
+        return FlowScores(
+            epe=_mean(error),
+            epe_moving=_mean(error[moving]),
+            zero=_mean(length),
+            zero_moving=_mean(length[moving]),
+            answers=len(error),
+            moving=int(moving.sum()),
+        )
+
+    def _answer(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Rollout, Float[Tensor, "B K 3"]]:
+        with torch.no_grad():
+            roll = roll_out(self.network, frames, truth)
+        return roll, self.network.displace(roll.prediction)
+
+
+def with_flow_head(network: QuestNetwork) -> QuestNetwork:
+    """The network with a flow head: its own, or a new one that says that nothing moves."""
+    if network.flow is not None:
+        return network
+    return _rebuilt(network, flow=True)
+
+
+def without_flow_head(network: QuestNetwork) -> QuestNetwork:
+    """The network as stage 1 trains it: a flow head would be left behind by a backbone that moves on."""
+    return network if network.flow is None else _rebuilt(network, flow=False)
+
+
+def _rebuilt(network: QuestNetwork, *, flow: bool) -> QuestNetwork:
+    other = QuestNetwork(replace(network.config, flow=flow))
+    own = network.state_dict()
+    other.load_state_dict({name: own.get(name, tensor) for name, tensor in other.state_dict().items()})
+    return other.train(network.training)
+
+
+def _judged(roll: Rollout, truth: WindowTruth) -> Bool[Tensor, "B K"]:
+    return roll.mask[:, -1] & torch.isfinite(truth.flow).all(-1)
+
+
+def _length(truth: WindowTruth) -> Float[Tensor, "B K"]:
+    return truth.flow.norm(dim=-1) / truth.unit[:, None]
+
+
+def _mean(values: Float[Tensor, " N"]) -> float:
+    return float(values.mean()) if len(values) else 0.0

@@ -1,0 +1,154 @@
+"""Tables of variants over seeds, and the rows of the ablation benchmark."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quest.errors import InputError
+from quest.evaluation.ablation import AblationRow, Answers, ablation_rows
+from quest.evaluation.records import Discovery, EntityRecord
+from tests.evaluation.answers import make_answer
+
+SETTINGS = {"resamples": 200, "seed": 0}
+OBJECTS = ("desk-102015", "chest-102016", "safe-102017")
+
+
+def answers(rng: np.random.Generator, *, first_frame: int = 2, **about) -> tuple[EntityRecord, ...]:
+    return tuple(
+        make_answer(
+            rng.uniform(0, 1, 10),
+            object_id=name,
+            entity=entity,
+            first_frame=first_frame,
+            follows=rng.integers(1, 3, 10),
+            moved=entity == 1,
+            **about,
+        )
+        for name in OBJECTS
+        for entity in (1, 2)
+    )
+
+
+def row(rows: tuple[AblationRow, ...], variant: str, reading: str = "all", protocol: str = "point") -> AblationRow:
+    return next(r for r in rows if (r.variant, r.reading, r.protocol) == (variant, reading, protocol))
+
+
+def test_means_and_differences_equal_a_plain_loop() -> None:
+    rng = np.random.default_rng(0)
+    full = {s: answers(rng) for s in (0, 1)}
+    less = {s: answers(rng) for s in (0, 1)}
+    runs = [Answers("full", s, r) for s, r in full.items()]
+    runs += [Answers("less", s, r, reference="full") for s, r in less.items()]
+    rows = ablation_rows(runs, **SETTINGS)
+    for reading in ("all", "moved"):
+        both = []
+        for records in (full, less):
+            kept = [r for each in records.values() for r in each if reading == "all" or r.moved]
+            ape = np.mean(np.concatenate([r.distance[2:].astype(np.float64) for r in kept]))
+            acc = np.mean(np.concatenate([r.follows[2:] == r.entity for r in kept]))
+            d100 = np.mean([float(r.distance[-1]) for r in kept])
+            both.append((ape, d100, acc))
+        for variant, expected in zip(("full", "less"), both, strict=True):
+            metrics = row(rows, variant, reading).metrics
+            assert metrics.ape
+            assert metrics.d100
+            assert metrics.acc
+            np.testing.assert_allclose((metrics.ape.mean, metrics.d100.mean, metrics.acc.mean), expected)
+        gap = row(rows, "less", reading).difference
+        assert gap
+        assert gap.ape
+        assert gap.acc
+        assert gap.d100
+        np.testing.assert_allclose(
+            (gap.ape.mean, gap.d100.mean, gap.acc.mean), np.subtract(both[1], both[0]), atol=1e-12
+        )
+        assert gap.ape.low is not None
+        assert gap.ape.low <= gap.ape.mean <= (gap.ape.high or np.inf)
+    assert row(rows, "full").difference is None
+    assert (row(rows, "full").objects, row(rows, "full").tracks) == (3, 6)  # a track counts once for both seeds
+    first = row(rows, "full").seeds[0]
+    assert first.seed == 0
+    np.testing.assert_allclose(first.ape, np.mean([r.distance[2:].astype(np.float64) for r in full[0]]))
+
+
+def test_an_equal_answer_differs_by_nothing_with_certainty() -> None:
+    records = answers(np.random.default_rng(0))
+    rows = ablation_rows([Answers("full", 0, records), Answers("same", 0, records, reference="full")], **SETTINGS)
+    gap = row(rows, "same").difference
+    assert gap
+    assert gap.ape
+    assert (gap.ape.mean, gap.ape.low, gap.ape.high) == (0.0, 0.0, 0.0)
+
+
+def test_only_common_seeds_are_paired() -> None:
+    rng = np.random.default_rng(0)
+    full, less = answers(rng), answers(rng)
+    one = [Answers("full", 0, full), Answers("less", 0, less, reference="full")]
+    more = [*one, Answers("full", 7, answers(rng))]
+    a, b = (row(ablation_rows(runs, **SETTINGS), "less").difference for runs in (one, more))
+    assert a == b
+    apart = [Answers("full", 0, full), Answers("less", 1, less, reference="full")]
+    assert row(ablation_rows(apart, **SETTINGS), "less").difference is None
+
+
+def test_a_protocol_that_the_reference_lacks_has_no_difference() -> None:
+    rng = np.random.default_rng(0)
+    semantic = answers(rng, protocol="semantic", first_frame=0)
+    found = tuple(Discovery(r.subject, r.take, 0, slots=4, matched=1) for r in semantic)
+    runs = [Answers("full", 0, answers(rng)), Answers("less", 0, semantic, found, reference="full")]
+    less = row(ablation_rows(runs, **SETTINGS), "less", protocol="semantic")
+    assert less.difference is None
+    assert less.metrics.precision
+    assert less.metrics.recall
+    assert (less.metrics.precision.mean, less.metrics.recall.mean) == (0.25, 1.0)
+
+
+def test_what_does_not_belong_together_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    full = Answers("full", 0, answers(rng))
+    with pytest.raises(InputError, match="twice"):
+        ablation_rows([full, full], **SETTINGS)
+    with pytest.raises(InputError, match="same entities"):
+        ablation_rows([full, Answers("less", 0, answers(rng)[:-1], reference="full")], **SETTINGS)
+    with pytest.raises(InputError, match="different frames"):
+        ablation_rows([full, Answers("less", 0, answers(rng, first_frame=3), reference="full")], **SETTINGS)
+
+
+@pytest.fixture
+def variants(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    yield importlib.import_module("ablation_variants")
+    sys.modules.pop("ablation_variants")
+
+
+def test_the_benchmark_has_every_row_that_is_asked_for(variants) -> None:
+    from dataclasses import fields
+
+    from quest.evaluation.lineup import OF_WEIGHTS
+    from quest.train.settings import LossWeights
+
+    both = ("default", "paper")
+    tables = {table: variants.lines_of(table, both) for table in variants.TABLES}
+    for lines in tables.values():
+        labels = [line.label for line in lines]
+        assert len(set(labels)) == len(labels)
+        assert all(line.reference is None or line.reference in labels for line in lines)
+        assert all(line.tracker in (*OF_WEIGHTS, "hold-still") for line in lines)
+    by_name: dict[str, object] = {}
+    for lines in tables.values():
+        for line in lines:
+            assert by_name.setdefault(line.variant.name, line.variant) == line.variant
+    windows = {(line.variant.network.preset, line.variant.network.window) for line in tables["window"]}
+    assert windows == {(p, t) for p in both for t in (2, 4, 8)}
+    assert {line.variant.network.slots for line in tables["slots"]} == {4, 8, 16}
+    off = {f.name for f in fields(LossWeights)}
+    assert off == {name for line in tables["losses"] for name in off if getattr(line.variant.losses, name) == 0}
+    flat = next(line.variant for line in tables["parts"] if line.label == "default: no 3D")
+    assert not flat.network.points3d
+    assert flat.windows.depth_drop_share == 1.0
+    assert flat.losses.aff > 0 == flat.losses.point == flat.losses.joint
