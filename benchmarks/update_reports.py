@@ -193,6 +193,19 @@ TABLES = (
         "frames_per_s",
         {"reader": "key", "median": "median", "least": "least", "most": "most"},
     ),
+    Table(
+        "speed/training.json",
+        "Training steps of the loop, beside bare steps of the same network",
+        "",
+        {
+            "preset": "preset",
+            "windows": "batch",
+            "turns": "n_turns",
+            "frames/s": "frames_per_s",
+            "bare steps": "bare_frames_per_s",
+            "share of bare %": "%share_of_bare",
+        },
+    ),
 )
 
 
