@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from quest.evaluation.lineup import FLOW_NOISES
 from quest.model.config import PRESETS, NetworkConfig
 from quest.train.settings import LossWeights, WindowConfig
 
@@ -15,9 +16,6 @@ TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "design")
 
 LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 """Losses that know of 3D; the others are of pixels, features and confidences."""
-
-NOISES = ("0.01", "0.02", "0.05")
-"""Of chained flow, normalised units."""
 
 LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
     "default": ("aff", "heat", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map", "joint"),
@@ -108,10 +106,9 @@ def _parts(preset: PresetName) -> list[Line]:
     if preset == "default":
         lines += [
             Line(f"{preset}: no grounding", whole, "quest-ungrounded", own),
-            Line(f"{preset}: flow chain", whole, "flow-chain", own),
             *(
-                Line(f"{preset}: flow chain, noise {n}", whole, f"flow-chain-{n}", own)
-                for n in ("0.01", "0.02", "0.05")
+                Line(f"{preset}: flow chain{f', noise {noise}' if noise else ''}", whole, name, own)
+                for name, noise in FLOW_NOISES.items()
             ),
         ]
     return [*lines, Line(f"{preset}: hold still", whole, "hold-still", own)]

@@ -33,11 +33,6 @@ class AffordanceMap:
     offset: Float[Tensor, "B T C 2"]
     lift: Float[Tensor, "B T C"]
 
-    @property
-    def frames(self) -> int:
-        """T."""
-        return self.logits.shape[1]
-
 
 class AffordanceHead(nn.Module):
     """Reads the map off the cells that queries are matched with."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -257,4 +258,4 @@ class Binding:
 
 def _intents(slots: Peaks) -> list[str | None]:
     """What each slot is for; None where the network does not tell."""
-    return [None if lift != lift else INTENTS[int(lift > 0)] for lift in slots.lift.tolist()]
+    return [None if math.isnan(lift) else INTENTS[int(lift > 0)] for lift in slots.lift.tolist()]
