@@ -62,20 +62,26 @@ class Line:
     reference: str | None = None
 
 
+_NETWORKS = {**PRESETS, "default": replace(PRESETS["default"], map_layers=0)}
+"""The presets, but for the default's map: it is read off what queries look at, so that stage 1 trains all of it."""
+
+
 def full(preset: PresetName) -> Variant:
-    """A preset as it is; the default one has a flow head, which changes nothing else."""
-    return Variant(preset, PRESETS[preset], flow=preset == "default")
+    """A preset; the default one has a flow head, which changes nothing else."""
+    return Variant(preset, _NETWORKS[preset], flow=preset == "default")
 
 
 def changed(preset: PresetName, name: str, **fields: object) -> Variant:
     """A preset with other fields of the network."""
-    network = replace(PRESETS[preset], **fields)  # type: ignore[arg-type]
-    return full(preset) if network == PRESETS[preset] else Variant(f"{preset}-{name}", network)
+    network = replace(_NETWORKS[preset], **fields)  # type: ignore[arg-type]
+    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network)
 
 
 def without(preset: PresetName, name: str, *losses: str) -> Variant:
     """A preset trained without some losses."""
-    return Variant(f"{preset}-no-{name}", PRESETS[preset], losses=replace(LossWeights(), **dict.fromkeys(losses, 0.0)))
+    return Variant(
+        f"{preset}-no-{name}", _NETWORKS[preset], losses=replace(LossWeights(), **dict.fromkeys(losses, 0.0))
+    )
 
 
 def no_3d(preset: PresetName) -> Variant:
@@ -115,7 +121,7 @@ def _parts(preset: PresetName) -> list[Line]:
 
 
 def _window(preset: PresetName) -> list[Line]:
-    own = f"{preset}: T = {PRESETS[preset].window}"
+    own = f"{preset}: T = {_NETWORKS[preset].window}"
     labels = {t: f"{preset}: T = {t}" for t in (2, 4, 8)}
     return [
         Line(label, changed(preset, f"window-{t}", window=t), reference=None if label == own else own)
@@ -127,7 +133,7 @@ def _slots(preset: PresetName) -> list[Line]:
     """Learned queries are as many as there are slots; anchored ones are as many as are asked for."""
     if preset != "paper":
         return []
-    own = f"{preset}: K = {PRESETS[preset].slots}"
+    own = f"{preset}: K = {_NETWORKS[preset].slots}"
     labels = {k: f"{preset}: K = {k}" for k in (4, 8, 16)}
     return [
         Line(label, changed(preset, f"slots-{k}", slots=k), reference=None if label == own else own)

@@ -8,7 +8,7 @@ variants, in training and in evaluation. Everything goes on where it stopped: in
 the same arguments, or run it for some --tables, --presets or --seeds first and for all of them in the end.
 
 Every run has the same steps, windows and schedule, and its last weights count: nothing is chosen by validation but the
-threshold of discovery, for every run alike (best F1 in the first frames of the validation takes). docs/metrics.md says
+threshold of discovery, for every run alike (best F2 in the first frames of the validation takes). docs/metrics.md says
 what every row is. The tables rest on the runs that are there: rows and seeds that were not asked for are left out.
 """
 

@@ -22,7 +22,7 @@ from quest.cli.main import main
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
-Stage = Literal["takes", "train", "flow", "tune", "calibrate", "evaluate", "ship"]
+Stage = Literal["takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship"]
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,22 @@ PROCEDURAL = (
 )
 
 
+MAP_PARTNET = (
+    TrainingTakes(
+        "wide_partnet",
+        "--mix broad --level 1 --frames-per-joint 24 --every 8 --views 5 --takes-per-object 4 --seed 100",
+    ),
+)
+MAP_PROCEDURAL = (
+    TrainingTakes("wide_broad", "--mix broad --level 1 --frames-per-joint 24 --every 8 --views 4", 250, 21_000),
+    TrainingTakes("wide_usual", "--level 1 --frames-per-joint 24 --every 8 --views 4", 150, 1_000),
+)
+"""What the affordance map learns from: three frames of many views of many objects."""
+
+MAP_CHOICE = "--level 1 --frames-per-joint 24 --every 8 --views 4"
+"""The same of validation objects, by which the map's checkpoint and the threshold of discovery are chosen."""
+
+
 @dataclass(frozen=True)
 class Release:
     """Make released weights and their figures."""
@@ -75,7 +91,7 @@ class Release:
     """Folder for takes, features and checkpoints."""
     name: str = "quest-s16"
     """Name of the released weights."""
-    stages: tuple[Stage, ...] = ("takes", "train", "flow", "tune", "calibrate", "evaluate", "ship")
+    stages: tuple[Stage, ...] = ("takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship")
     """Which stages to run; each needs what those before it made."""
     partnet: bool = True
     """Whether PartNet-Mobility objects teach, which makes the weights for research use only."""
@@ -95,6 +111,8 @@ class Release:
     """Trained weights to start from, instead of the encoder alone."""
     steps: int = 6000
     """Optimiser steps."""
+    map_steps: int = 1200
+    """Optimiser steps of the affordance map."""
     flow_steps: int = 600
     """Optimiser steps of the flow head."""
     batch: int = 16
@@ -113,30 +131,48 @@ class Release:
     def _recipe(self) -> tuple[TrainingTakes, ...]:
         return (*(PARTNET if self.partnet else ()), *PROCEDURAL)
 
-    def _training_stores(self) -> list[Path]:
-        return sorted({self._takes_of("train", takes.store) for takes in self._recipe()})
+    def _map_recipe(self) -> tuple[TrainingTakes, ...]:
+        return (*(MAP_PARTNET if self.partnet else ()), *MAP_PROCEDURAL)
+
+    def _stores(self, recipe: tuple[TrainingTakes, ...]) -> list[Path]:
+        return sorted({self._takes_of("train", takes.store) for takes in recipe})
+
+    def _taught_by(self, recipe: tuple[TrainingTakes, ...], choice: str) -> list[object]:
+        """Where `quest train` finds takes that teach, what it mirrors, what chooses, and where its features lie."""
+        stores = self._stores(recipe)
+        mirrored = [store for store in stores if "partnet" in store.name]
+        return ["--data", *stores, self._takes_of(choice), *(("--mirrored", *mirrored) if mirrored else ()),
+                "--cache", self.work / "features", "--windows.batch", self.batch]  # fmt: skip
 
     def _takes_of(self, *parts: str) -> Path:
         return self.work.joinpath("takes", *parts)
 
     def _takes(self) -> None:
         """Takes that teach, thinned, and takes that choose, whole."""
-        for takes in self._recipe():
+        for takes in (*self._recipe(), *self._map_recipe()):
             which = ["--no-partnet" if takes.objects else "--partnet"]
             if takes.objects:
                 count = max(1, round(self.procedural_share * takes.objects))
                 which += ["--seeds", f"{takes.first_seed}..{takes.first_seed + count - 1}"]
-            _quest("generate", "--out", self._takes_of("train", takes.store), "--split", "train", "--every", self.every,
-                   *which, *takes.arguments.split())  # fmt: skip
+            thinned = [] if "--every" in takes.arguments else ["--every", self.every]
+            _quest("generate", "--out", self._takes_of("train", takes.store), "--split", "train", *which, *thinned,
+                   *takes.arguments.split())  # fmt: skip
         self._generate_whole("validation")
+        choice = ("--out", self._takes_of("wide_validation"), "--split", "validation", *MAP_CHOICE.split())
+        _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
+        _quest("generate", *choice, "--no-partnet", "--seeds", "105000..105023", "--mix", "broad")
 
     def _train(self) -> None:
-        run = self.work / "train"
         start = ("--weights", self.start) if self.start else ("--encoder", self._encoder())
-        mirrored = [store for store in self._training_stores() if store.name.startswith("partnet")]
-        _quest("train", "--data", *self._training_stores(), self._takes_of("validation"), "--out", run,
-               *(("--mirrored", *mirrored) if mirrored else ()), "--cache", self.work / "features", *start,
-               "--training.steps", self.steps, "--windows.batch", self.batch)  # fmt: skip
+        _quest("train", *self._taught_by(self._recipe(), "validation"), "--out", self.work / "train", *start,
+               "--training.steps", self.steps)  # fmt: skip
+
+    def _map(self) -> None:
+        """The affordance map, on the network that stage 1 left."""
+        _quest("train", "--stage", "map", "--weights", self.work / "train" / "weights.safetensors",
+               *self._taught_by(self._map_recipe(), "wide_validation"), "--out", self.work / "map",
+               "--training.steps", self.map_steps, "--training.weight-decay", 0.05,
+               "--training.validate-every", 100, "--training.validation-batches", 30)  # fmt: skip
 
     def _encoder(self) -> Path:
         encoder = self.work / "encoder.safetensors"
@@ -145,10 +181,9 @@ class Release:
         return encoder
 
     def _flow(self) -> None:
-        _quest("train", "--stage", 2, "--weights", self.work / "train" / "weights.safetensors",
-               "--data", *self._training_stores(), self._takes_of("validation"), "--out", self.work / "flow",
-               "--cache", self.work / "features", "--training.steps", self.flow_steps,
-               "--windows.batch", self.batch)  # fmt: skip
+        _quest("train", "--stage", 2, "--weights", self.work / "map" / "weights.safetensors",
+               *self._taught_by(self._recipe(), "validation"), "--out", self.work / "flow",
+               "--training.steps", self.flow_steps)  # fmt: skip
 
     def _tune(self) -> None:
         """The tracker's settings, in a copy that gets its name when they are chosen."""

@@ -169,6 +169,20 @@ TABLES = (
         },
     ),
     Table(
+        "intents.json",
+        "Open and lift: two places of one label on one thing, both asked for",
+        "rows",
+        OBJECTS
+        | {
+            "objects/takes/views": "objects/takes/views",
+            "both stable %": "%both",
+            "APE open": "open_ape",
+            "APE lift": "lift_ape",
+            "Acc open %": "%open_acc",
+            "Acc lift %": "%lift_acc",
+        },
+    ),
+    Table(
         "data/verify.json",
         "Takes of all suites, verified",
         "worst",

@@ -37,7 +37,7 @@ class FineTune:
     procedural: int = 0
     """Procedural objects to learn from as well, so that the network keeps what it knows of others."""
     steps: int = 300
-    """Training steps."""
+    """Training steps of what follows entities, and as many of what discovers them."""
     learning_rate: float = 1e-4
     """A quarter of what training anew takes: the weights are good already."""
 
@@ -63,7 +63,9 @@ class FineTune:
             "training.validate-every": max(1, self.steps // 6),
         }
         say("train", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
-        mine = run / "weights.safetensors"
+        found = {"data": data, "validation": takes / "choose", "weights": run / "weights.safetensors"}
+        say("train", stage="map", out=self.out / "map", **found, **training)
+        mine = self.out / "map" / "weights.safetensors"
         say("weights", "tune", str(mine), takes=takes / "choose")
         self.judge(mine, "after")
         self.compare()

@@ -3,6 +3,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import pytest
 
@@ -156,3 +157,17 @@ def test_doctor_fails_without_weights(monkeypatch, capsys):
     monkeypatch.setattr("quest.model.weights.shipped_weights", dict)
     assert program.main(["doctor"]) == 1
     assert "cannot track recordings here: weights" in capsys.readouterr().out
+
+
+def test_output_that_nobody_reads_is_no_error():
+    quest = Path(sys.executable).with_name("quest")
+    done = subprocess.run(
+        f'"{quest}" track --help | head -n 1; echo "${{PIPESTATUS[0]}}"',
+        shell=True,
+        executable="/bin/bash",
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "Traceback" not in done.stderr
+    assert done.stdout.splitlines()[-1] in ("0", "141")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def test_other_objects_than_validation_are_refused(store: TakeStore):
 
 
 def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
-    """Three candidates, of which the first and the last are entities: keeping all gives F1 = 4 / 5."""
+    """Three candidates, of which the first and the last are entities: keeping all gives the best F2."""
     take = store.read(NAME)
     entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
     labels = [take.info.entities[e].label for e in entities]
@@ -60,9 +61,18 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
     monkeypatch.setattr(
         tuning, "_slots", lambda tracker, take, view: (places, [labels[0], labels[0], labels[1]], [2.0, 1.0, -1.0])
     )
-    bias, f1 = discovery_bias(make_tracker(), store, [NAME])
-    assert f1 == pytest.approx(4 / 5)
+    bias, precision, recall = discovery_bias(make_tracker(), store, [NAME])
+    assert (precision, recall) == pytest.approx((2 / 3, 1.0))
     assert bias == pytest.approx(1.0)
+
+
+def test_after_the_map_alone_only_discovery_is_tuned(store: TakeStore):
+    tracker, told = make_tracker(), list[Trial]()
+    tuned = tune(tracker, store, {NAME: "validation"}, report=told.append, discovery_only=True)
+    assert not told
+    assert tuned.config == replace(tracker.config, slot_bias=tuned.config.slot_bias)
+    assert 0 <= tuned.precision <= 1
+    assert 0 <= tuned.recall <= 1
 
 
 @pytest.mark.parametrize("capacity", [3, 100])

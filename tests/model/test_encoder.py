@@ -48,6 +48,32 @@ def test_colours_are_normalised():
     torch.testing.assert_close(seen[0][0, :, 5, 7], expected)
 
 
+def test_an_enlarged_image_has_tokens_of_its_smaller_parts():
+    torch.manual_seed(0)
+    encoder = Encoder(CONFIG).eval()
+    rgb = torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8)
+    larger = Encoder(EncoderConfig(image_size=128, patch_size=16, width=32, depth=1, heads=2)).eval()
+    larger.load_initial(encoder.state_dict())
+    seen = []
+    encoder.patch.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    tokens = encoder(rgb, enlarge=2)
+    assert tokens.shape == (1, 64, 32)
+    assert seen[0].shape == (1, 3, 128, 128)
+    # Larger by resampling: the mean colour of the image stays.
+    torch.testing.assert_close(seen[0].mean((2, 3)), encoder_input(encoder, rgb).mean((2, 3)), rtol=0, atol=0.02)
+    smooth = torch.full((1, 64, 64, 3), 100, dtype=torch.uint8)
+    expected = larger(torch.full((1, 128, 128, 3), 100, dtype=torch.uint8))
+    torch.testing.assert_close(encoder(smooth, enlarge=2), expected, rtol=1e-4, atol=1e-4)
+
+
+def encoder_input(encoder: Encoder, rgb: Tensor) -> Tensor:
+    seen = []
+    handle = encoder.patch.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
+    encoder(rgb)
+    handle.remove()
+    return seen[0]
+
+
 def test_images_of_a_batch_do_not_meet():
     torch.manual_seed(0)
     encoder = Encoder(CONFIG).eval()

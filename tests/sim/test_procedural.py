@@ -158,9 +158,18 @@ def test_mix_knows_every_category_and_is_stable() -> None:
 
 
 def test_broad_mix_has_everything() -> None:
-    assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == set(CATEGORIES)
+    with_handles = {name for name in CATEGORIES if not name.startswith("bare_")}
+    assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == with_handles
     with pytest.raises(ConfigError, match="unknown mix 'wide'; expected one of usual, broad"):
         category_for_seed(0, mix="wide")
+
+
+@pytest.mark.parametrize("category", [name for name in CATEGORIES if name.startswith("bare_")])
+def test_bare_furniture_has_no_handles(category: str) -> None:
+    for seed in range(3):
+        model = build_model(category, seed)
+        assert len(model.links) >= 1
+        assert not any(link.has_handle for link in model.links)
 
 
 @pytest.mark.parametrize(

@@ -125,3 +125,17 @@ def test_batches_of_images_do_not_matter():
     rgb = np.random.default_rng(0).integers(0, 255, (5, 64, 64, 3)).astype(np.uint8)
     one, all_ = (encode_images(encoder, rgb, device=CPU, batch=n) for n in (2, 5))
     np.testing.assert_allclose(one.astype(float), all_.astype(float), atol=0.05)
+
+
+def test_tokens_of_enlarged_images_join_an_entry_when_they_are_asked_for(tmp_path: Path):
+    store, cache = store_with(tmp_path), cache_in(tmp_path)
+    assert build(cache, store) == (4, 4)
+    before = times(tmp_path)
+    assert not list(tmp_path.glob("cache/*/enlarged.npy"))
+    assert tuple(cache.build(store, store.names(), device=CPU, enlarged=True)) == (4, 4)
+    assert times(tmp_path) == before
+    for view in cache.views([NAME]):
+        with torch.no_grad():
+            expected = make_network().enlarge(torch.from_numpy(np.array(view.rgb))).numpy()
+        assert view.enlarged.shape == (4, DEFAULT.cells**2, DEFAULT.encoder.width)
+        assert np.abs(view.enlarged - expected).max() < 0.1 * np.abs(expected).max()

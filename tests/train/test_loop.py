@@ -247,4 +247,12 @@ def test_validation_is_the_same_at_every_call(samplers: dict[str, WindowSampler]
     assert one.answers > 0
     assert 0 <= one.mean_distance <= 1
     assert 0 <= one.right <= 1
-    assert 0 <= one.discovery_f1 <= 1
+    assert one.discovery_f1 is None, "neither reads a map off what its queries look at"
+
+
+def test_a_map_without_a_trunk_is_validated_with_the_rest(tmp_path: Path):
+    network = make_network(map_layers=0)
+    scores = validate(network, make_sampler(tmp_path, network), batches=1, device=torch.device("cpu"))
+    assert scores.discovery_f1 is not None
+    assert 0 <= scores.discovery_f1 <= 1
+    assert "discovery F1" in str(scores)

@@ -11,9 +11,9 @@ from jaxtyping import Float, Float32
 from torch import Tensor
 
 from quest.data.letterbox import Letterbox
-from quest.geometry import invert
+from quest.model.framing import Framer
 from quest.model.network import QuestNetwork
-from quest.model.observation import FrameBatch, Observation, cell_depth, reference_of
+from quest.model.observation import FrameBatch, Observation
 from quest.types import Clip
 
 
@@ -38,34 +38,21 @@ class ClipFrames:
         self._clip = clip
         self._device = device
         self._window: deque[Observation] = deque(maxlen=network.config.window)
-        camera = self.letterbox.camera
-        self._intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=device)
+        self._framer = Framer(network, self.letterbox.camera, device=device)
         first = 0
         if clip.depth_m is not None:
             first = int(np.argmax([bool(((d > 0) & np.isfinite(d)).any()) for d in clip.depth_m]))
-        cells = cell_depth(self._depth(first), network.config.cell_px)
-        self._center, self._scale = reference_of(cells, self._intrinsics, self.letterbox.size)
         self._cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).double()
-        self._reference = self._cam_from_world[first]
-        self.scale_m = float(self._scale[0])
+        self._reference = self._framer.reference(self._depth(first), self._cam_from_world[first])
+        self.scale_m = float(self._reference.scale[0])
 
     def see(self, t: int) -> tuple[FrameBatch, Observation]:
         """Frame ``t`` (B = T = 1) and what the network observes in it.
 
         Frames that are seen in order make up the window of :meth:`window`; some may be left out.
         """
-        image = torch.from_numpy(np.ascontiguousarray(self.letterbox.rgb(self._clip.rgb[t]))).to(self._device)
-        depth = self._depth(t)
-        ref_from_cam = self._reference @ invert(self._cam_from_world[t])
-        frames = FrameBatch(
-            features=self._network.encode(image[None])[:, None].float(),
-            rgb=image[None, None],
-            depth_m=depth[None],
-            cell_depth_m=cell_depth(depth, self._network.config.cell_px)[None],
-            intrinsics=self._intrinsics,
-            ref_from_cam=ref_from_cam.float().to(self._device)[None, None],
-            center=self._center,
-            scale=self._scale,
+        frames = self._framer.frame(
+            self.letterbox.rgb(self._clip.rgb[t]), self._depth(t), self._cam_from_world[t], self._reference
         )
         observed = self._network.observe(frames)
         while len(self._window) < self._network.config.window - 1:
@@ -90,18 +77,18 @@ class ClipFrames:
     def to_world(self, displacement: Float[Tensor, "K 3"]) -> Float[np.ndarray, "K 3"]:
         """Displacements of the reference frame in the world, metres."""
         metric = displacement.double().cpu() * self.scale_m
-        return (metric @ self._reference[:3, :3]).numpy()  # the transposed rotation, from the right
+        # The transposed rotation, from the right.
+        return (metric @ self._reference.cam_from_world[:3, :3]).numpy()
 
     def to_reference(self, point_world: Float[np.ndarray, "K 3"]) -> Float[Tensor, "K 3"]:
         """World points in the reference frame."""
-        point = torch.from_numpy(point_world).double() @ self._reference[:3, :3].mT + self._reference[:3, 3]
-        return ((point - self._center[0].cpu().double()) / self.scale_m).float().to(self._device)
+        pose = self._reference.cam_from_world
+        point = torch.from_numpy(point_world).double() @ pose[:3, :3].mT + pose[:3, 3]
+        return ((point - self._reference.center[0].cpu().double()) / self.scale_m).float().to(self._device)
 
     def _depth(self, t: int) -> Float[Tensor, "1 S S"]:
-        size = self.letterbox.size
         depth_m = self._clip.depth_m
-        raw = np.zeros((size, size), np.float32) if depth_m is None else self.letterbox.depth(depth_m[t])
-        return torch.from_numpy(np.ascontiguousarray(raw)).to(self._device)[None]
+        return self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m[t]))
 
 
 def single_frame(clip: Clip, t: int) -> Clip:

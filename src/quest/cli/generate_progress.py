@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from quest.sim.production import Event
 
 
+_LEAST_S = 5.0
+"""Less tells nothing of the speed: takes are written while the next ones are rendered, so two may end together."""
+
+
 class GenerateProgress:
     """Shows what a production reports; a context manager that sums up at the end.
 
@@ -45,7 +49,7 @@ class GenerateProgress:
     ) -> None:
         self._bar.stop()
         if self.made or self.skipped:
-            speed = f" at {self._speed()}" if self._frames else ""
+            speed = f" at {self._speed()}" if self._speed() else ""
             # To the log as one line, whatever the width of the terminal.
             self._console.print(
                 f"{self.made} takes written{speed}, {self.skipped} skipped; store {escape(self._store)}", soft_wrap=True
@@ -75,7 +79,8 @@ class GenerateProgress:
             self._frames += frames
 
     def _speed(self) -> str:
-        return f"{self._frames / (self._last - self._first):.1f} frames/s" if self._frames else ""
+        took_s = self._last - self._first
+        return f"{self._frames / took_s:.1f} frames/s" if took_s >= _LEAST_S else ""
 
     def _warn(self, line: str) -> None:
         if line not in self._said:

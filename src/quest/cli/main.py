@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
@@ -25,6 +26,7 @@ from quest.extras import explain_missing
 
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
+EXIT_BROKEN_PIPE = 141
 
 COMMANDS: dict[str, type[Command]] = {
     "generate": Generate,
@@ -78,9 +80,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: what follows ``quest``; those of the process by default.
 
     Returns:
-        The exit code: the command's own, 2 for an error that the user can mend, 130 when interrupted.
+        The exit code: the command's own, 2 for an error that the user can mend, 130 when interrupted, 141 when nobody
+        reads the output any more.
     """
-    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        return _run(sys.argv[1:] if arguments is None else arguments)
+    except BrokenPipeError:
+        # As in `quest --help | head -1`. Nothing can be flushed at exit either.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_BROKEN_PIPE
+
+
+def _run(arguments: Sequence[str]) -> int:
     if list(arguments) == ["--version"]:
         from quest import __version__
 

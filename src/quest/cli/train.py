@@ -68,8 +68,9 @@ class Train:
     """Start from these trained weights (a name or a file) instead, to fit your own objects."""
     validation: tuple[str, ...] = ()
     """Stores to choose by, for objects that are in no split."""
-    stage: Literal[1, 2] = 1
-    """1 trains everything but the encoder; 2 trains the flow head of --weights and nothing else."""
+    stage: Literal[1, "map", 2] = 1
+    """1 trains everything that follows entities; map trains the affordance map of --weights, from which entities are
+    discovered, and nothing else; 2 trains the flow head of --weights and nothing else."""
     mirrored: tuple[str, ...] = ()
     """Stores whose training takes teach by their mirror images; name a store in --data too to use both."""
     preset: Literal["default", "paper"] = "default"
@@ -125,19 +126,20 @@ class Train:
         from quest.track.settings import TrackerConfig
         from quest.train.dataset import load_initial_encoder
         from quest.train.flow import with_flow_head, without_flow_head
+        from quest.train.mapping import with_own_map
 
         if self.weights is not None:
             if self.network != NetworkChanges():
                 raise ConfigError("train: trained weights have a network of their own; leave --network.* away")
             loaded = load_network(self.weights)
             network = loaded.network.train()
-            if self.stage == 2:
+            if self.stage != 1:
                 # Tracking stays as it is, and so does what the monitor was calibrated on.
-                about = f"{loaded.about}; "
-                return _Start(with_flow_head(network), loaded.settings, loaded.monitor, about, loaded.licence)
+                grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
+                return _Start(grown, loaded.settings, loaded.monitor, f"{loaded.about}; ", loaded.licence)
             return _Start(without_flow_head(network), loaded.settings, licence=loaded.licence)
-        if self.stage == 2:
-            raise ConfigError("train: stage 2 needs --weights, a network that stage 1 has trained")
+        if self.stage != 1:
+            raise ConfigError(f"train: stage {self.stage} needs --weights, a network that stage 1 has trained")
         if self.encoder is None:
             raise ConfigError(
                 "train: pass --encoder FILE to start anew, or --weights NAME to start from trained weights"
@@ -158,13 +160,17 @@ class Train:
             windows=self.windows,
             device=device,
             report=_feature_bar(progress),
+            anchors_only=self.stage == "map",
         )
 
     def _objective(self, network: QuestNetwork) -> Objective:
         from quest.train.flow import StageTwo
+        from quest.train.mapping import StageMap
         from quest.train.stage import StageOne
 
-        return StageOne(network, self.losses) if self.stage == 1 else StageTwo(network)
+        if self.stage == 1:
+            return StageOne(network, self.losses)
+        return StageMap(network) if self.stage == "map" else StageTwo(network)
 
     def _write(self, best: Path, start: _Start, takes: int) -> Path:
         """The best checkpoint as a file that the tracker loads."""
@@ -174,7 +180,7 @@ class Train:
         network = start.network.cpu()
         load_checkpoint(best, network, None)
         file = self.out / "weights.safetensors"
-        how = f"--stage {self.stage}" if self.stage == 2 else f"--preset {network.config.preset}"
+        how = f"--stage {self.stage}" if self.stage != 1 else f"--preset {network.config.preset}"
         about = f"{start.about}quest train {how}, {takes} training takes"
         save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=start.licence)
         return file

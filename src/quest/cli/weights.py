@@ -132,6 +132,8 @@ class TuneWeights:
     """Levels of the takes to use."""
     objects: tuple[str, ...] = ()
     """Objects to use; all by default."""
+    discovery_only: bool = False
+    """Leave all settings but the threshold of discovery as they are, as after training with --stage map."""
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
@@ -144,9 +146,14 @@ class TuneWeights:
         store = TakeStore(self.takes)
         takes = _to_choose_by(store, levels=self.level, objects=self.objects)
         tuned = tune(
-            load(self.weights), store, takes, report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}")
+            load(self.weights),
+            store,
+            takes,
+            report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}"),
+            discovery_only=self.discovery_only,
         )
-        console.print(f"discovery F1 {tuned.discovery_f1:.3f}; settings {tuned.config.to_json()}")
+        console.print(f"discovery: precision {tuned.precision:.1%}, recall {tuned.recall:.1%}")
+        console.print(f"settings {tuned.config.to_json()}")
         replace(load_network(self.weights), settings=tuned.config.to_json()).save(self.weights)
         return 0
 

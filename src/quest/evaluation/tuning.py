@@ -1,7 +1,8 @@
 """Choose the tracker's settings on validation objects.
 
 One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``,
-PartNet-Mobility and procedural objects alike); the threshold of discovery by its F1 in the first frame.
+PartNet-Mobility and procedural objects alike); the threshold of discovery by its F2 in the first frame, in which recall
+counts twice as much as precision: a false entity costs one more track, a missed one is not followed at all.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ GRID: dict[str, tuple[float, ...]] = {
 """Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
 _SLOT_RADIUS_PX = 16.0
+_BETA = 2.0
 
 
 @dataclass(frozen=True)
@@ -54,16 +56,23 @@ class Tuned:
     Attributes:
         config: the chosen settings.
         trials: everything that was tried.
-        discovery_f1: F1 of discovery at the chosen threshold.
+        precision: of discovery at the chosen threshold.
+        recall: of discovery there.
     """
 
     config: TrackerConfig
     trials: tuple[Trial, ...]
-    discovery_f1: float
+    precision: float
+    recall: float
 
 
 def tune(
-    tracker: Tracker, store: TakeStore, takes: Mapping[str, SplitPart], *, report: Callable[[Trial], None]
+    tracker: Tracker,
+    store: TakeStore,
+    takes: Mapping[str, SplitPart],
+    *,
+    report: Callable[[Trial], None],
+    discovery_only: bool = False,
 ) -> Tuned:
     """Choose settings for a tracker's network.
 
@@ -72,6 +81,8 @@ def tune(
         store: where the takes are.
         takes: takes of validation objects, by name.
         report: told of every trial.
+        discovery_only: leave all settings but the threshold of discovery as they are, as after training the affordance
+            map alone.
 
     Raises:
         ConfigError: a take is not of a validation object, or nothing moves in them.
@@ -81,10 +92,10 @@ def tune(
         raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
     config, trials = tracker.config, []
     remember_frames(tracker.network, capacity=10_000)
-    bias, f1 = discovery_bias(tracker, store, list(takes))
+    bias, precision, recall = discovery_bias(tracker, store, list(takes))
     config = replace(config, slot_bias=bias)
     known: dict[TrackerConfig, float] = {}
-    for name, values in GRID.items():
+    for name, values in () if discovery_only else GRID.items():
         configs = [replace(config, **{name: v}) for v in values]
         new = [c for c in configs if c not in known]
         known |= zip(new, _scores(tracker, new, store, takes) if new else (), strict=True)
@@ -93,11 +104,11 @@ def tune(
             report(trial)
         trials += tried
         config = replace(config, **{name: min(tried, key=lambda t: t.ape).value})
-    return Tuned(config, tuple(trials), f1)
+    return Tuned(config, tuple(trials), precision, recall)
 
 
-def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> tuple[float, float]:
-    """Bias of the affordance logit at which discovery in the first frame has its best F1, and that F1.
+def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> tuple[float, float, float]:
+    """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
     A slot counts as found if an unclaimed visible entity of its label lies within 16 px of the network's input.
     """
@@ -114,10 +125,10 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
             present += count
     order = np.argsort(-np.array(logits))
     right = np.cumsum(np.array(hits)[order])
-    f1 = 2 * right / (np.arange(1, len(order) + 1) + max(present, 1))
-    best = int(f1.argmax())
+    taken = np.arange(1, len(order) + 1)
+    best = int(((1 + _BETA**2) * right / (taken + _BETA**2 * max(present, 1))).argmax())
     threshold = logits[order[best]] if best + 1 == len(order) else (logits[order[best]] + logits[order[best + 1]]) / 2
-    return -float(threshold), float(f1[best])
+    return -float(threshold), float(right[best] / taken[best]), float(right[best] / max(present, 1))
 
 
 def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[str], list[float]]:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from quest.model.config import NetworkConfig
 from quest.model.layers import TokenLayer
-from quest.model.observation import FrameBatch, Observation, Observer
+from quest.model.observation import FrameBatch, Observer
 from quest.types import LABELS
 
 
@@ -55,32 +55,42 @@ class AffordanceHead(nn.Module):
 
 
 class AffordanceTrunk(nn.Module):
-    """Observes frames for the map alone: more layers over tokens, and convolutions over cells.
+    """Observes frames for the map alone, with the image's tokens at twice its size.
 
     What a query needs to be told from its neighbours and what makes a handle a handle are different things; with a
-    trunk of its own the map learns at its own pace. It runs only while something is to be discovered.
+    trunk of its own the map learns at its own pace, and a handle of a few pixels fills a token. It runs only while
+    something is to be discovered.
     """
+
+    width = 192
+    _dropout = 0.1
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         self.observer = Observer(config)
-        f = Observer.fine_width
-        self.layers = nn.ModuleList(TokenLayer(config.width, config.heads) for _ in range(config.map_layers))
-        self.grid, self.cells = config.encoder.grid, config.cells
-        self.up = nn.Linear(config.width, f)
+        f, self.cells = Observer.fine_width, config.cells
+        self.enlarged = nn.Sequential(
+            nn.LayerNorm(config.encoder.width), nn.Dropout(self._dropout), nn.Linear(config.encoder.width, self.width)
+        )
+        self.fine = nn.Linear(f, self.width)
+        self.layers = nn.ModuleList(TokenLayer(self.width, self.width // 32) for _ in range(config.map_layers))
+        self.out = nn.Linear(self.width, f)
+        self.dropout = nn.Dropout(self._dropout)
         self.mix = nn.ModuleList(nn.Conv2d(f, f, 3, padding=1) for _ in range(2))
         self.norm = nn.ModuleList(nn.GroupNorm(8, f) for _ in range(2))
 
-    def forward(self, frames: FrameBatch) -> Float[Tensor, "B T C F"]:
-        """Cells of every frame."""
-        observed: Observation = self.observer(frames)
-        b, t = observed.tokens.shape[:2]
-        tokens = observed.tokens.flatten(0, 1)
+    def forward(self, frames: FrameBatch, enlarged: Float[Tensor, "B T C E"]) -> Float[Tensor, "B T C F"]:
+        """Cells of every frame.
+
+        Args:
+            frames: the frames.
+            enlarged: tokens of their images at twice the size.
+        """
+        fine = self.observer(frames).fine.flatten(0, 1)
+        tokens = self.enlarged(enlarged.flatten(0, 1)) + self.fine(fine)
         for layer in self.layers:
             tokens = layer(tokens)
-        h = self.up(tokens).transpose(1, 2).unflatten(2, (self.grid, self.grid))
-        h = F.interpolate(h, size=(self.cells, self.cells), mode="bilinear", align_corners=False)
-        h = h + observed.fine.flatten(0, 1).transpose(1, 2).unflatten(2, (self.cells, self.cells))
+        h = self.dropout(fine + self.out(tokens)).transpose(1, 2).unflatten(2, (self.cells, self.cells))
         for mix, norm in zip(self.mix, self.norm, strict=True):
             h = h + F.gelu(norm(mix(F.gelu(h))))
-        return h.flatten(2).transpose(1, 2).unflatten(0, (b, t))
+        return h.flatten(2).transpose(1, 2).unflatten(0, enlarged.shape[:2])

@@ -32,7 +32,8 @@ class NetworkConfig:
         points3d: whether tokens and queries carry the position code of their 3D point, and details of depth.
         cell_px: side of a cell of the heatmap, pixels of the network's input.
         intents: whether queries and the affordance map tell entities to open from entities to lift.
-        map_layers: transformer layers of the affordance map's own trunk; 0 reads it off what the decoder looks at.
+        map_layers: transformer layers of the affordance map's own trunk, over tokens of the image at twice its size;
+            0 reads the map off what the decoder looks at.
         flow: whether there is a flow head, which stage 2 trains.
     """
 
@@ -92,7 +93,7 @@ class NetworkConfig:
 
 
 PRESETS: dict[str, NetworkConfig] = {
-    "default": NetworkConfig(intents=True, map_layers=4),
+    "default": NetworkConfig(intents=True, map_layers=1),
     "paper": NetworkConfig(
         preset="paper",
         queries="learned",

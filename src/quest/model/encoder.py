@@ -86,11 +86,19 @@ class Encoder(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, rgb: UInt8[Tensor, "B H W 3"]) -> Float[Tensor, "B N D"]:
-        """Tokens of images of the configured size, row by row, without the class token."""
-        image = (rgb.permute(0, 3, 1, 2).to(self.mean.dtype) / 255 - self.mean) / self.std
-        x = self.patch(image).flatten(2).transpose(1, 2)
-        x = torch.cat((self.class_token.expand(len(x), -1, -1), x), dim=1) + self.position
+    def forward(self, rgb: UInt8[Tensor, "B H W 3"], *, enlarge: int = 1) -> Float[Tensor, "B N D"]:
+        """Tokens of images of the configured size, row by row, without the class token.
+
+        Args:
+            rgb: the images.
+            enlarge: how many times larger to make them first, for tokens of smaller parts of them.
+        """
+        image = rgb.permute(0, 3, 1, 2).to(self.mean.dtype)
+        if enlarge > 1:
+            image = F.interpolate(image, scale_factor=enlarge, mode="bicubic", align_corners=False).clamp(0, 255)
+        x = self.patch((image / 255 - self.mean) / self.std).flatten(2).transpose(1, 2)
+        position = resize_position(self.position, enlarge * self.config.grid)
+        x = torch.cat((self.class_token.expand(len(x), -1, -1), x), dim=1) + position
         for block in self.blocks:
             x = block(x)
         return self.norm(x)[:, 1:]

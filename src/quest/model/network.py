@@ -61,6 +61,10 @@ class QuestNetwork(nn.Module):
         """Tokens of letterboxed images; frozen while the decoder trains, so they can be cached."""
         return self.encoder(rgb)
 
+    def enlarge(self, rgb: UInt8[Tensor, "B H W 3"]) -> Float[Tensor, "B C E"]:
+        """Tokens of letterboxed images at twice their size, one per cell, from which the affordance map is read."""
+        return self.encoder(rgb, enlarge=2)
+
     def observe(self, frames: FrameBatch) -> Observation:
         """What the decoder and the binder look at."""
         return self.observer(frames)
@@ -97,8 +101,13 @@ class QuestNetwork(nn.Module):
         """
         if not isinstance(self.head, HeatmapHead):
             raise ConfigError(f"preset {self.config.preset!r}: learned queries have no affordance map")
-        fine = observed.fine if self.affordance_trunk is None else self.affordance_trunk(frames)
-        return self.affordance(fine)
+        if self.affordance_trunk is None:
+            return self.affordance(observed.fine)
+        enlarged = frames.enlarged
+        if enlarged is None:
+            with torch.no_grad():
+                enlarged = self.enlarge(frames.rgb.flatten(0, 1)).unflatten(0, frames.rgb.shape[:2])
+        return self.affordance(self.affordance_trunk(frames, enlarged))
 
     def slots(self, batch: int) -> Anchor:
         """The learned queries, for networks that have them."""
@@ -163,5 +172,6 @@ class QuestNetwork(nn.Module):
         return self.flow(prediction.embedding, prediction.point)
 
     def trainable(self) -> list[nn.Parameter]:
-        """Parameters of stage 1: all outside the encoder and the flow head."""
-        return [p for name, p in self.named_parameters() if not name.startswith(("encoder.", "flow."))]
+        """Parameters of stage 1: all outside the encoder, the flow head, and a map with a trunk of its own."""
+        others = ("encoder.", "flow.") if self.config.map_layers == 0 else ("encoder.", "flow.", "affordance")
+        return [p for name, p in self.named_parameters() if not name.startswith(others)]

@@ -32,6 +32,8 @@ class FrameBatch:
         ref_from_cam: rigid motion from each frame's camera to the reference camera, metres.
         center: origin of the reference frame in the reference camera, metres.
         scale: metres per unit of the reference frame.
+        enlarged: tokens of the images at twice their size, one per cell, where they are known already; None where
+            the network is to encode them when it looks for entities.
     """
 
     features: Float[Tensor, "B T N E"]
@@ -42,6 +44,7 @@ class FrameBatch:
     ref_from_cam: Float[Tensor, "B T 4 4"]
     center: Float[Tensor, "B 3"]
     scale: Float[Tensor, " B"]
+    enlarged: Float[Tensor, "B T C E"] | None = None
 
     def during(self, frames: slice | list[int]) -> FrameBatch:
         """Some of the frames."""
@@ -52,11 +55,12 @@ class FrameBatch:
             depth_m=self.depth_m[:, frames],
             cell_depth_m=self.cell_depth_m[:, frames],
             ref_from_cam=self.ref_from_cam[:, frames],
+            enlarged=None if self.enlarged is None else self.enlarged[:, frames],
         )
 
     def of(self, batch: slice) -> FrameBatch:
         """Some of the batch."""
-        return FrameBatch(**{f.name: getattr(self, f.name)[batch] for f in fields(self)})
+        return FrameBatch(**{name: value[batch] for name, value in self._tensors().items()})
 
     def ends(self) -> FrameBatch:
         """The first and the last frame."""
@@ -64,7 +68,10 @@ class FrameBatch:
 
     def to(self, device: torch.device) -> FrameBatch:
         """The same on a device."""
-        return FrameBatch(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return FrameBatch(**{name: value.to(device) for name, value in self._tensors().items()})
+
+    def _tensors(self) -> dict[str, Tensor]:
+        return {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
 
     def to_reference(
         self, uv_px: Float[Tensor, "B T Q 2"], depth_m: Float[Tensor, "B T Q"]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -13,9 +12,9 @@ from torch import Tensor
 
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
-from quest.geometry import invert
+from quest.model.framing import Framer, Reference
 from quest.model.network import QuestNetwork
-from quest.model.observation import FrameBatch, cell_depth, reference_of
+from quest.model.observation import FrameBatch
 from quest.types import Camera
 
 _FRAMES_PER_S = 30.0
@@ -29,23 +28,6 @@ class Arrival(Enum):
     NEW = "new"
     LATE = "late"
     DUPLICATE = "duplicate"
-
-
-@dataclass(frozen=True)
-class Reference:
-    """The reference frame of a stream (see :mod:`quest.model.observation`).
-
-    Attributes:
-        cam_from_world: pose of the camera at which it began.
-        center: its origin in that camera, metres.
-        scale: metres per unit.
-        has_depth: whether it was made from depth; without, units are metres by guess.
-    """
-
-    cam_from_world: Float[Tensor, "4 4"]
-    center: Float[Tensor, "1 3"]
-    scale: Float[Tensor, " 1"]
-    has_depth: bool
 
 
 class Intake:
@@ -68,7 +50,7 @@ class Intake:
         self.reference: Reference | None = None
         self.elapsed = 1.0
         self.flags: tuple[str, ...] = ()
-        self._network = network
+        self._framer = Framer(network, self.letterbox.camera, device=device)
         self._device = device
         self._stamp_s: float | None = None
         self._pose: np.ndarray | None = None
@@ -138,35 +120,18 @@ class Intake:
 
         The reference frame is made at the first frame, and again at the first that brings depth.
         """
-        size = self._network.config.encoder.image_size
-        image = torch.from_numpy(np.ascontiguousarray(self.letterbox.rgb(rgb))).to(self._device)
-        raw = np.zeros((size, size), np.float32) if depth_m is None else self.letterbox.depth(depth_m)
-        depth = torch.from_numpy(raw).to(self._device)[None]
-        cells = cell_depth(depth, self._network.config.cell_px)
-        camera = self.letterbox.camera
-        intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=self._device)
-        # Poses stay on the CPU in double precision, which not every device has.
+        depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
         pose = torch.from_numpy(self._pose_of(cam_from_world))
         has_depth = bool((depth > 0).any())
         if not has_depth:
             self.flags += ("no depth: pixels only, world points are NaN",)
         renewed = self.reference is None or (has_depth and not self.reference.has_depth)
         if renewed:
-            self.reference = Reference(pose, *reference_of(cells, intrinsics, size), has_depth)
-        reference = self.reference
-        assert reference is not None
-        if self._features is None:  # the same picture again is not looked at again
-            self._features = self._network.encode(image[None])[:, None].float()
-        frames = FrameBatch(
-            features=self._features,
-            rgb=image[None, None],
-            depth_m=depth[None],
-            cell_depth_m=cells[None],
-            intrinsics=intrinsics,
-            ref_from_cam=(reference.cam_from_world @ invert(pose)).float().to(self._device)[None, None],
-            center=reference.center,
-            scale=reference.scale,
-        )
+            self.reference = self._framer.reference(depth, pose)
+        assert self.reference is not None
+        # The same picture again is not looked at again.
+        frames = self._framer.frame(self.letterbox.rgb(rgb), depth, pose, self.reference, features=self._features)
+        self._features = frames.features
         return frames, renewed
 
     def _pose_of(self, cam_from_world: np.ndarray | None) -> np.ndarray:

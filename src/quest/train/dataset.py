@@ -60,6 +60,7 @@ def open_dataset(
     windows: WindowConfig,
     device: torch.device,
     report: Callable[[int, int, int], None],
+    anchors_only: bool = False,
 ) -> Dataset:
     """Select takes by the object split and prepare their features.
 
@@ -77,6 +78,7 @@ def open_dataset(
         windows: how windows are drawn.
         device: where the encoder runs.
         report: told takes done, takes in all, frames so far.
+        anchors_only: whether windows are anchor frames alone, for the affordance map.
 
     Raises:
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
@@ -109,9 +111,13 @@ def open_dataset(
     features = FeatureCache(cache, network.config, network.encoder)
     frames = 0
     for done, w in enumerate(wanted, start=1):
-        frames += sum(features.build(w.store, [w.name], device=device, mirrored=w.mirrored))
+        built = features.build(w.store, [w.name], device=device, mirrored=w.mirrored, enlarged=anchors_only)
+        frames += sum(built)
         report(done, len(wanted), frames)
-    samplers = {part: WindowSampler(features.views(found), network.config, windows) for part, found in takes.items()}
+    samplers = {
+        part: WindowSampler(features.views(found), network.config, windows, anchors_only=anchors_only)
+        for part, found in takes.items()
+    }
     return Dataset(samplers["train"], samplers["validation"], len(takes["train"]), len(takes["validation"]))
 
 

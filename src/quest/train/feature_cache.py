@@ -78,6 +78,11 @@ class CachedView:
         return self._map("features")
 
     @property
+    def enlarged(self) -> Float16[np.ndarray, "T C E"]:
+        """Tokens of the images at twice their size, if they were asked for when the features were prepared."""
+        return self._map("enlarged")
+
+    @property
     def rgb(self) -> UInt8[np.ndarray, "T S S 3"]:
         """Letterboxed colours."""
         return self._map("rgb")
@@ -120,7 +125,13 @@ class FeatureCache:
         self.encoder_hash = digest.hexdigest()
 
     def build(
-        self, store: TakeStore, names: list[str], *, device: torch.device, mirrored: bool = False
+        self,
+        store: TakeStore,
+        names: list[str],
+        *,
+        device: torch.device,
+        mirrored: bool = False,
+        enlarged: bool = False,
     ) -> Iterator[int]:
         """Make what is missing or stale; yields the number of frames of every view that is ready.
 
@@ -129,20 +140,23 @@ class FeatureCache:
             names: takes to prepare.
             device: where the encoder runs.
             mirrored: prepare their mirror images instead (see :func:`quest.data.mirror.mirror_take`).
+            enlarged: prepare tokens of the images at twice their size too, from which the affordance map is read;
+                four times the space and five times the work.
         """
         self.root.mkdir(parents=True, exist_ok=True)
         self.encoder.to(device)
         for name in names:
             stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
             entries = self._entries(mirrored_name(name) if mirrored else name)
-            if self._complete(entries, stamp):
-                yield from (len(np.load(e / "visible.npy", mmap_mode="r")) for e in entries)
-                continue
+            if not self._complete(entries, stamp):
+                for entry in entries:
+                    shutil.rmtree(entry)  # also of views that the take no longer has
+                take = mirror_take(store.read(name)) if mirrored else store.read(name)
+                entries = [self._write(take, view, stamp, device) for view in range(len(take.views))]
             for entry in entries:
-                shutil.rmtree(entry)  # also of views that the take no longer has
-            take = mirror_take(store.read(name)) if mirrored else store.read(name)
-            for view in range(len(take.views)):
-                yield self._write(take, view, stamp, device)
+                if enlarged and not (entry / "enlarged.npy").exists():
+                    self._enlarge(entry, device)
+                yield len(np.load(entry / "visible.npy", mmap_mode="r"))
 
     def views(self, names: list[str]) -> list[CachedView]:
         """Open the prepared views of these takes.
@@ -165,7 +179,7 @@ class FeatureCache:
         metas = [json.loads((entry / "meta.json").read_text()) for entry in entries]
         return bool(metas) and all(m["stamp"] == stamp and m.get("views", len(metas)) == len(metas) for m in metas)
 
-    def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> int:
+    def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> Path:
         clip, truth, tracked = take.views[view].clip, take.views[view], take.tracked
         box = Letterbox(clip.camera, self.config.encoder.image_size)
         rgb = np.stack([box.rgb(image) for image in clip.rgb])
@@ -205,7 +219,13 @@ class FeatureCache:
             np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
         (partial / "meta.json").write_text(json.dumps(meta))
         partial.rename(entry)
-        return len(rgb)
+        return entry
+
+    def _enlarge(self, entry: Path, device: torch.device) -> None:
+        rgb = np.load(entry / "rgb.npy", mmap_mode="r", allow_pickle=False)
+        partial = entry / ".enlarged.npy"
+        np.save(partial, encode_images(self.encoder, rgb, device=device, batch=4, enlarge=2), allow_pickle=False)
+        partial.rename(entry / "enlarged.npy")
 
     def _open(self, entry: Path) -> CachedView:
         meta = json.loads((entry / "meta.json").read_text())
@@ -220,12 +240,17 @@ class FeatureCache:
 
 
 def encode_images(
-    encoder: Encoder, rgb: UInt8[np.ndarray, "T S S 3"], *, device: torch.device, batch: int = 16
+    encoder: Encoder,
+    rgb: UInt8[np.ndarray, "T S S 3"],
+    *,
+    device: torch.device,
+    batch: int = 16,
+    enlarge: int = 1,
 ) -> Float16[np.ndarray, "T N E"]:
-    """Features of many images, in bfloat16 arithmetic where that is fast."""
+    """Features of many images, made ``enlarge`` times larger first, in bfloat16 arithmetic where that is fast."""
     out = []
     with torch.inference_mode(), torch.autocast(device.type, dtype=torch.bfloat16):
         for start in range(0, len(rgb), batch):
-            images = torch.from_numpy(np.ascontiguousarray(rgb[start : start + batch])).to(device)
-            out.append(encoder(images).to(torch.float16).cpu().numpy())
+            images = torch.from_numpy(np.array(rgb[start : start + batch])).to(device)
+            out.append(encoder(images, enlarge=enlarge).to(torch.float16).cpu().numpy())
     return np.concatenate(out)

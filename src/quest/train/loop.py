@@ -263,4 +263,5 @@ def _log(
             writer.add_scalar(f"loss/{name}", value, step)
     if scores is not None:
         for name, value in asdict(scores).items():  # type: ignore[call-overload]
-            writer.add_scalar(f"validation/{name}", value, step)
+            if value is not None:
+                writer.add_scalar(f"validation/{name}", value, step)

@@ -131,7 +131,8 @@ def stage_one(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> 
         conf = losses.confidence_loss(free.visible_logit, roll.visible, mask)
         right, judged = is_right(free.point.detach(), truth, px.detach())
         conf = conf + losses.confidence_loss(free.right_logit, right, mask & judged)
-        affordance = _affordance(network, frames, roll, truth)
+        # A map with a trunk of its own has a stage of its own.
+        affordance = zero if network.config.map_layers else _affordance(network, frames, roll, truth)
         belief = network.joint(free.embedding)
         joint = losses.joint_loss(belief, roll.truth_point, truth.axis, truth.revolute, mask)
         aff = losses.coordinate_loss(taught.uv, roll.truth_uv, seen * importance)

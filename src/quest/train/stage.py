@@ -19,7 +19,7 @@ from quest.train.windows import WindowSampler, WindowTruth
 
 @runtime_checkable
 class Scores(Protocol):
-    """A dataclass of validation scores, plain numbers; ``str`` of it is a line for people."""
+    """A dataclass of validation scores, plain numbers or None; ``str`` of it is a line for people."""
 
     @property
     def score(self) -> float:
@@ -55,10 +55,11 @@ class Objective(Protocol):
 
 
 class StageOne:
-    """Stage 1: everything but the encoder learns to find, follow and judge.
+    """Stage 1: everything but the encoder learns to follow and judge, and to find where that has no stage of its own.
 
     Args:
-        network: the network; a flow head stays as it is, and should be trained again afterwards.
+        network: the network; a flow head, and a map with a trunk of its own, stay as they are. The flow head should be
+            trained again afterwards; the map does not stand on what changed.
         weights: weight of every loss.
     """
 
@@ -70,7 +71,7 @@ class StageOne:
         self.weights = weights
 
     def trained(self) -> list[nn.Parameter]:
-        """All parameters outside the encoder and the flow head."""
+        """All parameters outside the encoder, the flow head and a map with a trunk of its own."""
         return self.network.trainable()
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:

@@ -27,14 +27,15 @@ class WindowScores:
         median_px: median distance of visible answers, pixels of the input.
         mean_distance: mean 3D distance of all answers, normalised units, at most 1 each.
         right: share of answers with the right identity.
-        discovery_f1: F1 of discovered slots against visible entities, same label and within 16 px.
+        discovery_f1: F1 of discovered slots against visible entities, same label and within 16 px; None for networks
+            whose map has a stage of its own.
         answers: how many answers were judged.
     """
 
     median_px: float
     mean_distance: float
     right: float
-    discovery_f1: float
+    discovery_f1: float | None
     answers: int
 
     @property
@@ -43,9 +44,10 @@ class WindowScores:
         return self.mean_distance
 
     def __str__(self) -> str:
+        discovery = "" if self.discovery_f1 is None else f"discovery F1 {self.discovery_f1:.3f} "
         return (
             f"median {self.median_px:.2f} px, 3D distance {self.mean_distance:.4f}, right {self.right:.1%}, "
-            f"discovery F1 {self.discovery_f1:.3f} (n = {self.answers})"
+            f"{discovery}(n = {self.answers})"
         )
 
 
@@ -55,6 +57,7 @@ def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, dev
     network.eval()
     px, distance, right = [], [], []
     found = np.zeros(3)
+    reads_map = network.config.queries == "anchored" and network.config.map_layers == 0
     with torch.no_grad():
         for _ in range(batches):
             frames, truth = sampler.draw(rng, disturb=False)
@@ -62,7 +65,7 @@ def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, dev
             roll = roll_out(network, frames, truth)
             for values, value in zip((px, distance, right), _score(network, roll, truth), strict=True):
                 values.append(value)
-            if network.config.queries == "anchored":
+            if reads_map:
                 found += _discovery(network, frames.during(slice(0, 1)), roll.anchor_observed, truth)
     network.train()
     all_px, hits, proposed, present = torch.cat(px), *found
@@ -70,7 +73,7 @@ def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, dev
         median_px=float(all_px.median()) if len(all_px) else math.inf,
         mean_distance=float(torch.cat(distance).mean()),
         right=float(torch.cat(right).mean()),
-        discovery_f1=float(2 * hits / max(proposed + present, 1)),
+        discovery_f1=float(2 * hits / max(proposed + present, 1)) if reads_map else None,
         answers=sum(len(d) for d in distance),
     )
 

@@ -70,14 +70,19 @@ class WindowSampler:
         views: prepared views, drawn evenly: an object counts as often as it was filmed.
         network: network that the windows are for.
         config: how windows are drawn.
+        anchors_only: whether to draw nothing but anchor frames, with the tokens of their enlarged images, which is
+            all that the affordance map is learned from.
 
     Raises:
         ConfigError: nothing is visible in any view.
     """
 
-    def __init__(self, views: list[CachedView], network: NetworkConfig, config: WindowConfig) -> None:
+    def __init__(
+        self, views: list[CachedView], network: NetworkConfig, config: WindowConfig, *, anchors_only: bool = False
+    ) -> None:
         self.network = network
         self.config = config
+        self.anchors_only = anchors_only
         self.views = [view for view in views if view.visible.any()]
         if not self.views:
             raise ConfigError(f"training: no entity is visible in any of {len(views)} views; use other takes")
@@ -114,7 +119,7 @@ class WindowSampler:
         end = int(rng.integers(len(view)))
         window = [int(np.clip(end - stride * back, 0, len(view) - 1)) for back in range(self.network.window)]
         following = end + stride if 0 <= end + stride < len(view) else -1
-        return view, [anchor, *reversed(window)], following
+        return view, [anchor] if self.anchors_only else [anchor, *reversed(window)], following
 
     def _frames(self, picks: tuple[Pick, ...], disturbance: Disturbance | None) -> FrameBatch:
         def gather(name: str) -> np.ndarray:
@@ -141,6 +146,7 @@ class WindowSampler:
             ref_from_cam=(poses[:, :1] @ torch.linalg.inv(poses)).float(),
             center=center,
             scale=scale,
+            enlarged=torch.from_numpy(gather("enlarged")).float() if self.anchors_only else None,
         )
 
     def _truth(self, plan: WindowPlan, frames: FrameBatch) -> WindowTruth:

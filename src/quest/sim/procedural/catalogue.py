@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -13,12 +14,22 @@ from quest.errors import ConfigError
 from quest.sim.procedural.appliances import APPLIANCES
 from quest.sim.procedural.laptop import build_laptop, build_trunk
 from quest.sim.procedural.layouts import FURNITURE
-from quest.sim.procedural.model import ObjectModel
+from quest.sim.procedural.model import HANDLE_ROLES, ObjectModel
 from quest.sim.procedural.room_door import build_room_door
 from quest.sim.procedural.storage import STORAGE
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
 from quest.sim.procedural.things import THINGS
 from quest.sim.procedural.urdf import write_object
+
+_OFTEN_BARE = ("chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk")
+
+
+def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
+    """Furniture that opens without handles: its fronts and rims are followed."""
+    model = {**FURNITURE, **STORAGE}[category](rng)
+    links = [replace(link, parts=tuple(p for p in link.parts if p.role not in HANDLE_ROLES)) for link in model.links]
+    return replace(model, links=tuple(links))
+
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **FURNITURE,
@@ -29,6 +40,7 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **APPLIANCES,
     **THINGS,
     "room_door": build_room_door,
+    **{f"bare_{name}": partial(_build_bare, name) for name in _OFTEN_BARE},
 }
 
 _WEIGHTS = {
@@ -44,7 +56,7 @@ _MORE_WEIGHTS = {
 }  # fmt: skip
 
 MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
-"""How often each category comes: the usual mix, and one of everything."""
+"""How often each category comes: the usual mix, and one of everything but furniture without handles (``bare_``)."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""

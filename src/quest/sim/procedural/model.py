@@ -55,6 +55,10 @@ def join(meshes: list[Mesh]) -> Mesh:
     )
 
 
+HANDLE_ROLES = ("handle", "knob")
+"""Roles of parts that one takes hold of."""
+
+
 @dataclass(frozen=True)
 class Part:
     """One visual of a link.
@@ -106,7 +110,7 @@ class Link:
     @property
     def has_handle(self) -> bool:
         """Whether a handle or a knob is among the parts."""
-        return any(part.role in ("handle", "knob") for part in self.parts)
+        return any(part.role in HANDLE_ROLES for part in self.parts)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,160 @@
+"""Intents: one thing has two places of the same label, one to open it by and one to lift it by; each is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from quest.evaluation.bootstrap import Value, draw_objects, mean_value
+from quest.evaluation.metrics import GATE, Sums, distance, identity
+from quest.evaluation.protocols import first_visible
+from quest.track import Tracker
+from quest.types import INTENTS, Query, Take
+
+STABLE = 0.95
+"""A track is stable if it is nearest to its own entity, and within the gate, in so many of the frames."""
+
+
+@dataclass(frozen=True)
+class IntentAnswer:
+    """What a tracker made of both intents in one view.
+
+    Attributes:
+        take: name of the take.
+        view: index of the view.
+        object_id: the object.
+        part: part of the object split.
+        source: ``partnet-mobility`` or ``procedural``.
+        label: label that both entities have.
+        open_ape: mean 3D distance to the entity to open by, normalised units; a frame without an answer counts 1.
+        lift_ape: the same to the entity to lift by.
+        open_acc: share of frames in which the answer is nearest to its own entity and within 0.1.
+        lift_acc: the same to lift by.
+    """
+
+    take: str
+    view: int
+    object_id: str
+    part: str
+    source: str
+    label: str
+    open_ape: float
+    lift_ape: float
+    open_acc: float
+    lift_acc: float
+
+    @property
+    def both(self) -> bool:
+        """Whether the answers are two distinct, stable tracks."""
+        return min(self.open_acc, self.lift_acc) >= STABLE
+
+
+@dataclass(frozen=True)
+class IntentRow:
+    """Answers for one kind of objects, with intervals over objects.
+
+    Attributes:
+        part: part of the object split.
+        source: ``partnet-mobility`` or ``procedural``.
+        objects: how many.
+        takes: how many.
+        views: how many were judged.
+        both: share of views with two distinct, stable tracks.
+        open_ape: mean 3D distance of what opens, normalised units.
+        lift_ape: of what lifts.
+        open_acc: share of frames in which what opens is followed.
+        lift_acc: what lifts.
+    """
+
+    part: str
+    source: str
+    objects: int
+    takes: int
+    views: int
+    both: Value | None
+    open_ape: Value | None
+    lift_ape: Value | None
+    open_acc: Value | None
+    lift_acc: Value | None
+
+
+def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
+    """Labels of which one entity is there to open by and one to lift by, both seen in the first frames.
+
+    Returns:
+        The label, and both entities' indices.
+    """
+    seen, _ = first_visible(take.views[view].visible, take.tracked)
+    found = []
+    entities = take.info.entities
+    for label in sorted({entities[e].label for e in seen}):
+        by = {intent: [int(e) for e in seen if (entities[e].label, entities[e].intent) == (label, intent)]
+              for intent in INTENTS}  # fmt: skip
+        if len(by["open"]) == len(by["lift"]) == 1:
+            found.append((label, by["open"][0], by["lift"][0]))
+    return found
+
+
+def judge_intents(tracker: Tracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
+    """Ask for what opens and for what lifts in one stream, and judge both tracks.
+
+    Args:
+        tracker: weights that know intents.
+        take: with ground truth.
+        view: index of the view.
+        part: part of the object split.
+
+    Raises:
+        InputError: the weights know no intents.
+    """
+    answers = []
+    info, clip = take.info, take.views[view].clip
+    for label, opens, lifts in intent_pairs(take, view):
+        queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
+        tracks = tracker.track(clip, queries)
+        gap, right = _score(take, tracks.point_world, np.array([opens, lifts]))
+        answers.append(
+            IntentAnswer(
+                take=info.name,
+                view=view,
+                object_id=info.object_id,
+                part=part,
+                source=info.source,
+                label=label,
+                open_ape=float(gap[:, 0].mean()),
+                lift_ape=float(gap[:, 1].mean()),
+                open_acc=float(right[:, 0].mean()),
+                lift_acc=float(right[:, 1].mean()),
+            )
+        )
+    return answers
+
+
+def _score(
+    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    half = take.info.half_diagonal_m
+    gap = distance(point_world, take.point_world[:, entities], half_diagonal_m=half)
+    rank = np.searchsorted(take.tracked, entities)
+    nearest = identity(point_world, take.point_world[:, take.tracked], rank, half_diagonal_m=half)
+    return gap, (nearest == rank) & (gap <= GATE)
+
+
+def intent_rows(answers: Sequence[IntentAnswer], *, resamples: int = 1000, seed: int = 0) -> tuple[IntentRow, ...]:
+    """One row per part and source."""
+    rows = []
+    for part, source in sorted({(a.part, a.source) for a in answers}):
+        chosen = [a for a in answers if (a.part, a.source) == (part, source)]
+        objects, owner = np.unique([a.object_id for a in chosen], return_inverse=True)
+        draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
+
+        def value(name: str, chosen=chosen, owner=owner, draws=draws) -> Value | None:
+            numbers = np.array([float(getattr(a, name)) for a in chosen])
+            return mean_value(Sums(numbers, np.ones(len(numbers))), owner, draws)
+
+        measured = {name: value(name) for name in ("both", "open_ape", "lift_ape", "open_acc", "lift_acc")}
+        rows.append(IntentRow(part, source, len(objects), len({a.take for a in chosen}), len(chosen), **measured))
+    return tuple(rows)

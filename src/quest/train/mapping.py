@@ -1,0 +1,152 @@
+"""Stage map: the affordance map learns what could be taken hold of, from single frames.
+
+Its trunk shares nothing with what follows entities, so this stage changes no track of a given query and leaves the
+monitor's calibration as it was. It needs many objects rather than many frames of each.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from quest.errors import ConfigError
+from quest.model.config import PRESETS
+from quest.model.discovery import find_peaks
+from quest.model.network import QuestNetwork
+from quest.model.observation import FrameBatch
+from quest.train import losses
+from quest.train.windows import WindowSampler, WindowTruth
+
+_FOUND_PX = 16.0
+_RADIUS_CELLS = 1.5
+
+
+@dataclass(frozen=True)
+class MapScores:
+    """Discovery in fixed frames: a peak is right if an entity of its label, not yet taken, is within 16 px.
+
+    Attributes:
+        precision: average precision over all peaks, the best first.
+        recall: share of seen entities that any peak is right about.
+        lift: share of those of which it is known rightly whether one opens or lifts by them.
+        present: how many entities are seen.
+    """
+
+    precision: float
+    recall: float
+    lift: float
+    present: int
+
+    @property
+    def score(self) -> float:
+        """What a checkpoint is chosen by; less is better."""
+        return 1 - self.precision
+
+    def __str__(self) -> str:
+        return (
+            f"average precision {self.precision:.3f}, {self.recall:.1%} among the peaks, intent right "
+            f"{self.lift:.1%} (n = {self.present})"
+        )
+
+
+class StageMap:
+    """The affordance map alone.
+
+    Args:
+        network: a network whose map has a trunk of its own (see :func:`with_own_map`).
+    """
+
+    name = "stage-map"
+    terms: tuple[str, ...] = ("map",)
+
+    def __init__(self, network: QuestNetwork) -> None:
+        self.network = network
+
+    def trained(self) -> list[nn.Parameter]:
+        """Trunk and head of the map."""
+        trunk = self.network.affordance_trunk
+        assert trunk is not None
+        return [*trunk.parameters(), *self.network.affordance.parameters()]
+
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
+        """Focal loss of the map, its offsets and its intents."""
+        found = self.network.afford(frames, self.network.observe(frames))
+        visible = truth.visible & truth.exists[:, None]
+        loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible)
+        return loss, loss.detach()[None]
+
+    def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> MapScores:
+        """Average precision on the same frames at every call."""
+        rng = np.random.default_rng(0)
+        self.network.eval()
+        peaks: list[tuple[float, bool, bool]] = []
+        present = 0
+        with torch.no_grad():
+            for _ in range(batches):
+                frames, truth = sampler.draw(rng, disturb=False)
+                frames, truth = frames.to(device), truth.to(device)
+                for b in range(len(truth.unit)):
+                    peaks += self._judge(frames.of(slice(b, b + 1)), truth, b)
+                    present += int((truth.visible[b, 0] & truth.exists[b]).sum())
+        self.network.train()
+        peaks.sort(key=lambda peak: -peak[0])
+        right = np.array([hit for _, hit, _ in peaks])
+        intent = np.array([lift for _, hit, lift in peaks if hit])
+        precision = np.cumsum(right) / np.arange(1, len(right) + 1)
+        return MapScores(
+            precision=float(precision[right].sum() / max(present, 1)),
+            recall=float(right.sum() / max(present, 1)),
+            lift=float(intent.mean()) if len(intent) else 0.0,
+            present=present,
+        )
+
+    def _judge(self, frames: FrameBatch, truth: WindowTruth, b: int) -> list[tuple[float, bool, bool]]:
+        """Score of every peak, whether it is right, and whether its intent is."""
+        network = self.network
+        peaks = find_peaks(network, frames, network.observe(frames), radius_cells=_RADIUS_CELLS)
+        seen = torch.nonzero(truth.visible[b, 0] & truth.exists[b])[:, 0]
+        gap = torch.cdist(peaks.uv, truth.uv[b, 0, seen]) * network.config.encoder.image_size
+        gap = torch.where(peaks.label[:, None] == truth.label[b, seen], gap, torch.inf)
+        out = []
+        for k in range(len(peaks.logit)):
+            e = int(gap[k].argmin()) if len(seen) else -1
+            hit = e >= 0 and float(gap[k, e]) < _FOUND_PX
+            lift = hit and bool(peaks.lift[k] > 0) == bool(truth.intent[b, seen[e]])
+            if hit:
+                gap[:, e] = torch.inf
+            out.append((float(peaks.logit[k]), hit, lift))
+        return out
+
+
+def with_own_map(network: QuestNetwork) -> QuestNetwork:
+    """The network with a map of its own trunk, which begins with what the network observes frames by.
+
+    Intents are learned by the map too. A network that knew none keeps queries that take no notice of them.
+
+    Raises:
+        ConfigError: the network's queries are learned slots, which need no map.
+    """
+    if network.config.queries != "anchored":
+        raise ConfigError(f"preset {network.config.preset!r}: learned queries have no affordance map to train")
+    if network.affordance_trunk is not None:
+        return network
+    layers = PRESETS["default"].map_layers
+    other = QuestNetwork(replace(network.config, map_layers=layers, intents=True))
+    own, state = network.state_dict(), other.state_dict()
+    begin = {f"affordance_trunk.{name}": tensor for name, tensor in network.state_dict().items()
+             if name.startswith("observer.")}  # fmt: skip
+    for name, tensor in state.items():
+        old = own.get(name, begin.get(name))
+        if old is not None and old.shape == tensor.shape:
+            state[name] = old
+    if not network.config.intents:
+        state["binder.intent.weight"] = torch.zeros_like(state["binder.intent.weight"])
+        # The head has one more output for what to lift; the others stay.
+        for name in ("affordance.mlp.2.weight", "affordance.mlp.2.bias"):
+            state[name][: len(own[name])] = own[name]
+    other.load_state_dict(state)
+    return other.train(network.training)

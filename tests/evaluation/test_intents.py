@@ -1,0 +1,74 @@
+"""Two places of one label, one to open by and one to lift by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quest.evaluation.intents import IntentAnswer, intent_pairs, intent_rows, judge_intents
+from quest.types import Clip, Query, Take, Tracks
+from tests.synthetic import make_take
+from tests.track.clips import make_tracker
+
+
+@pytest.fixture(scope="module")
+def take() -> Take:
+    """Two handles, the second of which is fixed in the base, and a rim that opens."""
+    take = make_take(frames=12, views=1, entities=3, seed=0)
+    first, second, third = take.info.entities
+    entities = (first, replace(second, label=first.label, link=0, joint=-1), third)
+    return replace(take, info=replace(take.info, entities=entities))
+
+
+class Perfect:
+    """Answers with the truth, or with one entity for both intents."""
+
+    def __init__(self, take: Take, *, deaf: bool = False) -> None:
+        self.take = take
+        self.deaf = deaf
+        self.asked: list[Query] = []
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        assert queries is not None
+        self.asked += queries
+        which = [0 if q.intent == "open" or self.deaf else 1 for q in queries]
+        answer: Any = make_tracker().track(clip, [Query.point(0, 20.0, 30.0, name=q.name) for q in queries])
+        return replace(answer, point_world=self.take.point_world[:, which].astype(np.float32))
+
+
+def test_pairs_are_labels_with_both_intents(take: Take):
+    assert intent_pairs(take, 0) == [(take.info.entities[0].label, 0, 1)]
+    assert intent_pairs(make_take(frames=12, views=1, entities=3, seed=0), 0) == []
+
+
+def test_both_intents_are_asked_for_and_judged(take: Take):
+    tracker: Any = Perfect(take)
+    (answer,) = judge_intents(tracker, take, 0, part="validation")
+    assert [(q.kind, q.label, q.intent) for q in tracker.asked] == [
+        ("semantic", answer.label, "open"),
+        ("semantic", answer.label, "lift"),
+    ]
+    assert (answer.open_acc, answer.lift_acc) == (1.0, 1.0)
+    assert answer.open_ape == pytest.approx(0, abs=1e-6)
+    assert answer.both
+    deaf: Any = Perfect(take, deaf=True)
+    (answer,) = judge_intents(deaf, take, 0, part="validation")
+    assert (answer.open_acc, answer.lift_acc) == (1.0, 0.0)
+    assert not answer.both
+
+
+def test_rows_are_over_objects():
+    good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0.01, 0.02, 1.0, 0.95)
+    bad = replace(good, take="u", object_id="laptop-2", lift_acc=0.5, lift_ape=0.4)
+    (row,) = intent_rows([good, replace(good, view=1), bad], resamples=200)
+    assert (row.objects, row.takes, row.views) == (2, 2, 3)
+    assert row.both is not None
+    assert row.both.mean == pytest.approx(2 / 3)
+    assert row.lift_ape is not None
+    assert row.lift_ape.mean == pytest.approx((0.02 + 0.02 + 0.4) / 3)
+    assert row.both.low is not None
+    assert row.both.low <= row.both.mean
