@@ -1,7 +1,7 @@
 """Measure whether what opens a thing and what lifts it are told apart and followed, both asked for by the same label.
 
     quest generate --out TAKES --objects procedural:laptop-112000,...
-    python benchmarks/intents.py --takes TAKES --split test --out benchmarks/results/intents.json
+    python benchmarks/intents.py --takes TAKES --split test --out benchmarks/results/intents/intents.json
 
 Judged are views in which exactly one entity of a label opens and exactly one lifts, such as the rims of a laptop.
 """

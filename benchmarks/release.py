@@ -34,12 +34,14 @@ class TrainingTakes:
         arguments: how they are made, as arguments of `quest generate`.
         objects: how many procedural objects; 0 for PartNet-Mobility.
         first_seed: seed of the first procedural object.
+        kinds: what procedural objects are, so many of each, instead of what a mix makes of the seeds.
     """
 
     store: str
     arguments: str
     objects: int = 0
     first_seed: int = 0
+    kinds: tuple[str, ...] = ()
 
 
 PARTNET = (
@@ -65,19 +67,34 @@ PROCEDURAL = (
 )
 
 
+_WIDE = "--level 1 --frames-per-joint 24 --every 8"
 MAP_PARTNET = (
-    TrainingTakes(
-        "wide_partnet",
-        "--mix broad --level 1 --frames-per-joint 24 --every 8 --views 5 --takes-per-object 4 --seed 100",
-    ),
+    TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 5 --takes-per-object 4 --seed 100"),
+    TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 3 --takes-per-object 6 --seed 200"),
 )
 MAP_PROCEDURAL = (
-    TrainingTakes("wide_broad", "--mix broad --level 1 --frames-per-joint 24 --every 8 --views 4", 250, 21_000),
-    TrainingTakes("wide_usual", "--level 1 --frames-per-joint 24 --every 8 --views 4", 150, 1_000),
+    TrainingTakes("wide_broad", f"--mix broad {_WIDE} --views 4", 310, 21_000),
+    TrainingTakes("wide_usual", f"{_WIDE} --views 4", 150, 1_000),
+    # No mix has these, but PartNet-Mobility has many.
+    TrainingTakes(
+        "wide_bare",
+        f"{_WIDE} --views 4",
+        12,
+        23_000,
+        (
+            "bare_chest",
+            "bare_night_stand",
+            "bare_cabinet",
+            "bare_wardrobe",
+            "bare_sideboard",
+            "bare_desk",
+            "bare_drawer_desk",
+        ),
+    ),
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 
-MAP_CHOICE = "--level 1 --frames-per-joint 24 --every 8 --views 4"
+MAP_CHOICE = f"{_WIDE} --views 4"
 """The same of validation objects, by which the map's checkpoint and the threshold of discovery are chosen."""
 
 
@@ -150,12 +167,15 @@ class Release:
     def _takes(self) -> None:
         """Takes that teach, thinned, and takes that choose, whole."""
         for takes in (*self._recipe(), *self._map_recipe()):
-            which = ["--no-partnet" if takes.objects else "--partnet"]
-            if takes.objects:
-                count = max(1, round(self.procedural_share * takes.objects))
-                which += ["--seeds", f"{takes.first_seed}..{takes.first_seed + count - 1}"]
+            which: list[object] = ["--split", "train", "--no-partnet" if takes.objects else "--partnet"]
+            count = max(1, round(self.procedural_share * takes.objects))
+            seeds = range(takes.first_seed, takes.first_seed + count)
+            if takes.kinds:
+                which = ["--objects", *(f"procedural:{kind}-{seed}" for kind in takes.kinds for seed in seeds)]
+            elif takes.objects:
+                which += ["--seeds", f"{seeds[0]}..{seeds[-1]}"]
             thinned = [] if "--every" in takes.arguments else ["--every", self.every]
-            _quest("generate", "--out", self._takes_of("train", takes.store), "--split", "train", *which, *thinned,
+            _quest("generate", "--out", self._takes_of("train", takes.store), *which, *thinned,
                    *takes.arguments.split())  # fmt: skip
         self._generate_whole("validation")
         choice = ("--out", self._takes_of("wide_validation"), "--split", "validation", *MAP_CHOICE.split())
@@ -190,6 +210,7 @@ class Release:
         untuned = self.work / "untuned.safetensors"
         shutil.copyfile(self.work / "flow" / "weights.safetensors", untuned)
         _quest("weights", "tune", untuned, "--takes", self._takes_of("validation"))
+        _quest("weights", "tune", untuned, "--takes", self._takes_of("wide_validation"), "--discovery-only")
         untuned.rename(self._weights)
 
     def _calibrate(self) -> None:

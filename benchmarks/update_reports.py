@@ -169,7 +169,7 @@ TABLES = (
         },
     ),
     Table(
-        "intents.json",
+        "intents/intents.json",
         "Open and lift: two places of one label on one thing, both asked for",
         "rows",
         OBJECTS

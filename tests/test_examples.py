@@ -11,10 +11,6 @@ from typing import Any
 import pytest
 
 from quest.cli.main import parse
-from quest.data.store import TakeStore
-from quest.types import Query
-from tests.synthetic import make_take
-from tests.track.clips import make_tracker
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -55,28 +51,3 @@ def test_the_tool_chest_has_three_handles():
     text = (EXAMPLES / "toolbox" / "toolbox.urdf").read_text(encoding="utf-8")
     assert text.count('type="prismatic"') == 2
     assert text.count('type="revolute"') == 1
-
-
-def test_open_or_lift_asks_for_both_rims(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
-    module, commands = example("open_or_lift"), []
-    take = make_take(frames=12, views=1, entities=2, name="laptop-7-L1-s000000")
-    asked = []
-
-    class Listening:
-        def track(self, clip: Any, queries: Any) -> Any:
-            asked.extend(queries)
-            points = [Query.point(0, 20.0, 30.0, name=q.name) for q in queries]
-            return make_tracker().track(clip, points)
-
-    def generate(words: list[str]) -> int:
-        commands.append(words)
-        TakeStore(tmp_path / "takes").write(take)
-        return 0
-
-    monkeypatch.setattr(module, "run_quest", generate)
-    monkeypatch.setattr(module.quest, "load", lambda weights: Listening())
-    assert module.OpenOrLift(object="procedural:laptop-7", out=tmp_path).run() == 0
-    parse(commands[0])
-    assert [(q.label, q.intent) for q in asked] == [("rim", "open"), ("rim", "lift")]
-    assert (tmp_path / "overlay.mp4").stat().st_size > 0
-    assert "open: found in frame 0" in capsys.readouterr().out

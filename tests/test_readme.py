@@ -64,7 +64,7 @@ def test_python_example_runs(monkeypatch, capsys):
     shared: dict = {}
     for block in blocks(README, "python"):
         exec(compile(block, "<example of the README>", "exec"), shared)
-    assert "handle" in capsys.readouterr().out
+    assert "knob" in capsys.readouterr().out
 
 
 def benchmark(name: str):

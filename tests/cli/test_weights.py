@@ -49,9 +49,9 @@ def weights(tmp_path: Path) -> Path:
 def test_own_objects_choose_the_settings(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = {}
 
-    def tuned(tracker, store, takes, *, report):
+    def tuned(tracker, store, takes, *, report, discovery_only):
         chosen.update(takes)
-        return Tuned(TrackerConfig(jump=0.3), (), 1.0)
+        return Tuned(TrackerConfig(jump=0.3), (), 1.0, float(discovery_only))
 
     monkeypatch.setattr(tuning, "tune", tuned)
     assert TuneWeights(weights, takes=str(takes)).run() == 0

@@ -67,7 +67,7 @@ def test_shapes(config: NetworkConfig, frames_in_window: int):
 def test_batch_elements_are_independent(config: NetworkConfig):
     network, frames = make_network(config), make_frames(config, batch=3)
     anchor = bound(network, frames)
-    alone = FrameBatch(**{name: getattr(frames, name)[1:2] for name in FrameBatch.__dataclass_fields__})
+    alone = frames.of(slice(1, 2))
     got = answers(network, Anchor(anchor.content[1:2], anchor.template[1:2], anchor.valid[1:2]), alone)
     assert_same(got, {name: value[1:2] for name, value in answers(network, anchor, frames).items()})
 

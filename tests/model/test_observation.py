@@ -91,7 +91,7 @@ def test_cells_are_counted_row_by_row():
 
 
 def one(frames: FrameBatch, b: int) -> FrameBatch:
-    return FrameBatch(**{name: getattr(frames, name)[b : b + 1] for name in FrameBatch.__dataclass_fields__})
+    return frames.of(slice(b, b + 1))
 
 
 @pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)

@@ -32,7 +32,7 @@ SHORT = TrainingConfig(
     steps=4, warmup_steps=2, learning_rate=1e-3, validate_every=2, validation_batches=1, precision="32-true"
 )
 
-GOLDEN_LOSSES = (16.91808, 15.16622, 14.59182, 10.14250)
+GOLDEN_LOSSES = (12.23846, 11.15981, 12.27336, 8.67538)
 """Of four steps of SHORT from make_network(): a change here is a change of the losses, the sampler or the network."""
 
 
@@ -173,8 +173,7 @@ def test_deterministic_algorithms_end_with_the_run(run: Run):
 def test_every_trained_parameter_learns(run: Run, config: NetworkConfig):
     """DDP waits for the gradient of every parameter."""
     network, _ = run(replace(SHORT, steps=1), network=config)
-    missing = [n for n, p in network.named_parameters() if p.grad is None and not n.startswith("encoder.")]
-    assert not missing
+    assert all(p.grad is not None for p in network.trainable())
 
 
 def test_a_run_of_another_stage_is_not_resumed(run: Run):
