@@ -27,6 +27,8 @@ def take() -> Take:
 class Perfect:
     """Answers with the truth, or with one entity for both intents."""
 
+    name = "perfect"
+
     def __init__(self, take: Take, *, deaf: bool = False) -> None:
         self.take = take
         self.deaf = deaf

@@ -10,8 +10,7 @@ from jaxtyping import Float, Int
 
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
 from quest.evaluation.metrics import GATE, Sums, distance, identity
-from quest.evaluation.protocols import first_visible
-from quest.track import Tracker
+from quest.evaluation.protocols import ClipTracker, first_visible
 from quest.types import INTENTS, Query, Take
 
 STABLE = 0.95
@@ -98,7 +97,7 @@ def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
     return found
 
 
-def judge_intents(tracker: Tracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
+def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
     """Ask for what opens and for what lifts in one stream, and judge both tracks.
 
     Args:
