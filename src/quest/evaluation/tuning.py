@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from quest.data.letterbox import Letterbox
 from quest.data.store import TakeStore
@@ -19,6 +20,7 @@ from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import SplitPart
+from quest.model.discovery import match_peaks
 from quest.track import Tracker, TrackerConfig
 from quest.types import LABELS, Take
 
@@ -30,7 +32,6 @@ GRID: dict[str, tuple[float, ...]] = {
 }
 """Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
-_SLOT_RADIUS_PX = 16.0
 _BETA = 2.0
 
 
@@ -142,17 +143,14 @@ def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[st
 def _match(take: Take, view: int, uv: np.ndarray, labels: list[str], *, size: int) -> tuple[list[bool], int]:
     truth = take.views[view]
     canvas = Letterbox(truth.clip.camera, size).to_canvas(truth.uv_px[0])
-    entities = [e for e in take.tracked if truth.visible[0, e]]
-    free = set(entities)
-    hits = []
-    for place, label in zip(uv, labels, strict=True):
-        gap = {e: float(np.linalg.norm(canvas[e] - place)) for e in free if take.info.entities[e].label == label}
-        nearest = min(gap, key=lambda e: gap[e], default=None)
-        hit = nearest is not None and gap[nearest] < _SLOT_RADIUS_PX
-        hits.append(hit)
-        if hit:
-            free.discard(nearest)
-    return hits, len(entities)
+    entities = [int(e) for e in take.tracked if truth.visible[0, e]]
+    found = match_peaks(
+        torch.from_numpy(uv),
+        torch.tensor([LABELS.index(label) for label in labels], dtype=torch.long),
+        torch.from_numpy(canvas[entities]),
+        torch.tensor([LABELS.index(take.info.entities[e].label) for e in entities], dtype=torch.long),
+    )
+    return (found >= 0).tolist(), len(entities)
 
 
 def _scores(

@@ -13,6 +13,9 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
 from quest.types import LABELS
 
+FOUND_PX = 16.0
+"""A candidate this close to an entity of its label has found it, pixels of the network's input."""
+
 
 @dataclass(frozen=True)
 class Peaks:
@@ -51,3 +54,28 @@ def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation,
             keep.append(i)
     uv = (uv_px / network.config.encoder.image_size).clamp(0, 1)
     return Peaks(uv[keep], label[keep], value[keep], found.lift[0, 0][place][keep])
+
+
+def match_peaks(
+    uv_px: Float[Tensor, "K 2"],
+    label: Int[Tensor, " K"],
+    true_px: Float[Tensor, "E 2"],
+    true_label: Int[Tensor, " E"],
+) -> Int[Tensor, " K"]:
+    """Which entity each candidate is right about: the nearest free one of its label within :data:`FOUND_PX`, else -1.
+
+    Args:
+        uv_px: candidates, best first, pixels of the network's input.
+        label: their labels.
+        true_px: entities that are seen.
+        true_label: their labels.
+    """
+    gap = torch.cdist(uv_px.float(), true_px.float())
+    gap = torch.where((label[:, None] == true_label) & (gap < FOUND_PX), gap, torch.inf)
+    found = torch.full_like(label, -1)
+    for k in range(len(label) if len(true_label) else 0):
+        e = int(gap[k].argmin())
+        if torch.isfinite(gap[k, e]):
+            found[k] = e
+            gap[:, e] = torch.inf
+    return found

@@ -15,13 +15,12 @@ from torch import Tensor, nn
 
 from quest.errors import ConfigError
 from quest.model.config import PRESETS
-from quest.model.discovery import find_peaks
+from quest.model.discovery import find_peaks, match_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train import losses
 from quest.train.windows import WindowSampler, WindowTruth
 
-_FOUND_PX = 16.0
 _RADIUS_CELLS = 1.5
 
 
@@ -109,16 +108,11 @@ class StageMap:
         network = self.network
         peaks = find_peaks(network, frames, network.observe(frames), radius_cells=_RADIUS_CELLS)
         seen = torch.nonzero(truth.visible[b, 0] & truth.exists[b])[:, 0]
-        gap = torch.cdist(peaks.uv, truth.uv[b, 0, seen]) * network.config.encoder.image_size
-        gap = torch.where(peaks.label[:, None] == truth.label[b, seen], gap, torch.inf)
+        size = network.config.encoder.image_size
+        found = match_peaks(size * peaks.uv, peaks.label, size * truth.uv[b, 0, seen], truth.label[b, seen])
         out = []
-        for k in range(len(peaks.logit)):
-            e = int(gap[k].argmin()) if len(seen) else -1
-            hit = e >= 0 and float(gap[k, e]) < _FOUND_PX
-            lift = hit and bool(peaks.lift[k] > 0) == bool(truth.intent[b, seen[e]])
-            if hit:
-                gap[:, e] = torch.inf
-            out.append((float(peaks.logit[k]), hit, lift))
+        for score, lifts, e in zip(peaks.logit.tolist(), (peaks.lift > 0).tolist(), found.tolist(), strict=True):
+            out.append((score, e >= 0, e >= 0 and lifts == bool(truth.intent[b, seen[e]])))
         return out
 
 

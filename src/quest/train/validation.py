@@ -9,13 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quest.model.discovery import find_peaks
+from quest.model.discovery import find_peaks, match_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.train.objective import Rollout, is_right, roll_out
 from quest.train.windows import WindowSampler, WindowTruth
 
-_FOUND_PX = 16.0
 _PEAK_LOGIT = -0.5
 
 
@@ -94,7 +93,8 @@ def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation,
         peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=1.5)
         keep = peaks.logit > _PEAK_LOGIT
         present = truth.visible[b, 0] & truth.exists[b]
-        gap = torch.cdist(truth.uv[b, 0, present], peaks.uv[keep]) * network.config.encoder.image_size
-        hit = (gap < _FOUND_PX) & (truth.label[b, present][:, None] == peaks.label[keep])
-        counts += (int(hit.any(1).sum()), int(keep.sum()), int(present.sum()))
+        size = network.config.encoder.image_size
+        uv, true = size * peaks.uv[keep], size * truth.uv[b, 0, present]
+        found = match_peaks(uv, peaks.label[keep], true, truth.label[b, present])
+        counts += (int((found >= 0).sum()), int(keep.sum()), int(present.sum()))
     return counts
