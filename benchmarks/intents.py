@@ -35,6 +35,8 @@ class Intents:
     """Parts of the object split."""
     weights: str = "quest-s16"
     """Name or file of the weights."""
+    apart_px: float = 0.0
+    """Begin each stream with the first frame in which both are seen this far apart; 0 begins with the take."""
     resamples: int = 1000
     """Of the bootstrap over objects."""
     seed: int = 0
@@ -51,14 +53,19 @@ class Intents:
             for name, part in select_takes(store.infos(), split=self.split).items():
                 take, before = store.read(name), len(answers)
                 for view in range(len(take.views)):
-                    answers += judge_intents(tracker, take, view, part=part)
+                    answers += judge_intents(tracker, take, view, part=part, apart_px=self.apart_px)
                 if len(answers) > before:
                     hashes.append((name, store.data_hash(name)))
                     console.print(f"{name}: {len(answers)} views so far")
         rows = intent_rows(answers, resamples=self.resamples, seed=self.seed)
         if self.out is not None:
             about = {"weights": self.weights, "weights_hash": tracker.weights_hash, "data_hash": combined_hash(hashes)}
-            about |= {"resamples": self.resamples, "seed": self.seed, "rows": [asdict(row) for row in rows]}
+            about |= {
+                "apart_px": self.apart_px,
+                "resamples": self.resamples,
+                "seed": self.seed,
+                "rows": [asdict(row) for row in rows],
+            }
             write_report(provenance() | about | {"answers": [asdict(a) for a in answers]}, self.out)
         console.print(_table(rows))
         return 0

@@ -89,6 +89,10 @@ MAP_PROCEDURAL = (
             "bare_sideboard",
             "bare_desk",
             "bare_drawer_desk",
+            "bare_wall_unit",
+            "bare_refrigerator",
+            "bare_french_refrigerator",
+            "bare_microwave",
         ),
     ),
 )

@@ -38,8 +38,9 @@ class Perfect:
         assert queries is not None
         self.asked += queries
         which = [0 if q.intent == "open" or self.deaf else 1 for q in queries]
+        begin = int(np.flatnonzero(self.take.stamp_s == clip.stamp_s[0])[0])
         answer: Any = make_tracker().track(clip, [Query.point(0, 20.0, 30.0, name=q.name) for q in queries])
-        return replace(answer, point_world=self.take.point_world[:, which].astype(np.float32))
+        return replace(answer, point_world=self.take.point_world[begin:, which].astype(np.float32))
 
 
 def test_pairs_are_labels_with_both_intents(take: Take):
@@ -63,8 +64,23 @@ def test_both_intents_are_asked_for_and_judged(take: Take):
     assert not answer.both
 
 
+def test_a_stream_may_begin_where_both_are_apart(take: Take):
+    view = take.views[0]
+    uv_px = view.uv_px.copy()
+    uv_px[:, :2] = 50.0
+    uv_px[5:, 1, 0] += 30.0
+    visible = np.ones_like(view.visible)
+    visible[5, 0] = False
+    apart = replace(take, views=(replace(view, uv_px=uv_px, visible=visible),))
+    tracker: Any = Perfect(apart)
+    (answer,) = judge_intents(tracker, apart, 0, part="validation", apart_px=20.0)
+    assert answer.begin == 6
+    assert answer.both
+    assert judge_intents(tracker, apart, 0, part="validation", apart_px=40.0) == []
+
+
 def test_rows_are_over_objects():
-    good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0.01, 0.02, 1.0, 0.95)
+    good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0, 0.01, 0.02, 1.0, 0.95)
     bad = replace(good, take="u", object_id="laptop-2", lift_acc=0.5, lift_ape=0.4)
     (row,) = intent_rows([good, replace(good, view=1), bad], resamples=200)
     assert (row.objects, row.takes, row.views) == (2, 2, 3)

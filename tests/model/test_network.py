@@ -9,12 +9,13 @@ import torch
 from torch import Tensor
 
 from quest.errors import ConfigError
+from quest.model.affordance import AffordanceMap
 from quest.model.config import PRESETS, NetworkConfig
 from quest.model.decoder import Anchor, HeatmapHead, Prediction, sample_grid
 from quest.model.discovery import find_peaks
-from quest.model.network import UNKNOWN_LABEL, QuestNetwork
+from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch
-from quest.types import LABELS
+from quest.types import INTENTS, LABELS
 from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
@@ -269,18 +270,35 @@ def test_slots_are_peaks_best_first_and_apart():
     assert (peaks.logit.diff() <= 0).all()
     assert ((peaks.label >= 0) & (peaks.label < len(LABELS))).all()
     gap = torch.cdist(peaks.uv * 64, peaks.uv * 64) + 1e3 * torch.eye(len(peaks.uv))
+    other_purpose = (peaks.label[:, None] == peaks.label) & (peaks.intent[:, None] != peaks.intent)
     # Coordinates are clamped to the image after the comparison.
     inside = ((peaks.uv > 0) & (peaks.uv < 1)).all(-1)
-    assert (gap[inside][:, inside] >= 1.5 * 8 - 1e-3).all()
+    assert (gap >= torch.where(other_purpose, 3.0, 1.5 * 8) - 1e-3)[inside][:, inside].all()
     assert peaks.logit[0] == network.afford(frames, observed).logits.max()
-    assert torch.isfinite(peaks.lift).all()
+    assert ((peaks.intent >= 0) & (peaks.intent < len(INTENTS))).all()
+
+
+def test_one_place_to_open_and_to_lift_by_gives_two_slots(monkeypatch: pytest.MonkeyPatch):
+    network, frames = make_network(), make_frames(batch=1, frames=1)
+    cells, purposes = network.config.cells**2, len(INTENTS)
+    logits, offset = torch.full((1, 1, cells, len(LABELS), purposes), -9.0), torch.zeros(1, 1, cells, purposes, 2)
+    logits[..., 27, 2, 0], logits[..., 27, 2, 1], logits[..., 27, 1, 1] = 4.0, 3.0, 2.0
+    offset[..., 27, 0, 1], offset[..., 27, 1, 1] = -0.3, 0.3
+    monkeypatch.setattr(network, "afford", lambda *_: AffordanceMap(logits, offset))
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
+    assert (peaks.label[:2].tolist(), peaks.intent[:2].tolist()) == ([2, 2], [0, 1])
+    assert (peaks.logit[2:] == -9).all(), "the same place under another label is no third"
+    offset[..., 1] = 0.0
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
+    assert peaks.intent[0] == 0
+    assert (peaks.logit[1:] == -9).all(), "in one pixel only the better is kept"
 
 
 def test_a_network_without_intents_and_trunk_reads_its_map_off_its_cells():
     network, frames = make_network(intents=False, map_layers=0), make_frames(batch=1, frames=1)
     peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
     assert len(peaks.uv) >= 1
-    assert torch.isnan(peaks.lift).all()
+    assert (peaks.intent == UNKNOWN_INTENT).all()
     with pytest.raises(ConfigError, match="no affordance map"):
         make_network(PAPER).afford(frames, network.observe(frames))
 

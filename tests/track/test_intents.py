@@ -28,7 +28,7 @@ def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
             uv=torch.tensor([[0.25, 0.25], [0.75, 0.75], [0.25, 0.75]]),
             label=torch.tensor([2, 2, 0]),
             logit=torch.tensor([9.0, 8.0, 7.0]),
-            lift=torch.tensor([-3.0, 3.0, 3.0]),
+            intent=torch.tensor([0, 1, 1]),
         )
 
     monkeypatch.setattr("quest.track.binding.find_peaks", peaks)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -261,49 +262,51 @@ def test_manifold_loss():
     lives(loss, point)
 
 
-def test_affordance_loss():
-    logits, offset = torch.randn(B, C * C, 4, requires_grad=True), torch.randn(B, C * C, 2, requires_grad=True)
+@pytest.mark.parametrize("purposes", [1, 2])
+def test_affordance_loss(purposes: int):
+    logits = torch.randn(B, C * C, 4, purposes, requires_grad=True)
+    offset = torch.randn(B, C * C, purposes, 2, requires_grad=True)
     uv, label = torch.rand(B, K, 2), torch.tensor([[0, 0, 3], [1, 2, 2]])
     visible = torch.tensor([[True, True, False], [True, False, True]])
-    intent, lift = torch.tensor([[0, 1, 0], [0, 0, 1]]), torch.randn(B, C * C, requires_grad=True)
+    intent = torch.tensor([[0, 1, 0], [0, 0, 1]])
     uv[~visible] = math.nan
-    total, positives, residuals, purposes = 0.0, 0, [], []
+    total, positives, residuals = 0.0, 0, [[] for _ in range(purposes)]
     p = logits.detach().sigmoid()
     for b in range(B):
-        for i in range(C * C):
-            for n in range(4):
-                y = 0.0
-                for k in range(K):
-                    if not visible[b, k] or label[b, k] != n:
-                        continue
-                    px, py = (uv[b, k] * C).tolist()
-                    gap = (i % C + 0.5 - px) ** 2 + (i // C + 0.5 - py) ** 2
-                    y = max(y, 1.0 if i == int(py) * C + int(px) else math.exp(-0.5 * gap / 0.8**2))
-                q = float(p[b, i, n])
-                positives += y == 1.0
-                total -= (1 - q) ** 2 * math.log(q) if y == 1.0 else (1 - y) ** 4 * q**2 * math.log(1 - q)
-        for k in range(K):
-            if visible[b, k]:
+        told = intent[b] if purposes == 2 else torch.zeros_like(intent[b])
+        for i, n, m in itertools.product(range(C * C), range(4), range(purposes)):
+            y = 0.0
+            for k in range(K):
+                if not visible[b, k] or label[b, k] != n or told[k] != m:
+                    continue
                 px, py = (uv[b, k] * C).tolist()
-                cell = int(py) * C + int(px)
-                at, purpose = offset[b, cell].tolist(), float(lift[b, cell].detach().sigmoid())
-                residuals.append(abs(at[0] - (px % 1 - 0.5)) + abs(at[1] - (py % 1 - 0.5)))
-                purposes.append(-math.log(purpose if intent[b, k] else 1 - purpose))
-    found = AffordanceMap(logits[:, None], offset[:, None], lift[:, None])
+                gap = (i % C + 0.5 - px) ** 2 + (i // C + 0.5 - py) ** 2
+                y = max(y, 1.0 if i == int(py) * C + int(px) else math.exp(-0.5 * gap / 0.8**2))
+            q = float(p[b, i, n, m])
+            positives += y == 1.0
+            total -= (1 - q) ** 2 * math.log(q) if y == 1.0 else (1 - y) ** 4 * q**2 * math.log(1 - q)
+        for i, m in itertools.product(range(C * C), range(purposes)):
+            gaps = [
+                (uv[b, k] * C - torch.tensor([i % C + 0.5, i // C + 0.5])).tolist()
+                for k in range(K)
+                if visible[b, k] and told[k] == m
+            ]
+            gap = min(gaps, key=lambda g: max(map(abs, g)), default=[math.inf, math.inf])
+            if max(map(abs, gap)) < 1.5:
+                residuals[m].append(sum(abs(o - g) for o, g in zip(offset[b, i, m].tolist(), gap, strict=True)))
+    found = AffordanceMap(logits[:, None], offset[:, None])
     loss = losses.affordance_loss(found, uv[:, None], label, intent, visible[:, None])
-    expected = total / positives + 0.5 * mean(residuals) + 0.3 * mean(purposes)
-    assert float(loss.detach()) == pytest.approx(expected, rel=1e-4)
-    lives(loss, logits, offset, lift)
+    assert float(loss.detach()) == pytest.approx(total / positives + 0.5 * mean([mean(r) for r in residuals]), rel=1e-4)
+    lives(loss, logits, offset)
 
 
 def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
-    uv, label, intent = torch.tensor([[[[0.3, 0.7]]]]), torch.tensor([[2]]), torch.tensor([[0]])
-    quiet = AffordanceMap(
-        torch.full((1, 1, C * C, 4), -20.0), torch.zeros(1, 1, C * C, 2), torch.full((1, 1, C * C), math.nan)
-    )
-    perfect = AffordanceMap(*(values.clone() for values in (quiet.logits, quiet.offset, quiet.lift)))
-    perfect.logits[0, 0, 5 * C + 2, 2] = 20.0
-    perfect.offset[0, 0, 5 * C + 2] = torch.tensor([0.4 - 0.5, 0.6 - 0.5])
+    uv, label, intent = torch.tensor([[[[0.3, 0.7]]]]), torch.tensor([[2]]), torch.tensor([[1]])
+    quiet = AffordanceMap(torch.full((1, 1, C * C, 4, 2), -20.0), torch.zeros(1, 1, C * C, 2, 2))
+    perfect = AffordanceMap(quiet.logits.clone(), quiet.offset.clone())
+    perfect.logits[0, 0, 5 * C + 2, 2, 1] = 20.0
+    for x, y in itertools.product((1, 2, 3), (4, 5, 6)):
+        perfect.offset[0, 0, y * C + x, 1] = torch.tensor([2.4 - 0.5 - x, 5.6 - 0.5 - y])
     none, seen = torch.tensor([[[False]]]), torch.tensor([[[True]]])
     assert losses.affordance_loss(quiet, uv, label, intent, none) == pytest.approx(0, abs=1e-6)
     assert losses.affordance_loss(perfect, uv, label, intent, seen) == pytest.approx(0, abs=1e-4)

@@ -18,6 +18,7 @@ from quest.train.loop import StepReport, fit
 from quest.train.mapping import MapScores, StageMap, with_own_map
 from quest.train.settings import TrainingConfig, WindowConfig
 from quest.train.windows import WindowSampler
+from quest.types import LABELS
 from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 from tests.train.prepared import CPU, make_store
 
@@ -101,7 +102,10 @@ def test_an_own_map_begins_with_what_the_network_knows():
         if not name.startswith("affordance.mlp.2"):
             assert torch.equal(new[name], tensor), name
     assert torch.equal(new["affordance_trunk.observer.project.weight"], old["observer.project.weight"])
-    assert torch.equal(new["affordance.mlp.2.bias"][:-1], old["affordance.mlp.2.bias"])
+    scores, offsets = new["affordance.mlp.2.bias"].split([2 * len(LABELS), 4])
+    for purpose in range(2):
+        torch.testing.assert_close(scores[purpose::2], old["affordance.mlp.2.bias"][: len(LABELS)])
+        torch.testing.assert_close(offsets.reshape(2, 2)[purpose], old["affordance.mlp.2.bias"][len(LABELS) :])
     with pytest.raises(ConfigError, match="learned queries"):
         with_own_map(make_network(PAPER))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
 from quest.evaluation.metrics import GATE, Sums, distance, identity
 from quest.evaluation.protocols import ClipTracker, first_visible
-from quest.types import INTENTS, Query, Take
+from quest.types import INTENTS, Clip, Query, Take, View
 
 STABLE = 0.95
 """A track is stable if it is nearest to its own entity, and within the gate, in so many of the frames."""
@@ -28,6 +28,7 @@ class IntentAnswer:
         part: part of the object split.
         source: ``partnet-mobility`` or ``procedural``.
         label: label that both entities have.
+        begin: frame of the take in which the stream began.
         open_ape: mean 3D distance to the entity to open by, normalised units; a frame without an answer counts 1.
         lift_ape: the same to the entity to lift by.
         open_acc: share of frames in which the answer is nearest to its own entity and within 0.1.
@@ -40,6 +41,7 @@ class IntentAnswer:
     part: str
     source: str
     label: str
+    begin: int
     open_ape: float
     lift_ape: float
     open_acc: float
@@ -97,7 +99,9 @@ def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
     return found
 
 
-def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
+def judge_intents(
+    tracker: ClipTracker, take: Take, view: int, *, part: str, apart_px: float = 0.0
+) -> list[IntentAnswer]:
     """Ask for what opens and for what lifts in one stream, and judge both tracks.
 
     Args:
@@ -105,6 +109,8 @@ def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> 
         take: with ground truth.
         view: index of the view.
         part: part of the object split.
+        apart_px: the stream begins with the first frame in which both are seen this far apart, pixels of the video;
+            where there is none, the view is left out.
 
     Raises:
         InputError: the weights know no intents.
@@ -112,9 +118,13 @@ def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> 
     answers = []
     info, clip = take.info, take.views[view].clip
     for label, opens, lifts in intent_pairs(take, view):
+        pair = np.array([opens, lifts])
+        begin = _first_apart(take.views[view], pair, apart_px)
+        if begin is None:
+            continue
         queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
-        tracks = tracker.track(clip, queries)
-        gap, right = _score(take, tracks.point_world, np.array([opens, lifts]))
+        tracks = tracker.track(_from(clip, begin), queries)
+        gap, right = _score(take, tracks.point_world, pair, begin)
         answers.append(
             IntentAnswer(
                 take=info.name,
@@ -123,6 +133,7 @@ def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> 
                 part=part,
                 source=info.source,
                 label=label,
+                begin=begin,
                 open_ape=float(gap[:, 0].mean()),
                 lift_ape=float(gap[:, 1].mean()),
                 open_acc=float(right[:, 0].mean()),
@@ -132,13 +143,29 @@ def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> 
     return answers
 
 
+def _first_apart(view: View, pair: Int[np.ndarray, " 2"], apart_px: float) -> int | None:
+    gap_px = np.linalg.norm(np.diff(view.uv_px[:, pair], axis=1)[:, 0], axis=-1)
+    frames = np.flatnonzero((gap_px >= apart_px) & view.visible[:, pair].all(axis=1)) if apart_px > 0 else np.zeros(1)
+    return int(frames[0]) if len(frames) else None
+
+
+def _from(clip: Clip, begin: int) -> Clip:
+    return replace(
+        clip,
+        rgb=clip.rgb[begin:],
+        depth_m=None if clip.depth_m is None else clip.depth_m[begin:],
+        stamp_s=clip.stamp_s[begin:],
+        cam_from_world=clip.cam_from_world[begin:],
+    )
+
+
 def _score(
-    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"]
+    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"], begin: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    half = take.info.half_diagonal_m
-    gap = distance(point_world, take.point_world[:, entities], half_diagonal_m=half)
+    half, true = take.info.half_diagonal_m, take.point_world[begin:]
+    gap = distance(point_world, true[:, entities], half_diagonal_m=half)
     rank = np.searchsorted(take.tracked, entities)
-    nearest = identity(point_world, take.point_world[:, take.tracked], rank, half_diagonal_m=half)
+    nearest = identity(point_world, true[:, take.tracked], rank, half_diagonal_m=half)
     return gap, (nearest == rank) & (gap <= GATE)
 
 

@@ -1,4 +1,4 @@
-"""The dense affordance map: per cell a score for every label, an offset, and what one would take hold of it for.
+"""The dense affordance map: per cell a score for every label and what one would take hold of it for, and offsets.
 
 References: Law and Deng, CornerNet, ECCV 2018, for the map and its loss; Zhou et al., Objects as Points, 2019,
 section 3, for offsets at peaks.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -16,22 +15,23 @@ from torch import Tensor, nn
 from quest.model.config import NetworkConfig
 from quest.model.layers import TokenLayer
 from quest.model.observation import FrameBatch, Observer
-from quest.types import LABELS
+from quest.types import INTENTS, LABELS
 
 
 @dataclass(frozen=True)
 class AffordanceMap:
     """What could be taken hold of, per cell.
 
+    The rims of a closed laptop, one to open and one to lift, may lie in one cell: each purpose has scores and offsets
+    of its own. A network that knows no intents has one purpose.
+
     Attributes:
-        logits: score of every label.
+        logits: score of every label and purpose (index into INTENTS).
         offset: from the cell's centre to the entity, in cells.
-        lift: above zero where one would lift the thing there rather than open it; NaN if the network does not know.
     """
 
-    logits: Float[Tensor, "B T C L"]
-    offset: Float[Tensor, "B T C 2"]
-    lift: Float[Tensor, "B T C"]
+    logits: Float[Tensor, "B T C L P"]
+    offset: Float[Tensor, "B T C P 2"]
 
 
 class AffordanceHead(nn.Module):
@@ -40,18 +40,16 @@ class AffordanceHead(nn.Module):
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         f = Observer.fine_width
-        self.intents = config.intents
-        self.mlp = nn.Sequential(nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, len(LABELS) + 2 + config.intents))
+        self.purposes = len(INTENTS) if config.intents else 1
+        self.mlp = nn.Sequential(nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, (len(LABELS) + 2) * self.purposes))
         final = self.mlp[-1]
         assert isinstance(final, nn.Linear)
-        nn.init.constant_(final.bias[: len(LABELS)], -4.0)
+        nn.init.constant_(final.bias[: len(LABELS) * self.purposes], -4.0)
 
     def forward(self, fine: Float[Tensor, "B T C F"]) -> AffordanceMap:
         """The map of every frame."""
-        out = self.mlp(fine).float()
-        n = len(LABELS)
-        lift = out[..., n + 2] if self.intents else torch.full_like(out[..., 0], torch.nan)
-        return AffordanceMap(out[..., :n], out[..., n : n + 2], lift)
+        logits, offset = self.mlp(fine).float().split([len(LABELS) * self.purposes, 2 * self.purposes], dim=-1)
+        return AffordanceMap(logits.unflatten(-1, (-1, self.purposes)), offset.unflatten(-1, (-1, 2)))
 
 
 class AffordanceTrunk(nn.Module):

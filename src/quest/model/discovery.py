@@ -9,12 +9,13 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from quest.model.network import QuestNetwork
+from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
-from quest.types import LABELS
 
 FOUND_PX = 16.0
 """A candidate this close to an entity of its label has found it, pixels of the network's input."""
+
+_PURPOSES_APART_PX = 3.0
 
 
 @dataclass(frozen=True)
@@ -25,35 +26,41 @@ class Peaks:
         uv: coordinates in [0, 1]^2 of the network's input.
         label: index into LABELS.
         logit: score of the affordance map.
-        lift: above zero where the thing is to be lifted by it rather than opened; NaN if the network does not know.
+        intent: index into INTENTS, or UNKNOWN_INTENT if the network does not know.
     """
 
     uv: Float[Tensor, "K 2"]
     label: Int[Tensor, " K"]
     logit: Float[Tensor, " K"]
-    lift: Float[Tensor, " K"]
+    intent: Int[Tensor, " K"]
 
 
 def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float) -> Peaks:
     """Peaks of one frame (B = 1, T = 1), at most as many as the network has slots.
 
-    A peak is the best of its 3 x 3 cells and label; of peaks of any label closer than ``radius_cells`` the best stays.
+    A peak is the best of its 3 x 3 cells, label and intent; of peaks closer than ``radius_cells`` the best stays. The
+    same label for another intent may come closer: the rims of a closed laptop are two things.
     """
     side, cell = network.config.cells, network.config.cell_px
     found = network.afford(frames, observed)
-    scores = found.logits[0, 0].T.reshape(len(LABELS), side, side)
+    purposes = found.logits.shape[-1]
+    scores = found.logits[0, 0].flatten(1).T.reshape(-1, side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
     flat = torch.where(is_peak, scores, -torch.inf).flatten()
     value, index = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
-    label, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
-    uv_px = cell_centres(network.config, device=place.device)[place] + cell * found.offset[0, 0][place]
+    channel, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
+    label, purpose = channel.div(purposes, rounding_mode="floor"), channel % purposes
+    uv_px = cell_centres(network.config, device=place.device)[place] + cell * found.offset[0, 0][place, purpose]
+    other_purpose = (label[:, None] == label) & (purpose[:, None] != purpose)
+    apart_px = torch.where(other_purpose, _PURPOSES_APART_PX, radius_cells * cell)
+    clash = torch.cdist(uv_px, uv_px) < apart_px
     keep: list[int] = []
     for i in range(len(value)):
-        near = bool(keep) and bool(((uv_px[keep] - uv_px[i]).norm(dim=-1) < radius_cells * cell).any())
-        if not near and len(keep) < network.config.slots:
+        if len(keep) < network.config.slots and not bool(clash[i, keep].any()):
             keep.append(i)
     uv = (uv_px / network.config.encoder.image_size).clamp(0, 1)
-    return Peaks(uv[keep], label[keep], value[keep], found.lift[0, 0][place][keep])
+    intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
+    return Peaks(uv[keep], label[keep], value[keep], intent[keep])
 
 
 def match_peaks(

@@ -9,6 +9,8 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from quest.model.relief import RELIEF_CHANNELS
+
 
 class Attention(nn.Module):
     """Multi-head attention with pre-norm on the queries.
@@ -102,14 +104,16 @@ class PointCode(nn.Module):
 
 
 class DetailStem(nn.Module):
-    """Fine detail that frozen patch tokens lack, from colours and lifted points of every pixel.
+    """Fine detail that frozen patch tokens lack, from colours, lifted points and relief of every pixel.
 
-    Input channels: 3 colours, 3 coordinates in the reference frame, 1 whether depth is there.
+    Input channels: 3 colours, 3 coordinates in the reference frame, 1 whether depth is there, and the relief.
     """
+
+    channels = 7 + RELIEF_CHANNELS
 
     def __init__(self, close_width: int, fine_width: int, token_width: int) -> None:
         super().__init__()
-        self.patchify = nn.Conv2d(7, close_width, 4, 4)
+        self.patchify = nn.Conv2d(self.channels, close_width, 4, 4)
         self.norm1 = nn.GroupNorm(8, close_width)
         self.down = nn.Conv2d(close_width, fine_width, 3, 2, 1)
         self.norm2 = nn.GroupNorm(8, fine_width)
@@ -118,7 +122,7 @@ class DetailStem(nn.Module):
         self.to_token = nn.Conv2d(fine_width, token_width, 2, 2)
 
     def forward(
-        self, image: Float[Tensor, "B 7 H W"]
+        self, image: Float[Tensor, "B S H W"]
     ) -> tuple[Float[Tensor, "B G Hc Wc"], Float[Tensor, "B F Hf Wf"], Float[Tensor, "B D Hp Wp"]]:
         """Features at one fourth, one eighth and one sixteenth of the resolution."""
         close = F.gelu(self.norm1(self.patchify(image)))

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from quest.geometry import invert, transform
 from quest.model.config import NetworkConfig
 from quest.model.layers import DetailStem, PointCode, TokenLayer
+from quest.model.relief import relief
 
 
 @dataclass(frozen=True)
@@ -264,10 +265,10 @@ class Observer(nn.Module):
         centre = cell_centres(self.config, device=frames.depth_m.device).expand(b, t, -1, -1)
         return frames.to_reference(centre, frames.cell_depth_m.flatten(2))
 
-    def _detail_image(self, frames: FrameBatch) -> Float[Tensor, "B T 7 H W"]:
+    def _detail_image(self, frames: FrameBatch) -> Float[Tensor, "B T S H W"]:
         rgb = frames.rgb.permute(0, 1, 4, 2, 3).to(frames.depth_m.dtype) / 127.5 - 1
         if not self.config.points3d:
-            return F.pad(rgb, (0, 0, 0, 0, 0, 4))
+            return F.pad(rgb, (0, 0, 0, 0, 0, DetailStem.channels - 3))
         b, t, h, w = frames.depth_m.shape
         y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
         uv = torch.stack((x, y), dim=-1).to(frames.depth_m).reshape(1, 1, h * w, 2).expand(b, t, -1, -1)
@@ -275,7 +276,8 @@ class Observer(nn.Module):
         point, valid = frames.to_reference(uv, depth), (depth > 0).unsqueeze(-1)
         point = torch.where(valid, point, torch.zeros_like(point)).clamp(-4, 4)
         geometry = torch.cat((point, valid.to(point.dtype)), dim=-1).transpose(2, 3).reshape(b, t, 4, h, w)
-        return torch.cat((rgb, geometry), dim=2)
+        standing_out = relief(frames.depth_m, frames.scale[:, None].expand(b, t))
+        return torch.cat((rgb, geometry, standing_out), dim=2)
 
 
 def cell_centres(config: NetworkConfig, *, device: torch.device | None = None) -> Float[Tensor, "C 2"]:

@@ -21,7 +21,7 @@ from quest.model.hub import FILE, LIBRARY, HubId, download, explained
 from quest.model.model_card import TAGS, model_card
 from quest.model.network import QuestNetwork
 
-FORMAT = "quest-network-1"
+FORMAT = "quest-network-2"
 
 FOLDER_FILES = (FILE, "weights.safetensors")
 """What a folder is searched for: what ``save_pretrained`` writes, then what ``quest train`` writes."""
@@ -240,7 +240,7 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
     if metadata.get("format") != FORMAT:
         raise WeightsError(
             f"{path}: expected a network of format {FORMAT!r}, got {metadata.get('format')!r}; "
-            "write it with `quest train` (encoder weights alone are not a network)"
+            "make it with `quest train` (networks of format 1 saw no relief; encoder weights alone are no network)"
         )
     try:
         network = QuestNetwork(NetworkConfig.from_json(metadata["config"]))

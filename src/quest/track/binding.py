@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -205,8 +204,7 @@ class Binding:
                 name = query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]]))
         if chosen:
-            told = [UNKNOWN_INTENT if intent[i] is None else INTENTS.index(intent[i]) for i in chosen]
-            self._join(observed, frames, slots.uv[chosen], slots.label[chosen], torch.tensor(told))
+            self._join(observed, frames, slots.uv[chosen], slots.label[chosen], slots.intent[chosen])
         return found
 
     def _taken(self, uv: Tensor, frames: FrameBatch, following: Sequence[Following]) -> bool:
@@ -258,4 +256,4 @@ class Binding:
 
 def _intents(slots: Peaks) -> list[str | None]:
     """What each slot is for; None where the network does not tell."""
-    return [None if math.isnan(lift) else INTENTS[int(lift > 0)] for lift in slots.lift.tolist()]
+    return [None if n == UNKNOWN_INTENT else INTENTS[n] for n in slots.intent.tolist()]

@@ -16,7 +16,7 @@ from torch import Tensor
 from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
 from quest.train.pooling import pooled
-from quest.types import INTENTS, LABELS
+from quest.types import LABELS
 
 
 def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
@@ -198,7 +198,9 @@ def affordance_loss(
     intent: Int[Tensor, "B K"],
     visible: Bool[Tensor, "B T K"],
 ) -> Float[Tensor, ""]:
-    """Focal loss of the dense map; at the true cells, L1 of its offsets and cross-entropy of what they are taken for.
+    """Focal loss of the dense map; in the 3 x 3 cells around every entity, L1 of the offsets to it.
+
+    Where cells are near several entities of one purpose, they point to the nearest.
 
     Reference: Law and Deng, CornerNet, ECCV 2018, equations 1 and 2.
 
@@ -209,24 +211,28 @@ def affordance_loss(
         intent: index into INTENTS.
         visible: which entities are seen.
     """
-    cells = math.isqrt(found.logits.shape[2])
+    cells, purposes = math.isqrt(found.logits.shape[2]), found.logits.shape[-1]
     place = torch.where(visible.unsqueeze(-1), uv, torch.full_like(uv, 0.5)).clamp(0, 1 - 1e-6) * cells
-    centre = torch.arange(cells, device=uv.device) + 0.5
-    x = torch.exp(-0.5 * ((centre - place[..., :1]) / 0.8) ** 2)
-    y = torch.exp(-0.5 * ((centre - place[..., 1:]) / 0.8) ** 2)
-    blob = (y.unsqueeze(-1) * x.unsqueeze(-2)).flatten(-2) * visible.unsqueeze(-1)
+    side = torch.arange(cells, device=uv.device) + 0.5
+    centre = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).flatten(0, 1)
+    gap = place.unsqueeze(-2) - centre
+    blob = torch.exp(-0.5 * gap.square().sum(-1) / 0.8**2) * visible.unsqueeze(-1)
     cell = place[..., 1].long() * cells + place[..., 0].long()
     blob = blob.scatter(-1, cell.unsqueeze(-1), visible.to(blob.dtype).unsqueeze(-1))
-    one_hot = F.one_hot(label, len(LABELS)).to(blob.dtype)[:, None, :, None]
+    purpose = intent.clamp(max=purposes - 1)
+    one_hot = F.one_hot(label * purposes + purpose, len(LABELS) * purposes).to(blob.dtype)[:, None, :, None]
     target = (blob.unsqueeze(-1) * one_hot).amax(dim=2)
-    log_p, log_not = F.logsigmoid(found.logits), F.logsigmoid(-found.logits)
-    p = found.logits.sigmoid()
+    logits = found.logits.flatten(-2)
+    log_p, log_not, p = F.logsigmoid(logits), F.logsigmoid(-logits), logits.sigmoid()
     positive = target >= 1
     loss = torch.where(positive, -((1 - p) ** 2) * log_p, -((1 - target) ** 4) * p**2 * log_not)
     focal = loss.sum() / pooled(positive.sum().to(loss.dtype)).clamp(min=1)
-    at_cell = found.offset.gather(2, cell.unsqueeze(-1).expand(-1, -1, -1, 2))
-    residual = (at_cell - (place - place.floor() - 0.5)).abs().sum(-1)
-    lift = found.lift.gather(2, cell)
-    wanted = (intent == INTENTS.index("lift"))[:, None].expand_as(visible)
-    taken = confidence_loss(lift, wanted, visible & torch.isfinite(lift))
-    return focal + 0.5 * masked_mean(residual, visible) + 0.3 * taken
+    pointing = found.logits.new_zeros(())
+    for n in range(purposes):
+        meant = visible & (purpose == n)[:, None]
+        far = torch.where(meant.unsqueeze(-1), gap.abs().amax(-1), torch.inf)
+        least, nearest = far.min(dim=2)
+        wanted = gap.gather(2, nearest[:, :, None, :, None].expand(-1, -1, -1, -1, 2)).squeeze(2)
+        residual = (found.offset[..., n, :] - wanted).abs().sum(-1)
+        pointing = pointing + masked_mean(residual, least < 1.5) / purposes
+    return focal + 0.5 * pointing

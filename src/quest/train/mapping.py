@@ -20,6 +20,7 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train import losses
 from quest.train.windows import WindowSampler, WindowTruth
+from quest.types import INTENTS, LABELS
 
 _RADIUS_CELLS = 1.5
 
@@ -72,7 +73,7 @@ class StageMap:
         return [*trunk.parameters(), *self.network.affordance.parameters()]
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
-        """Focal loss of the map, its offsets and its intents."""
+        """Focal loss of the map, and its offsets."""
         found = self.network.afford(frames, self.network.observe(frames))
         visible = truth.visible & truth.exists[:, None]
         loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible)
@@ -111,8 +112,8 @@ class StageMap:
         size = network.config.encoder.image_size
         found = match_peaks(size * peaks.uv, peaks.label, size * truth.uv[b, 0, seen], truth.label[b, seen])
         out = []
-        for score, lifts, e in zip(peaks.logit.tolist(), (peaks.lift > 0).tolist(), found.tolist(), strict=True):
-            out.append((score, e >= 0, e >= 0 and lifts == bool(truth.intent[b, seen[e]])))
+        for score, intent, e in zip(peaks.logit.tolist(), peaks.intent.tolist(), found.tolist(), strict=True):
+            out.append((score, e >= 0, e >= 0 and intent == int(truth.intent[b, seen[e]])))
         return out
 
 
@@ -139,8 +140,11 @@ def with_own_map(network: QuestNetwork) -> QuestNetwork:
             state[name] = old
     if not network.config.intents:
         state["binder.intent.weight"] = torch.zeros_like(state["binder.intent.weight"])
-        # The head has one more output for what to lift; the others stay.
+        # Both purposes begin with what the one map knows.
         for name in ("affordance.mlp.2.weight", "affordance.mlp.2.bias"):
-            state[name][: len(own[name])] = own[name]
+            scores, offsets = own[name].split([len(LABELS), 2])
+            state[name] = torch.cat(
+                (scores.repeat_interleave(len(INTENTS), 0), offsets.repeat(len(INTENTS), *[1] * (offsets.ndim - 1)))
+            )
     other.load_state_dict(state)
     return other.train(network.training)

@@ -21,12 +21,15 @@ from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
 from quest.sim.procedural.things import THINGS
 from quest.sim.procedural.urdf import write_object
 
-_OFTEN_BARE = ("chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk")
+_OFTEN_BARE = (
+    "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
+    "french_refrigerator", "microwave",
+)  # fmt: skip
 
 
 def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
-    model = {**FURNITURE, **STORAGE}[category](rng)
+    model = _BUILDERS[category](rng)
     links = [replace(link, parts=tuple(p for p in link.parts if p.role not in HANDLE_ROLES)) for link in model.links]
     return replace(model, links=tuple(links))
 
