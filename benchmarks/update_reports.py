@@ -48,6 +48,13 @@ def _ablation(file: str, title: str, columns: dict[str, str]) -> Table:
     return Table(f"ablations/{file}.json", title, "rows", about | counts | columns, only={"reading": "moved"})
 
 
+def _intents(file: str, title: str) -> Table:
+    shares = {"both stable %": "%both", "APE open": "open_ape", "APE lift": "lift_ape"}
+    right = {"Acc open %": "%open_acc", "Acc lift %": "%lift_acc"}
+    counts = {"objects/takes/views": "objects/takes/views"}
+    return Table(f"intents/{file}.json", title, "rows", OBJECTS | counts | shares | right)
+
+
 OBJECTS = {"objects": "source", "part": "part"}
 ON_OFF = {
     "objects/tracks": "objects/tracks",
@@ -168,18 +175,21 @@ TABLES = (
             "p90": "axis_p90_deg",
         },
     ),
+    _intents("intents", "Open and lift: two places of one label on one thing, both asked for"),
+    _intents("ajar", "The same, begun where both are seen 16 pixels apart"),
     Table(
-        "intents/intents.json",
-        "Open and lift: two places of one label on one thing, both asked for",
+        "scene_flow/test.json",
+        "Scene flow: EPE3D of the flow head beside zero flow and differences of lifted points",
         "rows",
         OBJECTS
         | {
-            "objects/takes/views": "objects/takes/views",
-            "both stable %": "%both",
-            "APE open": "open_ape",
-            "APE lift": "lift_ape",
-            "Acc open %": "%open_acc",
-            "Acc lift %": "%lift_acc",
+            "level": "level",
+            "stride": "stride",
+            "reading": "reading",
+            "objects/takes/entities": "objects/takes/entities",
+            "flow head": "epe.head",
+            "zero": "epe.zero",
+            "lifted, as predicted": "epe.lifted",
         },
     ),
     Table(

@@ -16,7 +16,7 @@ _GAIN = 20.0
 RELIEF_CHANNELS = len(_RADII_PX)
 
 
-def relief(depth_m: Float[Tensor, "*B H W"], scale: Float[Tensor, "*B"]) -> Float[Tensor, "*B {RELIEF_CHANNELS} H W"]:
+def relief(depth_m: Float[Tensor, "*B H W"], scale: Float[Tensor, "*B"]) -> Float[Tensor, "*B R H W"]:
     """How far each pixel stands before the surface around it, squashed to (-1, 1); 0 where depth is missing.
 
     Over a plane inverse depth is linear in the image, so its mean over a square is the value in the middle: planes have
