@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from quest.data.cut import cut_clip
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.decoder import HeatmapHead
@@ -63,20 +64,9 @@ def test_stream_equals_clip(config: NetworkConfig, queries: tuple[Query, ...] | 
 @BOTH
 def test_the_future_is_not_used(config: NetworkConfig, clip: Clip):
     tracker = make_tracker(config)
-    whole, start = tracker.track(clip, POINTS), tracker.track(cut(clip, slice(0, 3)), POINTS)
+    whole, start = tracker.track(clip, POINTS), tracker.track(cut_clip(clip, slice(0, 3)), POINTS)
     np.testing.assert_allclose(whole.uv_px[:3], start.uv_px, atol=1e-4)
     np.testing.assert_allclose(whole.point_world[:3], start.point_world, atol=1e-4)
-
-
-def cut(clip: Clip, frames: slice) -> Clip:
-    return Clip(
-        clip.name,
-        clip.camera,
-        clip.rgb[frames],
-        None if clip.depth_m is None else clip.depth_m[frames],
-        clip.stamp_s[frames],
-        clip.cam_from_world[frames],
-    )
 
 
 def test_tracks_come_in_the_order_of_the_queries(clip: Clip):

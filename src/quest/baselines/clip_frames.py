@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -89,15 +88,3 @@ class ClipFrames:
     def _depth(self, t: int) -> Float[Tensor, "1 S S"]:
         depth_m = self._clip.depth_m
         return self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m[t]))
-
-
-def single_frame(clip: Clip, t: int) -> Clip:
-    """A clip of one frame of a clip."""
-    frame = slice(t, t + 1)
-    return replace(
-        clip,
-        rgb=clip.rgb[frame],
-        depth_m=None if clip.depth_m is None else clip.depth_m[frame],
-        stamp_s=clip.stamp_s[frame],
-        cam_from_world=clip.cam_from_world[frame],
-    )

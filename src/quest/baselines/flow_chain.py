@@ -13,9 +13,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 
-from quest.baselines.clip_frames import ClipFrames, single_frame
+from quest.baselines.clip_frames import ClipFrames
 from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
 from quest.baselines.redetect import NOTHING_FOUND, Detections, Detector
+from quest.data.cut import cut_clip
 from quest.errors import ConfigError, WeightsError
 from quest.model.network import UNKNOWN_LABEL
 from quest.model.observation import FrameBatch
@@ -111,7 +112,9 @@ class FlowChain:
         for t in range(len(clip) if len(first) else 0):
             unknown = (first <= t) & ~np.isfinite(found[t]).all(axis=-1)
             if unknown.any():
-                lifted = lift_pixels(single_frame(clip, t), uv_first[None], window_px=self.detector.depth_window_px)[0]
+                lifted = lift_pixels(
+                    cut_clip(clip, slice(t, t + 1)), uv_first[None], window_px=self.detector.depth_window_px
+                )[0]
                 found[t, unknown] = lifted[unknown]
             step = self._flow(frames, t, found[t])
             noise = rng.normal(0.0, 1.0, step.shape) * sigma_m

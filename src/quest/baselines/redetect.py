@@ -16,8 +16,9 @@ import torch
 from jaxtyping import Float, Float32
 from scipy.optimize import linear_sum_assignment
 
-from quest.baselines.clip_frames import ClipFrames, single_frame
+from quest.baselines.clip_frames import ClipFrames
 from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
+from quest.data.cut import cut_clip
 from quest.errors import WeightsError
 from quest.model.discovery import find_peaks
 from quest.model.network import QuestNetwork
@@ -94,7 +95,7 @@ class Detector:
         score = (peaks.logit[kept] - self.min_logit).sigmoid().float().cpu().numpy()
         return Detections(
             uv_px,
-            lift_pixels(single_frame(clip, t), uv_px[None], window_px=self.depth_window_px)[0],
+            lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None], window_px=self.depth_window_px)[0],
             tuple(LABELS[int(n)] for n in peaks.label[kept]),
             score.astype(np.float32),
         )
@@ -180,7 +181,7 @@ class Redetect:
         t: int,
     ) -> None:
         """Point queries begin at the nearest detection; one that has none in reach begins, and stays, at its pixel."""
-        own = single_frame(clip, t)
+        own = cut_clip(clip, slice(t, t + 1))
         rows.uv_px[t, born] = uv_px
         rows.point_world[t, born] = lift_pixels(own, uv_px[None], window_px=self.detector.depth_window_px)[0]
         half_px = max(clip.camera.width, clip.camera.height) / 2

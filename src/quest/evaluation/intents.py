@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from quest.data.cut import cut_clip
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
 from quest.evaluation.metrics import GATE, Sums, distance, identity
 from quest.evaluation.protocols import ClipTracker, first_visible
-from quest.types import INTENTS, Clip, Query, Take, View
+from quest.types import INTENTS, Query, Take, View
 
 STABLE = 0.95
 """A track is stable if it is nearest to its own entity, and within the gate, in so many of the frames."""
@@ -123,7 +124,7 @@ def judge_intents(
         if begin is None:
             continue
         queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
-        tracks = tracker.track(_from(clip, begin), queries)
+        tracks = tracker.track(cut_clip(clip, slice(begin, None)), queries)
         gap, right = _score(take, tracks.point_world, pair, begin)
         answers.append(
             IntentAnswer(
@@ -147,16 +148,6 @@ def _first_apart(view: View, pair: Int[np.ndarray, " 2"], apart_px: float) -> in
     gap_px = np.linalg.norm(np.diff(view.uv_px[:, pair], axis=1)[:, 0], axis=-1)
     frames = np.flatnonzero((gap_px >= apart_px) & view.visible[:, pair].all(axis=1)) if apart_px > 0 else np.zeros(1)
     return int(frames[0]) if len(frames) else None
-
-
-def _from(clip: Clip, begin: int) -> Clip:
-    return replace(
-        clip,
-        rgb=clip.rgb[begin:],
-        depth_m=None if clip.depth_m is None else clip.depth_m[begin:],
-        stamp_s=clip.stamp_s[begin:],
-        cam_from_world=clip.cam_from_world[begin:],
-    )
 
 
 def _score(

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
+from quest.model.observation import grid_centres
 from quest.train.pooling import pooled
 from quest.types import LABELS
 
@@ -213,9 +214,7 @@ def affordance_loss(
     """
     cells, purposes = math.isqrt(found.logits.shape[2]), found.logits.shape[-1]
     place = torch.where(visible.unsqueeze(-1), uv, torch.full_like(uv, 0.5)).clamp(0, 1 - 1e-6) * cells
-    side = torch.arange(cells, device=uv.device) + 0.5
-    centre = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).flatten(0, 1)
-    gap = place.unsqueeze(-2) - centre
+    gap = place.unsqueeze(-2) - grid_centres(cells, 1, device=uv.device)
     blob = torch.exp(-0.5 * gap.square().sum(-1) / 0.8**2) * visible.unsqueeze(-1)
     cell = place[..., 1].long() * cells + place[..., 0].long()
     blob = blob.scatter(-1, cell.unsqueeze(-1), visible.to(blob.dtype).unsqueeze(-1))

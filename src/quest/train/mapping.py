@@ -32,13 +32,13 @@ class MapScores:
     Attributes:
         precision: average precision over all peaks, the best first.
         recall: share of seen entities that any peak is right about.
-        lift: share of those of which it is known rightly whether one opens or lifts by them.
+        intent: share of those of which it is known rightly whether one opens or lifts by them.
         present: how many entities are seen.
     """
 
     precision: float
     recall: float
-    lift: float
+    intent: float
     present: int
 
     @property
@@ -49,7 +49,7 @@ class MapScores:
     def __str__(self) -> str:
         return (
             f"average precision {self.precision:.3f}, {self.recall:.1%} among the peaks, intent right "
-            f"{self.lift:.1%} (n = {self.present})"
+            f"{self.intent:.1%} (n = {self.present})"
         )
 
 
@@ -95,12 +95,12 @@ class StageMap:
         self.network.train()
         peaks.sort(key=lambda peak: -peak[0])
         right = np.array([hit for _, hit, _ in peaks])
-        intent = np.array([lift for _, hit, lift in peaks if hit])
+        intent = np.array([known for _, hit, known in peaks if hit])
         precision = np.cumsum(right) / np.arange(1, len(right) + 1)
         return MapScores(
             precision=float(precision[right].sum() / max(present, 1)),
             recall=float(right.sum() / max(present, 1)),
-            lift=float(intent.mean()) if len(intent) else 0.0,
+            intent=float(intent.mean()) if len(intent) else 0.0,
             present=present,
         )
 
