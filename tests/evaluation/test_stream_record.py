@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
@@ -27,6 +28,7 @@ from quest.monitor import SIGNALS
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
+from tests.tiny import DEFAULT
 from tests.track.clips import make_tracker
 
 NAMES: dict[str, SplitPart] = {"panels-100001": "validation", "panels-100002": "validation"}
@@ -124,6 +126,27 @@ def test_another_tracker_records_again(store: TakeStore, tmp_path: Path):
     record_streams(second, [(store, NAMES)], tmp_path, shard=Shard(0, 4), progress=lambda name, i, n: told.append(name))
     assert len(told) == 1
     assert len(read_records(tmp_path, made_by=tracker_id(second))) == 1
+
+
+def test_records_outlive_what_given_points_are_not_followed_by(take: Take):
+    first = make_tracker(replace(DEFAULT, flow=True))
+    known = tracker_id(first)
+    before = record_stream(first, take, 0, part="validation")
+    assert tracker_id(make_tracker()) == known  # without the flow head
+    assert tracker_id(first.with_config(replace(first.config, slot_bias=1.0), name="other")) == known
+    with torch.no_grad():
+        for name, parameter in first.network.named_parameters():
+            if name.startswith(("affordance", "flow.")):
+                parameter += 1
+    assert tracker_id(first) == known
+    after = record_stream(first, take, 0, part="validation")
+    assert before is not None
+    assert after is not None
+    assert equal(before, after)
+    assert tracker_id(first.with_config(replace(first.config, off_joint=-1.5), name="other")) != known
+    with torch.no_grad():
+        next(first.network.binder.parameters()).add_(1)
+    assert tracker_id(first) != known
 
 
 def test_a_view_with_nothing_to_follow_is_remembered(tmp_path: Path):

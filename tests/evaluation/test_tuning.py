@@ -7,13 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation import tuning
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.tuning import Trial, discovery_bias, tune
-from quest.types import Query
+from quest.model.discovery import Peaks
+from quest.track import Tracker
+from quest.types import LABELS, Query
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker
 
@@ -54,13 +57,17 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
     """Three candidates, of which the first and the last are entities: keeping all gives the best F2."""
     take = store.read(NAME)
     entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
-    labels = [take.info.entities[e].label for e in entities]
-    uv = take.views[0].uv_px[0, entities]
-    assert len(entities) == 2
-    places = np.stack([uv[0], np.array([-500.0, -500.0]), uv[1]])
-    monkeypatch.setattr(
-        tuning, "_slots", lambda tracker, take, view: (places, [labels[0], labels[0], labels[1]], [2.0, 1.0, -1.0])
+    first, second = (LABELS.index(take.info.entities[e].label) for e in entities)
+    pose = take.views[0].clip.cam_from_world[0]
+    point_m = torch.from_numpy(take.point_world[0, entities] @ pose[:3, :3].T + pose[:3, 3]).float()
+    peaks = Peaks(
+        uv=torch.zeros(3, 2),
+        point_m=torch.stack([point_m[0], point_m[0] + 9, point_m[1]]),
+        label=torch.tensor([first, first, second]),
+        logit=torch.tensor([2.0, 1.0, -1.0]),
+        intent=torch.zeros(3, dtype=torch.long),
     )
+    monkeypatch.setattr(Tracker, "candidates", lambda *_: peaks)
     bias, precision, recall = discovery_bias(make_tracker(), store, [NAME])
     assert (precision, recall) == pytest.approx((2 / 3, 1.0))
     assert bias == pytest.approx(1.0)

@@ -265,7 +265,7 @@ def test_bilinear_samples_against_a_plain_loop():
 def test_slots_are_peaks_best_first_and_apart():
     network, frames = make_network(), make_frames(batch=1, frames=1)
     observed = network.observe(frames)
-    peaks = find_peaks(network, frames, observed, radius_cells=1.5)
+    peaks = find_peaks(network, frames, observed, radius_cells=1.5, mirror=False)
     assert 1 <= len(peaks.uv) <= DEFAULT.slots
     assert (peaks.logit.diff() <= 0).all()
     assert ((peaks.label >= 0) & (peaks.label < len(LABELS))).all()
@@ -285,11 +285,11 @@ def test_one_place_to_open_and_to_lift_by_gives_two_slots(monkeypatch: pytest.Mo
     logits[..., 27, 2, 0], logits[..., 27, 2, 1], logits[..., 27, 1, 1] = 4.0, 3.0, 2.0
     offset[..., 27, 0, 1], offset[..., 27, 1, 1] = -0.3, 0.3
     monkeypatch.setattr(network, "afford", lambda *_: AffordanceMap(logits, offset))
-    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5, mirror=False)
     assert (peaks.label[:2].tolist(), peaks.intent[:2].tolist()) == ([2, 2], [0, 1])
     assert (peaks.logit[2:] == -9).all(), "the same place under another label is no third"
     offset[..., 1] = 0.0
-    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5, mirror=False)
     assert peaks.intent[0] == 0
     assert (peaks.logit[1:] == -9).all(), "in one pixel only the better is kept"
 

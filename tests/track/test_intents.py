@@ -26,6 +26,7 @@ def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     def peaks(*_: object, **__: object) -> Peaks:
         return Peaks(
             uv=torch.tensor([[0.25, 0.25], [0.75, 0.75], [0.25, 0.75]]),
+            point_m=torch.ones(3, 3),
             label=torch.tensor([2, 2, 0]),
             logit=torch.tensor([9.0, 8.0, 7.0]),
             intent=torch.tensor([0, 1, 1]),

@@ -12,7 +12,7 @@ import torch
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.train.feature_cache import FeatureCache, encode_images
+from quest.train.feature_cache import FeatureCache, encode_images, owner_of
 from tests.synthetic import make_take
 from tests.tiny import DEFAULT, make_network
 from tests.train.prepared import CPU
@@ -127,6 +127,25 @@ def test_batches_of_images_do_not_matter():
     np.testing.assert_allclose(one.astype(float), all_.astype(float), atol=0.05)
 
 
+def test_cells_belong_to_the_handle_that_they_show_or_to_the_rim_or_front_of_their_link():
+    size = DEFAULT.encoder.image_size
+    take = make_take(frames=4, views=2, entities=4, seed=0, size=(size, size), hinges=True)
+    labels = [take.info.entities[e].label for e in take.tracked]
+    assert labels == ["handle", "knob", "rim", "front"]
+    cell, side = DEFAULT.cell_px, DEFAULT.cells
+    for v, truth in enumerate(take.views):
+        owner = owner_of(take, v, DEFAULT)
+        assert set(owner.ravel().tolist()) == {-1, 0, 1, 2, 3}
+        for t, y, x in np.ndindex(len(take), side, side):
+            part = np.s_[t, y * cell : (y + 1) * cell, x * cell : (x + 1) * cell]
+            link = int(truth.link_id[part][cell // 2, cell // 2])
+            expected = link - 1 if link and labels[link - 1] in ("rim", "front") else -1
+            for k in (0, 1):
+                if (truth.entity_id[part] == 1 + k).sum() * 16 >= cell**2:
+                    expected = k
+            assert owner[t, y * side + x] == expected
+
+
 def test_tokens_of_enlarged_images_join_an_entry_when_they_are_asked_for(tmp_path: Path):
     store, cache = store_with(tmp_path), cache_in(tmp_path)
     assert build(cache, store) == (4, 4)
@@ -134,7 +153,8 @@ def test_tokens_of_enlarged_images_join_an_entry_when_they_are_asked_for(tmp_pat
     assert not list(tmp_path.glob("cache/*/enlarged.npy"))
     assert tuple(cache.build(store, store.names(), device=CPU, enlarged=True)) == (4, 4)
     assert times(tmp_path) == before
-    for view in cache.views([NAME]):
+    for v, view in enumerate(cache.views([NAME])):
+        np.testing.assert_array_equal(view.owner, owner_of(store.read(NAME), v, DEFAULT))
         with torch.no_grad():
             expected = make_network().enlarge(torch.from_numpy(np.array(view.rgb))).numpy()
         assert view.enlarged.shape == (4, DEFAULT.cells**2, DEFAULT.encoder.width)

@@ -313,6 +313,43 @@ def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
     assert losses.affordance_loss(quiet, uv, label, intent, seen) > 1
 
 
+def test_every_cell_of_a_rim_or_front_points_to_it():
+    uv = torch.tensor([[[[0.3, 0.7], [0.9, 0.1], [0.9, 0.5]]]])
+    label, intent, visible = torch.tensor([[2, 3, 0]]), torch.tensor([[0, 1, 0]]), torch.ones(1, 1, 3, dtype=torch.bool)
+    found = AffordanceMap(torch.randn(1, 1, C * C, 4, 2), torch.randn(1, 1, C * C, 2, 2))
+    owner = torch.full((1, 1, C * C), -1)
+    cells = {0: [(2, 2), (3, 4), (7, 7)], 1: [(0, 0), (6, 5)]}
+    for k, places in cells.items():
+        for x, y in places:
+            owner[0, 0, y * C + x] = k
+    far = []
+    for k, places in cells.items():
+        gaps = {(x, y): uv[0, 0, k] * C - torch.tensor([x + 0.5, y + 0.5]) for x, y in places}
+        beside = [uv[0, 0, n] * C for n in range(3) if intent[0, n] == intent[0, k]]
+        own = [
+            float((found.offset[0, 0, y * C + x, k] - gap).abs().sum())
+            for (x, y), gap in gaps.items()
+            if all((b - torch.tensor([x + 0.5, y + 0.5])).abs().max() >= 1.5 for b in beside)
+        ]
+        assert len(own) == 2  # one cell of each lies beside an entity, which counts more
+        far.append(mean(own))
+    plain = losses.affordance_loss(found, uv, label, intent, visible)
+    more = losses.affordance_loss(found, uv, label, intent, visible, owner)
+    assert float(more - plain) == pytest.approx(0.5 * losses.FAR_WEIGHT * mean(far), rel=1e-4)
+    # Any cell of a handle may score like its middle; those of rims and fronts may not.
+    owner[0, 0, 3 * C + 1] = 2
+    found.logits[0, 0, 3 * C + 1, 0, 0] += 9
+    assert losses.affordance_loss(found, uv, label, intent, visible) > plain + 1
+    assert losses.affordance_loss(found, uv, label, intent, visible, owner) == pytest.approx(float(more), abs=1)
+    found.logits[0, 0, 3 * C + 1, 0, 0] -= 9
+    owner[0, 0, 3 * C + 1] = -1
+    # The middle of what is not seen cannot be told.
+    visible[0, 0, 1] = False
+    less = losses.affordance_loss(found, uv, label, intent, visible, owner)
+    alone = losses.affordance_loss(found, uv, label, intent, visible)
+    assert float(less - alone) == pytest.approx(0.5 * losses.FAR_WEIGHT * far[0] / 2, rel=1e-4)
+
+
 def joints() -> tuple[JointBelief, Tensor, Tensor, Tensor, Tensor]:
     """A belief, true points and axes, kinds and a mask."""
     unit = torch.nn.functional.normalize

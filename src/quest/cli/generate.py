@@ -79,6 +79,8 @@ class Generate:
     """A gripper comes and pulls what moves."""
     randomize_materials: bool = True
     """Give objects random materials: procedural ones always, others now and then."""
+    stretch: float = 1.0
+    """Stretch the object anew in every take, its depth, width and height by up to this factor; 1 leaves it as it is."""
     ray: str | None = None
     """Make the takes on a Ray cluster: its address, auto, or local for one on this machine."""
     ray_cpus_per_worker: int = 2
@@ -179,6 +181,7 @@ class Generate:
             physics=preset.physics or self.physics,
             gripper=preset.gripper or self.gripper,
             randomize_materials=self.randomize_materials,
+            stretch=self.stretch,
             broad_materials=self.mix == "broad",
             **given,
         )

@@ -1,4 +1,4 @@
-"""``quest weights``: list, show, push to the hub, make the encoder's initial weights, tune and calibrate."""
+"""``quest weights``: list, show, push to the hub, merge, make the encoder's initial weights, tune, calibrate."""
 
 from __future__ import annotations
 
@@ -96,6 +96,35 @@ class PushWeights:
         console.print(escape(commit), soft_wrap=True)
         at = f"@{self.branch}" if self.branch else ""
         console.print(f'load it with quest.load("{escape(self.repository + at)}")', soft_wrap=True)
+        return 0
+
+
+@dataclass(frozen=True)
+class MergeWeights:
+    """Put together what was trained apart: what follows entities, the affordance map, the flow head."""
+
+    weights: tyro.conf.Positional[str]
+    """Shipped name, file or folder: what follows entities, with its settings and monitor."""
+    out: tyro.conf.Positional[Path]
+    """File to write."""
+    map: tuple[str, ...] = ()
+    """Whose affordance map to take; of several the mean, one named twice counts twice. Default: its own."""
+    flow: str | None = None
+    """Whose flow head to take; default: its own."""
+
+    def run(self) -> int:
+        """Write the file.
+
+        Raises:
+            WeightsError: weights cannot be loaded, or differ in what a map or flow head rests on.
+        """
+        from quest.model.merge import merge
+        from quest.model.weights import load_network
+
+        flow = None if self.flow is None else load_network(self.flow)
+        merged = merge(load_network(self.weights), maps=[load_network(name) for name in self.map], flow=flow)
+        merged.save(self.out)
+        Console(highlight=False).print(f"weights: {escape(str(self.out))}", soft_wrap=True)
         return 0
 
 
@@ -229,6 +258,7 @@ class Weights:
         | Annotated[ShowWeights, tyro.conf.subcommand("show")]
         | Annotated[SaveWeights, tyro.conf.subcommand("save")]
         | Annotated[PushWeights, tyro.conf.subcommand("push")]
+        | Annotated[MergeWeights, tyro.conf.subcommand("merge")]
         | Annotated[ImportEncoder, tyro.conf.subcommand("import-encoder")]
         | Annotated[TuneWeights, tyro.conf.subcommand("tune")]
         | Annotated[CalibrateWeights, tyro.conf.subcommand("calibrate")]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -161,10 +162,20 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
 
 
 def tracker_id(tracker: Tracker) -> str:
-    """Twelve hexadecimal digits that tell apart networks and settings, but not what else is in a weights file."""
-    digest = hashlib.sha256(tracker.network.config.to_json().encode())
-    digest.update(tracker.config.to_json().encode())
+    """Twelve hexadecimal digits that tell apart networks and settings by which given points are followed.
+
+    Streams are asked for by points. So a better affordance map or flow head, another threshold of discovery, or what
+    else is in a weights file leaves records, and with them the monitor's calibration, as good as they were.
+    """
+    config, settings = asdict(tracker.network.config), asdict(tracker.config)
+    elsewhere: tuple[str, ...] = ("flow.",)
+    if tracker.network.config.queries == "anchored":
+        elsewhere += ("affordance",)
+        settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
+    digest = hashlib.sha256(json.dumps([config | {"flow": None}, settings], sort_keys=True).encode())
     for name, tensor in sorted(tracker.network.state_dict().items()):
+        if name.startswith(elsewhere):
+            continue
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().float().numpy().tobytes())
     return digest.hexdigest()[:12]

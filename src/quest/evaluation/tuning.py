@@ -13,14 +13,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from quest.data.letterbox import Letterbox
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import SplitPart
-from quest.model.discovery import match_peaks
+from quest.geometry import transform
+from quest.model.discovery import Peaks, match_peaks
 from quest.track import Tracker, TrackerConfig
 from quest.types import LABELS, Take
 
@@ -111,7 +111,7 @@ def tune(
 def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> tuple[float, float, float]:
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
-    A slot counts as found if an unclaimed visible entity of its label lies within 16 px of the network's input.
+    A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D.
     """
     logits: list[float] = []
     hits: list[bool] = []
@@ -119,9 +119,10 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
     for name in names:
         take = store.read(name, frames=slice(0, 1))
         for view in range(len(take.views)):
-            uv, labels, scores = _slots(tracker, take, view)
-            hit, count = _match(take, view, uv, labels, size=tracker.network.config.encoder.image_size)
-            logits += scores
+            clip = take.views[view].clip
+            peaks = tracker.candidates(clip.camera, clip.frame(0))
+            hit, count = _match(take, view, peaks)
+            logits += peaks.logit.tolist()
             hits += hit
             present += count
     order = np.argsort(-np.array(logits))
@@ -132,23 +133,17 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
     return -float(threshold), float(right[best] / taken[best]), float(right[best] / max(present, 1))
 
 
-def _slots(tracker: Tracker, take: Take, view: int) -> tuple[np.ndarray, list[str], list[float]]:
-    """Canvas pixels, labels and logits of all candidates in a view's first frame, best first."""
-    clip = take.views[view].clip
-    peaks = tracker.candidates(clip.camera, clip.frame(0))
-    size = tracker.network.config.encoder.image_size
-    return peaks.uv.cpu().numpy() * size, [LABELS[int(n)] for n in peaks.label], peaks.logit.tolist()
-
-
-def _match(take: Take, view: int, uv: np.ndarray, labels: list[str], *, size: int) -> tuple[list[bool], int]:
+def _match(take: Take, view: int, peaks: Peaks) -> tuple[list[bool], int]:
+    """Which candidates of a view's first frame are right, and how many entities are seen in it."""
     truth = take.views[view]
-    canvas = Letterbox(truth.clip.camera, size).to_canvas(truth.uv_px[0])
     entities = [int(e) for e in take.tracked if truth.visible[0, e]]
+    point_m = transform(torch.from_numpy(truth.clip.cam_from_world[0]).float(), torch.from_numpy(take.point_world[0]))
     found = match_peaks(
-        torch.from_numpy(uv),
-        torch.tensor([LABELS.index(label) for label in labels], dtype=torch.long),
-        torch.from_numpy(canvas[entities]),
+        peaks.point_m.cpu(),
+        peaks.label.cpu(),
+        point_m[entities],
         torch.tensor([LABELS.index(take.info.entities[e].label) for e in entities], dtype=torch.long),
+        half_diagonal_m=take.info.half_diagonal_m,
     )
     return (found >= 0).tolist(), len(entities)
 

@@ -6,6 +6,7 @@ section 3, for offsets at peaks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch.nn.functional as F
@@ -32,6 +33,20 @@ class AffordanceMap:
 
     logits: Float[Tensor, "B T C L P"]
     offset: Float[Tensor, "B T C P 2"]
+
+    def mirrored(self) -> AffordanceMap:
+        """The map of the mirror image."""
+        return AffordanceMap(_flip(self.logits), _flip(self.offset) * self.offset.new_tensor([-1.0, 1.0]))
+
+    def mean(self, other: AffordanceMap) -> AffordanceMap:
+        """What two looks at the same frames agree on."""
+        return AffordanceMap((self.logits + other.logits) / 2, (self.offset + other.offset) / 2)
+
+
+def _flip(cells: Float[Tensor, "B T C *D"]) -> Float[Tensor, "B T C *D"]:
+    """Cells of the mirror image."""
+    side = math.isqrt(cells.shape[2])
+    return cells.unflatten(2, (side, side)).flip(3).flatten(2, 3)
 
 
 class AffordanceHead(nn.Module):

@@ -11,11 +11,17 @@ from torch import Tensor
 
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
+from quest.types import LABELS
 
-FOUND_PX = 16.0
-"""A candidate this close to an entity of its label has found it, pixels of the network's input."""
+FOUND_WITHIN = 0.1
+"""A candidate this close to an entity of its label has found it, normalised units: the gate of protocol semantic."""
 
 _PURPOSES_APART_PX = 3.0
+
+_ALIKE = 2.0
+"""Cells along a rim whose logit is at most so much below the best one's are a part of it ..."""
+_VOTES_WITHIN_PX = 40.0
+"""... if they point so near to where the best one points."""
 
 
 @dataclass(frozen=True)
@@ -24,25 +30,41 @@ class Peaks:
 
     Attributes:
         uv: coordinates in [0, 1]^2 of the network's input.
+        point_m: what is seen there, lifted by the nearest depth around: camera axes, metres; NaN without depth.
         label: index into LABELS.
         logit: score of the affordance map.
         intent: index into INTENTS, or UNKNOWN_INTENT if the network does not know.
     """
 
     uv: Float[Tensor, "K 2"]
+    point_m: Float[Tensor, "K 3"]
     label: Int[Tensor, " K"]
     logit: Float[Tensor, " K"]
     intent: Int[Tensor, " K"]
 
 
-def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float) -> Peaks:
+def find_peaks(
+    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+) -> Peaks:
     """Peaks of one frame (B = 1, T = 1), at most as many as the network has slots.
 
-    A peak is the best of its 3 x 3 cells, label and intent; of peaks closer than ``radius_cells`` the best stays. The
+    A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
+    places look alike, where its cells point to in the mean. Of peaks closer than ``radius_cells`` the best stays. The
     same label for another intent may come closer: the rims of a closed laptop are two things.
+
+    Args:
+        network: whose map is read.
+        frames: the frame.
+        observed: the frame as observed.
+        radius_cells: how far peaks are apart.
+        mirror: whether the map is the mean of the frame's and of its mirror image's, which finds more and costs the
+            encoding of another image.
     """
     side, cell = network.config.cells, network.config.cell_px
     found = network.afford(frames, observed)
+    if mirror:
+        other = _mirrored(network, frames)
+        found = found.mean(network.afford(other, network.observe(other)).mirrored())
     purposes = found.logits.shape[-1]
     scores = found.logits[0, 0].flatten(1).T.reshape(-1, side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
@@ -50,7 +72,11 @@ def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation,
     value, index = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
     channel, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
     label, purpose = channel.div(purposes, rounding_mode="floor"), channel % purposes
-    uv_px = cell_centres(network.config, device=place.device)[place] + cell * found.offset[0, 0][place, purpose]
+    pointed = cell_centres(network.config, device=place.device)[:, None] + cell * found.offset[0, 0]
+    uv_px = pointed[place, purpose]
+    rim = torch.nonzero(label == LABELS.index("rim"))[:, 0]
+    votes, likeness = pointed[:, purpose[rim]].transpose(0, 1), scores.flatten(1)[channel[rim]] - value[rim, None]
+    uv_px[rim] = _agreed(uv_px[rim], votes, likeness)
     other_purpose = (label[:, None] == label) & (purpose[:, None] != purpose)
     apart_px = torch.where(other_purpose, _PURPOSES_APART_PX, radius_cells * cell)
     clash = torch.cdist(uv_px, uv_px) < apart_px
@@ -58,27 +84,64 @@ def find_peaks(network: QuestNetwork, frames: FrameBatch, observed: Observation,
     for i in range(len(value)):
         if len(keep) < network.config.slots and not bool(clash[i, keep].any()):
             keep.append(i)
-    uv = (uv_px / network.config.encoder.image_size).clamp(0, 1)
+    size = network.config.encoder.image_size
+    uv_px = uv_px[keep].clamp(0, size)
+    point = frames.to_reference(uv_px[None, None], frames.near_depth_at(uv_px[None, None]))
     intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
-    return Peaks(uv[keep], label[keep], value[keep], intent[keep])
+    return Peaks(uv_px / size, frames.to_camera(point)[0, 0], label[keep], value[keep], intent[keep])
+
+
+def _agreed(
+    uv_px: Float[Tensor, "R 2"], votes: Float[Tensor, "R C 2"], likeness: Float[Tensor, "R C"]
+) -> Float[Tensor, "R 2"]:
+    """The mean of where cells like a peak's point to, near where its own does.
+
+    Args:
+        uv_px: where each peak's cell points to.
+        votes: where all cells point to.
+        likeness: their logits less the peak's.
+    """
+    near = (votes - uv_px[:, None]).norm(dim=-1) < _VOTES_WITHIN_PX
+    agree = (near & (likeness > -_ALIKE)).unsqueeze(-1)
+    return (votes * agree).sum(dim=1) / agree.sum(dim=1)
+
+
+def _mirrored(network: QuestNetwork, frames: FrameBatch) -> FrameBatch:
+    """The frames as a camera would see them whose world is mirrored left to right."""
+    rgb = frames.rgb.flip(-2)
+    fx, fy, cx, cy = frames.intrinsics.unbind(-1)
+    flip = frames.center.new_tensor([-1.0, 1.0, 1.0, 1.0])
+    return FrameBatch(
+        features=network.encode(rgb.flatten(0, 1)).float().unflatten(0, rgb.shape[:2]),
+        rgb=rgb,
+        depth_m=frames.depth_m.flip(-1),
+        cell_depth_m=frames.cell_depth_m.flip(-1),
+        intrinsics=torch.stack((fx, fy, network.config.encoder.image_size - cx, cy), dim=-1),
+        ref_from_cam=flip[:, None] * frames.ref_from_cam * flip,  # no matrix product: it would be in bfloat16
+        center=frames.center * flip[:3],
+        scale=frames.scale,
+    )
 
 
 def match_peaks(
-    uv_px: Float[Tensor, "K 2"],
+    point_m: Float[Tensor, "K 3"],
     label: Int[Tensor, " K"],
-    true_px: Float[Tensor, "E 2"],
+    true_point_m: Float[Tensor, "E 3"],
     true_label: Int[Tensor, " E"],
+    *,
+    half_diagonal_m: float,
 ) -> Int[Tensor, " K"]:
-    """Which entity each candidate is right about: the nearest free one of its label within :data:`FOUND_PX`, else -1.
+    """Which entity each candidate is right about: the nearest free one of its label within 0.1, else -1.
 
     Args:
-        uv_px: candidates, best first, pixels of the network's input.
+        point_m: candidates, best first, metres; NaN is right about nothing.
         label: their labels.
-        true_px: entities that are seen.
+        true_point_m: entities that are seen, in the same axes.
         true_label: their labels.
+        half_diagonal_m: metres per normalised unit.
     """
-    gap = torch.cdist(uv_px.float(), true_px.float())
-    gap = torch.where((label[:, None] == true_label) & (gap < FOUND_PX), gap, torch.inf)
+    gap = torch.cdist(point_m.float(), true_point_m.float()) / half_diagonal_m
+    gap = torch.where((label[:, None] == true_label) & (gap < FOUND_WITHIN), gap, torch.inf)
     found = torch.full_like(label, -1)
     for k in range(len(label) if len(true_label) else 0):
         e = int(gap[k].argmin())

@@ -153,6 +153,23 @@ class Articulation:
         poses = self.poses(position)
         return np.concatenate([apply(pose, points) for pose, points in zip(poses, self.body_points, strict=True)])
 
+    def travel_m(self, joint: int, point: Float[np.ndarray, "3"]) -> float:
+        """How far a point of a joint's body gets from its place at rest when only that joint moves.
+
+        Args:
+            joint: index of the joint; -1 for the base, which never moves.
+            point: where it is in the body, metres.
+        """
+        if joint < 0:
+            return 0.0
+        start = apply(self.poses(self.rest)[1 + joint], point)
+        travel = 0.0
+        for share in (0.25, 0.5, 0.75, 1.0):
+            moved = self.rest
+            moved[joint] += share * self.joints[joint].opening()
+            travel = max(travel, float(np.linalg.norm(apply(self.poses(moved)[1 + joint], point) - start)))
+        return travel
+
     def velocity(self, joint: int, point: Float[np.ndarray, "*N 3"]) -> Float[np.ndarray, "*N 3"]:
         """World velocity, per unit of opening, of world points on a joint's body when everything is at rest."""
         line = self.axes(self.poses(self.rest))[joint]

@@ -245,16 +245,7 @@ def _entity(
     parts: tuple[int, ...],
 ) -> SimEntity:
     name = f"{articulation.body_names[1 + joint]}/{label}"
-    if joint < 0:
-        return SimEntity(name, label, joint, point, parts, 0.0, inside)
-    rest = articulation.rest
-    start = apply(articulation.poses(rest)[1 + joint], point)
-    travel = 0.0
-    for share in (0.25, 0.5, 0.75, 1.0):
-        moved = rest.copy()
-        moved[joint] += share * articulation.joints[joint].opening()
-        travel = max(travel, float(np.linalg.norm(apply(articulation.poses(moved)[1 + joint], point) - start)))
-    return SimEntity(name, label, joint, point, parts, travel, inside)
+    return SimEntity(name, label, joint, point, parts, articulation.travel_m(joint, point), inside)
 
 
 def _with_unique_names(entities: list[SimEntity]) -> tuple[SimEntity, ...]:

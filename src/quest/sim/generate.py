@@ -21,6 +21,7 @@ from quest.sim.renderer import Picture, Renderer
 from quest.sim.sensor import SensorModel, sense
 from quest.sim.settings import TakeSettings
 from quest.sim.staging import Staging, see_entities, stage_plain
+from quest.sim.stretch import draw_stretch, stretched
 from quest.sim.suites import Suite
 from quest.types import Clip, Entity, Take, TakeInfo, View
 
@@ -64,6 +65,7 @@ def generate_take(
     own = suite.tag.encode() if suite is not None and hiding is not None else b""
     key = [zlib.crc32(sim_object.object_id.encode()), level, seed, *own]
     motion_rng, camera_rng, appearance_rng, props_rng, sensor_rng = (np.random.default_rng([*key, n]) for n in range(5))
+    sim_object, shape = _shaped(sim_object, np.random.default_rng([*key, 5]), settings)
     if hiding is None:
         staging = stage_plain(
             sim_object, level, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
@@ -78,7 +80,7 @@ def generate_take(
     views = _record(sim_object, staging, appearance_rng, settings)
     flow = np.zeros_like(played.points)
     flow[:-1] = np.diff(played.points, axis=0)
-    about = {**(provenance or {}), **_conditions(settings, suite), **staging.about}
+    about = {**(provenance or {}), **_conditions(settings, suite), **shape, **staging.about}
     info = TakeInfo(
         name=name,
         source=sim_object.source,
@@ -108,6 +110,16 @@ def generate_take(
         joint_velocity=played.velocity.astype(np.float32),
         joint_axis=np.stack([sim_object.articulation.axes(p) for p in played.poses]).astype(np.float32),
     )
+
+
+def _shaped(
+    sim_object: SimObject, rng: np.random.Generator, settings: TakeSettings
+) -> tuple[SimObject, dict[str, Any]]:
+    """The object in the shape that it has in this take, and what is unusual about that."""
+    if settings.stretch == 1:
+        return sim_object, {}
+    factors = draw_stretch(rng, settings.stretch)
+    return stretched(sim_object, factors), {"stretch": factors.tolist()}
 
 
 def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:

@@ -30,6 +30,8 @@ class TakeSettings:
         gripper: whether a gripper pulls what moves.
         sensor: what the sensor makes of colours and depth; the ground truth knows nothing of it.
         disturbance: what happens to light, materials or cameras.
+        stretch: up to which factor every take has the object stretched along its depth, width and height; 1 leaves it
+            as it is.
     """
 
     views: int = 3
@@ -45,6 +47,7 @@ class TakeSettings:
     gripper: bool = False
     sensor: SensorModel = SensorModel()
     disturbance: Disturbance = "none"
+    stretch: float = 1.0
 
     def __post_init__(self) -> None:
         if self.views < 1 or self.size < 16:
@@ -59,6 +62,8 @@ class TakeSettings:
             raise ConfigError(
                 "take: a gripper pulls one joint after the other, each once; leave overlap, cycles and frames away"
             )
+        if not 1 <= self.stretch <= 4:
+            raise ConfigError(f"take: expected to stretch by a factor from 1 to 4, got {self.stretch}")
         if self.disturbance not in DISTURBANCES:
             raise ConfigError(
                 f"take: unknown disturbance {self.disturbance!r}; expected one of {', '.join(DISTURBANCES)}"

@@ -83,6 +83,11 @@ class CachedView:
         return self._map("enlarged")
 
     @property
+    def owner(self) -> Int8[np.ndarray, "T C"]:
+        """Which entity each cell is a part of (see :func:`owner_of`), if enlarged tokens were asked for."""
+        return self._map("owner")
+
+    @property
     def rgb(self) -> UInt8[np.ndarray, "T S S 3"]:
         """Letterboxed colours."""
         return self._map("rgb")
@@ -140,8 +145,8 @@ class FeatureCache:
             names: takes to prepare.
             device: where the encoder runs.
             mirrored: prepare their mirror images instead (see :func:`quest.data.mirror.mirror_take`).
-            enlarged: prepare tokens of the images at twice their size too, from which the affordance map is read;
-                four times the space and five times the work.
+            enlarged: prepare what the affordance map is learned from too: tokens of the images at twice their size,
+                four times the space and five times the work, and which entity each cell is a part of.
         """
         self.root.mkdir(parents=True, exist_ok=True)
         self.encoder.to(device)
@@ -151,8 +156,13 @@ class FeatureCache:
             if not self._complete(entries, stamp):
                 for entry in entries:
                     shutil.rmtree(entry)  # also of views that the take no longer has
-                take = mirror_take(store.read(name)) if mirrored else store.read(name)
+                take = _read(store, name, mirrored)
                 entries = [self._write(take, view, stamp, device) for view in range(len(take.views))]
+            if enlarged and not all((entry / "owner.npy").exists() for entry in entries):
+                take = _read(store, name, mirrored)
+                for entry in entries:
+                    view = int(entry.name.rpartition("-v")[2])
+                    _save(entry, "owner", owner_of(take, view, self.config))
             for entry in entries:
                 if enlarged and not (entry / "enlarged.npy").exists():
                     self._enlarge(entry, device)
@@ -223,9 +233,7 @@ class FeatureCache:
 
     def _enlarge(self, entry: Path, device: torch.device) -> None:
         rgb = np.load(entry / "rgb.npy", mmap_mode="r", allow_pickle=False)
-        partial = entry / ".enlarged.npy"
-        np.save(partial, encode_images(self.encoder, rgb, device=device, batch=4, enlarge=2), allow_pickle=False)
-        partial.rename(entry / "enlarged.npy")
+        _save(entry, "enlarged", encode_images(self.encoder, rgb, device=device, batch=4, enlarge=2))
 
     def _open(self, entry: Path) -> CachedView:
         meta = json.loads((entry / "meta.json").read_text())
@@ -237,6 +245,44 @@ class FeatureCache:
             half_diagonal_m=meta["half_diagonal_m"],
             **arrays,
         )
+
+
+def owner_of(take: Take, view: int, config: NetworkConfig) -> Int8[np.ndarray, "T C"]:
+    """The entity that each cell is a part of: its rank among the tracked ones, else -1.
+
+    A handle or knob owns the cells that show it in at least a sixteenth of their pixels. Rims and fronts have no
+    outline of their own; what tells where their middle is, is how far their link reaches: they own the cells whose
+    middle shows it.
+    """
+    truth, cell = take.views[view], config.cell_px
+    box = Letterbox(truth.clip.camera, config.encoder.image_size)
+    of_entity = np.full(len(take.info.entities) + 1, -1, np.int8)
+    of_link = np.full(take.link_pose.shape[1] + 1, -1, np.int8)
+    for rank, e in enumerate(take.tracked):
+        entity = take.info.entities[e]
+        if entity.label in ("rim", "front"):
+            of_link[1 + entity.link] = rank
+        else:
+            of_entity[1 + e] = rank
+    owners = []
+    for entity_id, link_id in zip(truth.entity_id, truth.link_id, strict=True):
+        owner = of_link[box.index(link_id)[cell // 2 :: cell, cell // 2 :: cell]]
+        shown = of_entity[box.index(entity_id)].reshape(config.cells, cell, config.cells, cell).swapaxes(1, 2)
+        pixels = (shown.reshape(*owner.shape, -1, 1) == np.arange(len(take.tracked))).sum(axis=2)
+        most = pixels.argmax(axis=-1) if len(take.tracked) else owner
+        owners.append(np.where(pixels.max(axis=-1, initial=0) * 16 >= cell * cell, most, owner).ravel())
+    return np.stack(owners).astype(np.int8)
+
+
+def _read(store: TakeStore, name: str, mirrored: bool) -> Take:
+    return mirror_take(store.read(name)) if mirrored else store.read(name)
+
+
+def _save(entry: Path, name: str, array: np.ndarray) -> None:
+    """Write an array of an entry whole or not at all."""
+    partial = entry / f".{name}.npy"
+    np.save(partial, array, allow_pickle=False)
+    partial.rename(entry / f"{name}.npy")
 
 
 def encode_images(

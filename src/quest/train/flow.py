@@ -19,12 +19,11 @@ from torch import Tensor, nn
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train.losses import masked_mean
-from quest.train.objective import Rollout, has_moved, roll_out
+from quest.train.objective import Rollout, roll_out
 from quest.train.windows import WindowSampler, WindowTruth
 
 _MOVING = 0.005
 """A displacement above this is motion rather than rest, normalised units per step."""
-_MOVING_WEIGHT = 3.0
 
 
 @dataclass(frozen=True)
@@ -78,13 +77,10 @@ class StageTwo:
         return list(self.network.flow.parameters())
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
-        """L1 of the displacement; what moves counts three times, because most entities rest in most windows."""
+        """L1 of the displacement; what rests counts like what moves, or it would be said to move a little."""
         roll, flow = self._answer(frames, truth)
-        mask = _judged(roll, truth)
-        moving = _length(truth) > _MOVING
-        weight = mask * torch.where(moving | has_moved(truth)[:, -1], _MOVING_WEIGHT, 1.0)
         error = (flow - truth.flow.nan_to_num()).abs().sum(-1) / truth.unit[:, None]
-        loss = masked_mean(error, weight)
+        loss = masked_mean(error, _judged(roll, truth))
         return loss, loss.detach()[None]
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> FlowScores:

@@ -19,6 +19,15 @@ from quest.model.observation import grid_centres
 from quest.train.pooling import pooled
 from quest.types import LABELS
 
+FAR_WEIGHT = 0.2
+"""Of offsets across a whole handle or link, beside those of the cells around an entity."""
+
+_NO_ERROR = 0.999
+"""Target of a cell that may have any score."""
+
+_OUTLINED = torch.tensor([LABELS.index("handle"), LABELS.index("knob")])
+"""Labels of things with an outline of their own."""
+
 
 def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
     """Mean of the values where the mask is, weighted by it; 0 where it is nowhere. NaN outside it does no harm.
@@ -198,10 +207,14 @@ def affordance_loss(
     label: Int[Tensor, "B K"],
     intent: Int[Tensor, "B K"],
     visible: Bool[Tensor, "B T K"],
+    owner: Int[Tensor, "B T C"] | None = None,
 ) -> Float[Tensor, ""]:
     """Focal loss of the dense map; in the 3 x 3 cells around every entity, L1 of the offsets to it.
 
-    Where cells are near several entities of one purpose, they point to the nearest.
+    Where cells are near several entities of one purpose, they point to the nearest. All other cells that are a part of
+    an entity point to it too: the middle of a long thing is known by where its ends are. To score them like the middle
+    of a handle is no error, as they point to the same place, nor is it where a handle hides its own middle; rims and
+    fronts are asked for their middle.
 
     Reference: Law and Deng, CornerNet, ECCV 2018, equations 1 and 2.
 
@@ -211,27 +224,43 @@ def affordance_loss(
         label: index into LABELS.
         intent: index into INTENTS.
         visible: which entities are seen.
+        owner: the entity that each cell is a part of, -1 for none; None where that is not known.
     """
     cells, purposes = math.isqrt(found.logits.shape[2]), found.logits.shape[-1]
     place = torch.where(visible.unsqueeze(-1), uv, torch.full_like(uv, 0.5)).clamp(0, 1 - 1e-6) * cells
     gap = place.unsqueeze(-2) - grid_centres(cells, 1, device=uv.device)
-    blob = torch.exp(-0.5 * gap.square().sum(-1) / 0.8**2) * visible.unsqueeze(-1)
+    owner = torch.full(found.logits.shape[:3], -1, device=uv.device) if owner is None else owner
+    blob = torch.exp(-0.5 * gap.square().sum(-1) / 0.8**2)
     cell = place[..., 1].long() * cells + place[..., 0].long()
-    blob = blob.scatter(-1, cell.unsqueeze(-1), visible.to(blob.dtype).unsqueeze(-1))
+    blob = blob.scatter(-1, cell.unsqueeze(-1), 1.0) * visible.unsqueeze(-1)
+    outlined = torch.isin(label, _OUTLINED.to(label.device))[:, None, :, None]
+    part = (owner[:, :, None] == torch.arange(uv.shape[2], device=uv.device)[:, None]) & outlined
+    blob = torch.maximum(blob, _NO_ERROR * part)
     purpose = intent.clamp(max=purposes - 1)
     one_hot = F.one_hot(label * purposes + purpose, len(LABELS) * purposes).to(blob.dtype)[:, None, :, None]
     target = (blob.unsqueeze(-1) * one_hot).amax(dim=2)
-    logits = found.logits.flatten(-2)
+    meant = [visible & (purpose == n)[:, None] for n in range(purposes)]
+    pointing = [_pointing_loss(found.offset[..., n, :], gap, meant[n], owner) for n in range(purposes)]
+    return _focal_loss(found.logits.flatten(-2), target) + 0.5 * torch.stack(pointing).mean()
+
+
+def _focal_loss(logits: Float[Tensor, "B T C N"], target: Float[Tensor, "B T C N"]) -> Float[Tensor, ""]:
     log_p, log_not, p = F.logsigmoid(logits), F.logsigmoid(-logits), logits.sigmoid()
     positive = target >= 1
     loss = torch.where(positive, -((1 - p) ** 2) * log_p, -((1 - target) ** 4) * p**2 * log_not)
-    focal = loss.sum() / pooled(positive.sum().to(loss.dtype)).clamp(min=1)
-    pointing = found.logits.new_zeros(())
-    for n in range(purposes):
-        meant = visible & (purpose == n)[:, None]
-        far = torch.where(meant.unsqueeze(-1), gap.abs().amax(-1), torch.inf)
-        least, nearest = far.min(dim=2)
-        wanted = gap.gather(2, nearest[:, :, None, :, None].expand(-1, -1, -1, -1, 2)).squeeze(2)
-        residual = (found.offset[..., n, :] - wanted).abs().sum(-1)
-        pointing = pointing + masked_mean(residual, least < 1.5) / purposes
-    return focal + 0.5 * pointing
+    return loss.sum() / pooled(positive.sum().to(loss.dtype)).clamp(min=1)
+
+
+def _pointing_loss(
+    offset: Float[Tensor, "B T C 2"],
+    gap: Float[Tensor, "B T K C 2"],
+    meant: Bool[Tensor, "B T K"],
+    owner: Int[Tensor, "B T C"],
+) -> Float[Tensor, ""]:
+    """L1 of offsets, in cells, to the nearest of the entities that are meant, else to the one a cell is a part of."""
+    least, nearest = torch.where(meant.unsqueeze(-1), gap.abs().amax(-1), torch.inf).min(dim=2)
+    near, own = least < 1.5, owner.clamp(min=0)
+    part = (owner >= 0) & meant.gather(2, own) & ~near
+    index = torch.where(near, nearest, own)[:, :, None, :, None]
+    residual = (offset - gap.gather(2, index.expand(-1, -1, -1, -1, 2)).squeeze(2)).abs().sum(-1)
+    return masked_mean(residual, near) + FAR_WEIGHT * masked_mean(residual, part)

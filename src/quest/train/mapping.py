@@ -15,10 +15,11 @@ from torch import Tensor, nn
 
 from quest.errors import ConfigError
 from quest.model.config import PRESETS
-from quest.model.discovery import find_peaks, match_peaks
+from quest.model.discovery import find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train import losses
+from quest.train.validation import match_at_anchor
 from quest.train.windows import WindowSampler, WindowTruth
 from quest.types import INTENTS, LABELS
 
@@ -27,7 +28,7 @@ _RADIUS_CELLS = 1.5
 
 @dataclass(frozen=True)
 class MapScores:
-    """Discovery in fixed frames: a peak is right if an entity of its label, not yet taken, is within 16 px.
+    """Discovery in fixed frames: a peak is right if an entity of its label, not yet taken, is within 0.1 in 3D.
 
     Attributes:
         precision: average precision over all peaks, the best first.
@@ -76,7 +77,7 @@ class StageMap:
         """Focal loss of the map, and its offsets."""
         found = self.network.afford(frames, self.network.observe(frames))
         visible = truth.visible & truth.exists[:, None]
-        loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible)
+        loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible, truth.owner)
         return loss, loss.detach()[None]
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> MapScores:
@@ -90,7 +91,7 @@ class StageMap:
                 frames, truth = sampler.draw(rng, disturb=False)
                 frames, truth = frames.to(device), truth.to(device)
                 for b in range(len(truth.unit)):
-                    peaks += self._judge(frames.of(slice(b, b + 1)), truth, b)
+                    peaks += self._judge(frames, truth, b)
                     present += int((truth.visible[b, 0] & truth.exists[b]).sum())
         self.network.train()
         peaks.sort(key=lambda peak: -peak[0])
@@ -106,11 +107,9 @@ class StageMap:
 
     def _judge(self, frames: FrameBatch, truth: WindowTruth, b: int) -> list[tuple[float, bool, bool]]:
         """Score of every peak, whether it is right, and whether its intent is."""
-        network = self.network
-        peaks = find_peaks(network, frames, network.observe(frames), radius_cells=_RADIUS_CELLS)
-        seen = torch.nonzero(truth.visible[b, 0] & truth.exists[b])[:, 0]
-        size = network.config.encoder.image_size
-        found = match_peaks(size * peaks.uv, peaks.label, size * truth.uv[b, 0, seen], truth.label[b, seen])
+        network, one = self.network, frames.of(slice(b, b + 1))
+        peaks = find_peaks(network, one, network.observe(one), radius_cells=_RADIUS_CELLS, mirror=False)
+        found, seen = match_at_anchor(peaks, frames, truth, b)
         out = []
         for score, intent, e in zip(peaks.logit.tolist(), peaks.intent.tolist(), found.tolist(), strict=True):
             out.append((score, e >= 0, e >= 0 and intent == int(truth.intent[b, seen[e]])))

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from torch import Tensor
 
-from quest.model.discovery import find_peaks, match_peaks
+from quest.model.discovery import Peaks, find_peaks, match_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.train.objective import Rollout, is_right, roll_out
@@ -26,7 +27,7 @@ class WindowScores:
         median_px: median distance of visible answers, pixels of the input.
         mean_distance: mean 3D distance of all answers, normalised units, at most 1 each.
         right: share of answers with the right identity.
-        discovery_f1: F1 of discovered slots against visible entities, same label and within 16 px; None for networks
+        discovery_f1: F1 of discovered slots against visible entities, same label and within 0.1; None for networks
             whose map has a stage of its own.
         answers: how many answers were judged.
     """
@@ -90,11 +91,34 @@ def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation,
     counts = np.zeros(3)
     for b in range(len(truth.unit)):
         one = slice(b, b + 1)
-        peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=1.5)
+        peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=1.5, mirror=False)
         keep = peaks.logit > _PEAK_LOGIT
-        present = truth.visible[b, 0] & truth.exists[b]
-        size = network.config.encoder.image_size
-        uv, true = size * peaks.uv[keep], size * truth.uv[b, 0, present]
-        found = match_peaks(uv, peaks.label[keep], true, truth.label[b, present])
-        counts += (int((found >= 0).sum()), int(keep.sum()), int(present.sum()))
+        found, present = match_at_anchor(peaks, frames, truth, b)
+        counts += (int((found[keep] >= 0).sum()), int(keep.sum()), len(present))
     return counts
+
+
+def match_at_anchor(
+    peaks: Peaks, frames: FrameBatch, truth: WindowTruth, b: int
+) -> tuple[Int[Tensor, " K"], Int[Tensor, " E"]]:
+    """What the peaks of an anchor frame are right about, and which entities are seen in it.
+
+    Args:
+        peaks: of window ``b``'s anchor frame, best first.
+        frames: the batch.
+        truth: of the batch.
+        b: which window.
+
+    Returns:
+        Index into the seen entities, or -1, of every peak; index into the truth's entities of every one seen.
+    """
+    seen = torch.nonzero(truth.visible[b, 0] & truth.exists[b])[:, 0]
+    one = frames.of(slice(b, b + 1)).during(slice(0, 1))
+    found = match_peaks(
+        peaks.point_m,
+        peaks.label,
+        one.to_camera(truth.point[b : b + 1, :1, seen])[0, 0],
+        truth.label[b, seen],
+        half_diagonal_m=float(truth.unit[b] * frames.scale[b]),
+    )
+    return found, seen

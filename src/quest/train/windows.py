@@ -41,6 +41,8 @@ class WindowTruth:
         axis: origin and direction of its joint's axis in the reference frame.
         flow: true displacement from the newest frame to the one after it, reference units. After it means at the
             window's own step between frames, back in time for a window that runs backwards; NaN where the view ends.
+        owner: the entity that each cell is a part of, -1 for none; None but for anchor frames alone, of which the
+            affordance map is learned.
     """
 
     uv: Float[Tensor, "B S K 2"]
@@ -57,10 +59,12 @@ class WindowTruth:
     revolute: Bool[Tensor, "B K"]
     axis: Float[Tensor, "B K 6"]
     flow: Float[Tensor, "B K 3"]
+    owner: Int[Tensor, "B S C"] | None = None
 
     def to(self, device: torch.device) -> WindowTruth:
         """The same on a device."""
-        return WindowTruth(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        known = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) is not None}
+        return WindowTruth(**{name: value.to(device) for name, value in known.items()})
 
 
 class WindowSampler:
@@ -201,7 +205,12 @@ class WindowSampler:
             revolute=padded("revolute", per_frame=False),
             axis=torch.cat((origin, direction), dim=-1),
             flow=_flow(plan, ref_from_world) / scale,
+            owner=_owner(plan) if self.anchors_only else None,
         )
+
+
+def _owner(plan: WindowPlan) -> Int[Tensor, "B S C"]:
+    return torch.from_numpy(np.stack([view.owner[frames] for view, frames in plan.picks])).long()
 
 
 def _flow(plan: WindowPlan, ref_from_world: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B K 3"]:

@@ -1,0 +1,70 @@
+"""Parts of a network that were trained apart, put together."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from quest.errors import WeightsError
+from quest.model.network import QuestNetwork
+from quest.model.weights import LoadedNetwork
+
+_MAP, _FLOW = "affordance", "flow."
+
+
+def merge(
+    base: LoadedNetwork, *, maps: Sequence[LoadedNetwork] = (), flow: LoadedNetwork | None = None
+) -> LoadedNetwork:
+    """Weights with the affordance map and the flow head of others.
+
+    Neither takes part in following what a query is bound to, so settings and the monitor's calibration stay good, but
+    for the threshold of discovery (``quest weights tune --discovery-only``). The mean of the maps of one training's
+    checkpoints, or of trainings that began with the same map, is often better than each.
+
+    Reference: Wortsman et al., Model soups, ICML 2022, section 2, for the mean.
+
+    Args:
+        base: what follows entities; everything else is taken from it too.
+        maps: whose map to take, the mean if they are several; none to keep the base's.
+        flow: whose flow head to take; None to keep the base's.
+
+    Raises:
+        WeightsError: a network differs in what its map or flow head rests on.
+    """
+    config = base.network.config
+    state = dict(base.network.state_dict())
+    if maps:
+        if config.map_layers == 0:
+            raise WeightsError(f"{base.name}: its map has no trunk of its own, so it cannot be exchanged")
+        for other in maps:
+            _check(base, other, apart=lambda name: not name.startswith("encoder."), what="map")
+        states = [other.network.state_dict() for other in maps]
+        state |= {name: _mean([s[name] for s in states]) for name in state if name.startswith(_MAP)}
+    if flow is not None:
+        if flow.network.flow is None:
+            raise WeightsError(f"{flow.name}: expected weights with a flow head (quest train --stage 2), it has none")
+        _check(base, flow, apart=lambda name: name.startswith((_MAP, _FLOW)), what="flow head")
+        config = replace(config, flow=True)
+        state |= {name: tensor for name, tensor in flow.network.state_dict().items() if name.startswith(_FLOW)}
+    network = QuestNetwork(config)
+    network.load_state_dict(state)
+    parts = [f"map of {', '.join(m.name for m in maps)}"] if maps else []
+    parts += [f"flow head of {flow.name}"] if flow is not None else []
+    return replace(base, network=network.eval(), about="; ".join([base.about, *parts]))
+
+
+def _mean(tensors: list[Tensor]) -> Tensor:
+    return torch.stack([tensor.double() for tensor in tensors]).mean(dim=0).to(tensors[0].dtype)
+
+
+def _check(base: LoadedNetwork, other: LoadedNetwork, *, apart: Callable[[str], bool], what: str) -> None:
+    """Refuse a network of another shape, or with other weights outside what may differ."""
+    if replace(other.network.config, flow=False) != replace(base.network.config, flow=False):
+        raise WeightsError(f"{other.name}: its network has another shape than that of {base.name}; use weights of one")
+    own, theirs = base.network.state_dict(), other.network.state_dict()
+    for name, tensor in own.items():
+        if not apart(name) and not torch.equal(tensor, theirs[name]):
+            raise WeightsError(f"{other.name}: its {what} was trained behind another {name} than that of {base.name}")
