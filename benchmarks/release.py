@@ -71,6 +71,7 @@ _WIDE = "--level 1 --frames-per-joint 24 --every 8"
 MAP_PARTNET = (
     TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 5 --takes-per-object 4 --seed 100"),
     TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 3 --takes-per-object 6 --seed 200"),
+    TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 3 --takes-per-object 8 --seed 400 --stretch 1.6"),
 )
 MAP_PROCEDURAL = (
     TrainingTakes("wide_broad", f"--mix broad {_WIDE} --views 4", 310, 21_000),

@@ -55,6 +55,13 @@ def _intents(file: str, title: str) -> Table:
     return Table(f"intents/{file}.json", title, "rows", OBJECTS | counts | shares | right)
 
 
+def _tracking(file: str, title: str) -> Table:
+    """What `quest eval` says of moved entities."""
+    about = {"suite": "suite", "level": "level", "tracker": "tracker", "objects/takes/tracks": "objects/takes/tracks"}
+    metrics = {"APE": "metrics.ape", "D@100": "metrics.d100", "Acc %": "%metrics.acc", "slope": "metrics.slope"}
+    return Table(file, title, "rows", OBJECTS | about | metrics, only={"reading": "moved"})
+
+
 OBJECTS = {"objects": "source", "part": "part"}
 ON_OFF = {
     "objects/tracks": "objects/tracks",
@@ -175,6 +182,8 @@ TABLES = (
             "p90": "axis_p90_deg",
         },
     ),
+    _tracking("robust/test.json", "Noise on the colours, and a camera position never trained on"),
+    _tracking("levels/test.json", "Levels 1 to 4 on the same objects"),
     _intents("intents", "Open and lift: two places of one label on one thing, both asked for"),
     _intents("ajar", "The same, begun where both are seen 16 pixels apart"),
     Table(

@@ -134,6 +134,16 @@ def test_a_folder_of_this_machine_comes_first(hub: FakeHub, file: Path, monkeypa
     assert not hub.requests
 
 
+def test_a_misspelt_path_in_a_folder_of_this_machine_is_not_looked_for_on_the_hub(
+    hub: FakeHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").mkdir()
+    with pytest.raises(WeightsError, match=r"no such weights in the folder runs.*runs/mien@main"):
+        load_network("runs/mien")
+    assert not hub.requests
+
+
 def test_what_the_hub_refuses(hub: FakeHub, file: Path):
     hub.gated.add("owner/gated")
     hub.files["owner/pickles"] = {"main": {"pytorch_model.bin": b"not looked at", "config.json": b"{}"}}

@@ -201,7 +201,8 @@ def load_network(name: str | Path) -> LoadedNetwork:
     Args:
         name: a shipped name; a file; a folder that ``save_pretrained`` or ``quest train`` wrote; or ``owner/name`` of
             a model repository, optionally ``owner/name@revision``. What is there as a file or folder is not looked
-            for on the hub. What was downloaded once works without a network.
+            for on the hub, nor is ``runs/mine`` where there is a folder ``runs`` here, unless it names a revision.
+            What was downloaded once works without a network.
 
     Raises:
         WeightsError: no such name, file or repository, or the file is torn, foreign, or of another shape.
@@ -213,6 +214,11 @@ def load_network(name: str | Path) -> LoadedNetwork:
         return read_network(path, name=str(name))
     known = ", ".join(shipped_weights()) or "none"
     hub_id = None if isinstance(name, Path) or path.exists() else HubId.parse(name)
+    if hub_id is not None and hub_id.revision is None and path.parent.is_dir():
+        raise WeightsError(
+            f"{name}: no such weights in the folder {path.parent}, which is here; check the spelling. If the Hugging "
+            f"Face hub is meant, name a revision: {name}@main"
+        )
     if hub_id is None:
         raise WeightsError(
             f"{name}: no such weights; expected a safetensors file, a folder with {' or '.join(FOLDER_FILES)}, a "
