@@ -5,12 +5,16 @@ from __future__ import annotations
 import importlib.util
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from quest.cli.main import parse
+from quest.errors import QuestError
+from tests.track.clips import make_clip, make_tracker
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
@@ -51,3 +55,18 @@ def test_the_tool_chest_has_three_handles():
     text = (EXAMPLES / "toolbox" / "toolbox.urdf").read_text(encoding="utf-8")
     assert text.count('type="prismatic"') == 2
     assert text.count('type="revolute"') == 1
+
+
+def test_both_rims_of_a_laptop_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    module, commands = example("open_and_lift"), []
+    tracks = module.follow(make_tracker(), make_clip())
+    assert tracks.names == ("opens", "lifts")
+    point_world = np.full((4, 2, 3), np.nan, np.float32)
+    point_world[1:, 0] = [[0, 0, 1], [0, 2, 1], [0.3, 0.4, 1]]
+    first, second = module.travelled_m(replace(tracks, point_world=point_world))
+    assert first == pytest.approx(0.5)
+    assert np.isnan(second)
+    monkeypatch.setattr(subprocess, "run", lambda command, check: commands.append(command[3:]))
+    with pytest.raises(QuestError):
+        module.OpenAndLift(out=tmp_path / "none").render()
+    parse(commands[0])

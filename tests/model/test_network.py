@@ -290,8 +290,11 @@ def test_one_place_to_open_and_to_lift_by_gives_two_slots(monkeypatch: pytest.Mo
     assert (peaks.logit[2:] == -9).all(), "the same place under another label is no third"
     offset[..., 1] = 0.0
     peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5, mirror=False)
-    assert peaks.intent[0] == 0
-    assert (peaks.logit[1:] == -9).all(), "in one pixel only the better is kept"
+    assert peaks.intent[:2].tolist() == [0, 1], "the rims of a closed laptop may fall into one pixel"
+    logits[..., 27, 0, :], logits[..., 27, 2, :] = logits[..., 27, 2, :].clone(), -9.0
+    peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5, mirror=False)
+    assert (peaks.label[0], peaks.intent[0]) == (0, 0)
+    assert (peaks.logit[1:] == -9).all(), "of a handle in one pixel only the better is kept"
 
 
 def test_a_network_without_intents_and_trunk_reads_its_map_off_its_cells():

@@ -50,7 +50,7 @@ def find_peaks(
 
     A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
     places look alike, where its cells point to in the mean. Of peaks closer than ``radius_cells`` the best stays. The
-    same label for another intent may come closer: the rims of a closed laptop are two things.
+    same label for another intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
 
     Args:
         network: whose map is read.
@@ -79,6 +79,7 @@ def find_peaks(
     uv_px[rim] = _agreed(uv_px[rim], votes, likeness)
     other_purpose = (label[:, None] == label) & (purpose[:, None] != purpose)
     apart_px = torch.where(other_purpose, _PURPOSES_APART_PX, radius_cells * cell)
+    apart_px[rim] = torch.where(other_purpose[rim], 0.0, apart_px[rim])
     clash = torch.cdist(uv_px, uv_px) < apart_px
     keep: list[int] = []
     for i in range(len(value)):

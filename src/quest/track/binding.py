@@ -165,7 +165,8 @@ class Binding:
 
     def _begin(self, waiting: Waiting, name: str, label: str | None, slot: int | None = None) -> Following:
         self.waiting = [w for w in self.waiting if w is not waiting]
-        return Following(waiting.number, name, label, slot, Ground(self._config))
+        fixed = waiting.query.intent == "lift"
+        return Following(waiting.number, name, label, slot, Ground(self._config, fixed=fixed))
 
     def _canvas(self, due: Sequence[Waiting]) -> Float[Tensor, "K 2"]:
         uv_px = np.array([w.query.uv_px for w in due], np.float32)

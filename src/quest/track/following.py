@@ -88,7 +88,8 @@ class Following:
 
     def forget_places(self, config: TrackerConfig) -> None:
         """Begin anew in another reference frame."""
-        self.ground, self.belief, self.place, self.held = Ground(config), None, None, False
+        self.ground = Ground(config, fixed=self.ground.fixed)
+        self.belief, self.place, self.held = None, None, False
         self.safe.clear()
         self.since_safe = self.refused = 0
         self.buried = False

@@ -27,6 +27,9 @@ _LOG_MISSED = -2.0
 _RECENT = 6
 _SLOWING = 0.92
 _MOST_CLOSED = 6.0
+_STANDING = 8
+"""Sights that tell where something fixed stands; nothing moves in the first frames of a stream."""
+_OFF_FIXED = -3.0
 
 
 @runtime_checkable
@@ -138,9 +141,12 @@ class Ground:
 
     Args:
         config: settings of tracking.
+        fixed: whether it was asked for as something that no joint moves (intent ``lift``). It then stands where it was
+            first seen, and only what the image shows plainly takes it away from there.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
+    def __init__(self, config: TrackerConfig, *, fixed: bool = False) -> None:
+        self.fixed = fixed
         self._config = config
         self._expectation = _Expectation()
         self._estimator = JointEstimator(config.point_sigma)
@@ -156,16 +162,17 @@ class Ground:
 
     def see(self, point: Float[np.ndarray, "3"], row: BeliefRow) -> None:
         """Learn from a frame in which the query is seen and trusted."""
-        self._expectation.add(row, point)
-        self._estimator.prior = prior = self._expectation.prior()
-        self._estimator.add(point)
-        self._curves = self._make_curves(prior)
+        if not (self.fixed and self._expectation.rows >= _STANDING):
+            self._expectation.add(row, point)
+            self._estimator.prior = prior = self._expectation.prior()
+            self._estimator.add(point)
+            self._curves = self._make_curves(prior)
         self._recent.append(point)
         self._along, self._hidden = None, 0
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
-        floor = self._config.off_joint
+        floor = _OFF_FIXED if self.fixed else self._config.off_joint
         if not self._curves:
             return np.zeros(len(point))
         total = np.full(len(point), floor)
@@ -280,12 +287,13 @@ class Ground:
         found = {f"expectation.{key}": value for key, value in self._expectation.state().items()}
         found |= {f"estimator.{key}": value for key, value in self._estimator.state().items()}
         found |= {"recent": np.array(self._recent).reshape(-1, 3), "hidden": np.array(self._hidden)}
+        found["fixed"] = np.array(self.fixed)
         return found if self._along is None else {**found, "along": self._along}
 
     @classmethod
     def restored(cls, config: TrackerConfig, state: Mapping[str, np.ndarray]) -> Ground:
         """Go on where :meth:`state` was taken."""
-        ground = cls(config)
+        ground = cls(config, fixed=bool(state["fixed"]))
         parts: dict[str, dict[str, np.ndarray]] = {"expectation": {}, "estimator": {}}
         for key, value in state.items():
             owner, _, name = key.partition(".")
@@ -339,7 +347,7 @@ class Ground:
     def _make_curves(self, prior: JointPrior) -> tuple[Curve, ...]:
         joint = self._estimator.joint
         assert joint is not None  # a point was added
-        if joint.kind is not JointKind.STATIC:
+        if joint.kind is not JointKind.STATIC or self.fixed:
             return (_curve(joint, 0.0),)
         weights = {JointKind.REVOLUTE: prior.revolute_probability, JointKind.PRISMATIC: 1 - prior.revolute_probability}
         return tuple(
