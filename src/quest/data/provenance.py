@@ -15,14 +15,21 @@ import quest
 PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
 
 
+_BUT_RESULTS = (":(top)", ":(top,exclude)benchmarks/results")
+
+
 def code_commit() -> str:
-    """Commit of the checkout that the package runs from, ``+dirty`` where tracked files differ; else the version."""
+    """Commit of the checkout that the package runs from, ``+dirty`` where tracked files differ; else the version.
+
+    Results of benchmarks may differ: they are written one after the other, and no code reads them.
+    """
     folder = Path(__file__).resolve().parent
     try:
         commit = _git(folder, "rev-parse", "HEAD")
         tracked = _git(folder, "ls-files", Path(__file__).name)
         if tracked:  # an installed package may lie inside a checkout of something else
-            return commit + ("+dirty" if _git(folder, "status", "--porcelain", "--untracked-files=no") else "")
+            changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *_BUT_RESULTS)
+            return commit + ("+dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pass  # no git or no checkout: a released version says as much
     return f"version {quest.__version__}"
