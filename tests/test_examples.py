@@ -61,8 +61,8 @@ def test_both_rims_of_a_laptop_are_asked_for(tmp_path: Path, monkeypatch: pytest
     module, commands = example("open_and_lift"), []
     tracks = module.follow(make_tracker(), make_clip())
     assert tracks.names == ("opens", "lifts")
-    point_world = np.full((4, 2, 3), np.nan, np.float32)
-    point_world[1:, 0] = [[0, 0, 1], [0, 2, 1], [0.3, 0.4, 1]]
+    point_world = np.full_like(tracks.point_world, np.nan)
+    point_world[-3:, 0] = [[0, 0, 1], [0, 2, 1], [0.3, 0.4, 1]]
     first, second = module.travelled_m(replace(tracks, point_world=point_world))
     assert first == pytest.approx(0.5)
     assert np.isnan(second)
