@@ -183,7 +183,6 @@ TABLES = (
         },
     ),
     _tracking("robust/test.json", "Noise on the colours, and a camera position never trained on"),
-    _tracking("levels/test.json", "Levels 1 to 4 on the same objects"),
     _intents("intents", "Open and lift: two places of one label on one thing, both asked for"),
     _intents("ajar", "The same, begun where both are seen 16 pixels apart"),
     Table(

@@ -242,7 +242,7 @@ def _answers(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> d
     newest = frames.during(slice(-2, None))
     uv_px = truth.uv[:, -2:].nan_to_num(-1) * network.config.encoder.image_size
     seen = truth.visible[:, -2:].unsqueeze(-1)
-    at_truth = torch.where(seen, newest.to_reference(uv_px, newest.near_depth_at(uv_px)), torch.nan)
+    at_truth = torch.where(seen, newest.near_point_at(uv_px), torch.nan)
     answers = {
         "head": flow,
         "zero": torch.zeros_like(flow),

@@ -87,7 +87,7 @@ def find_peaks(
             keep.append(i)
     size = network.config.encoder.image_size
     uv_px = uv_px[keep].clamp(0, size)
-    point = frames.to_reference(uv_px[None, None], frames.near_depth_at(uv_px[None, None]))
+    point = frames.near_point_at(uv_px[None, None])
     intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
     return Peaks(uv_px / size, frames.to_camera(point)[0, 0], label[keep], value[keep], intent[keep])
 

@@ -121,6 +121,10 @@ class FrameBatch:
         near = torch.where(depth > 0, depth, torch.inf).amin(dim=-1)
         return torch.where(torch.isfinite(near), near, torch.zeros_like(near))
 
+    def near_point_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q 3"]:
+        """What is seen at each position, lifted by :meth:`near_depth_at`: reference frame, NaN without depth."""
+        return self.to_reference(uv_px, self.near_depth_at(uv_px))
+
 
 @dataclass(frozen=True)
 class Observation:

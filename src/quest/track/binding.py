@@ -222,7 +222,7 @@ class Binding:
         """Bind more queries; the anchors of the others stay as they are."""
         uv, label, intent = (values[None].to(frames.depth_m.device) for values in (uv, label, intent))
         uv_px = uv[:, None] * self._network.config.encoder.image_size
-        point = frames.to_reference(uv_px, frames.near_depth_at(uv_px)).squeeze(1)
+        point = frames.near_point_at(uv_px).squeeze(1)
         valid = torch.ones_like(label, dtype=torch.bool)
         anchor = self._network.bind(observed, uv, point, label, valid, intent)
         self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)

@@ -111,7 +111,7 @@ def bind_at(network: QuestNetwork, frames: FrameBatch, observed: Observation, tr
     """Bind queries to their pixels of the first frame of a batch; their 3D points come from its depth."""
     first = frames.during(slice(0, 1))
     uv_px = truth.anchor_uv.unsqueeze(1) * network.config.encoder.image_size
-    point = first.to_reference(uv_px, first.near_depth_at(uv_px)).squeeze(1)
+    point = first.near_point_at(uv_px).squeeze(1)
     return network.bind(observed, truth.anchor_uv, point, truth.told, truth.bound, truth.told_intent)
 
 
