@@ -44,11 +44,21 @@ class TrainingTakes:
     kinds: tuple[str, ...] = ()
 
 
+_IN_FRONT = "--azimuth -40 40"
+_ABOVE = f"{_IN_FRONT} --elevation 30 80"
+# What is high above and farther aside is left to the suite `shift`, and so are orbits that end there.
+
 PARTNET = (
     TrainingTakes("partnet", "--mix broad --level 1 2 4 --takes-per-object 2"),
     TrainingTakes("partnet", "--mix broad --level 1 2 --seed 2 --motion mixed --overlap 0.5"),
     TrainingTakes(
-        "partnet_moving", "--mix broad --camera mixed --sensor stereo --views 2 --takes-per-object 2 --seed 10"
+        "partnet_shapes",
+        "--mix broad --level 1 2 --takes-per-object 2 --seed 520 --stretch 1.6 --motion mixed --overlap 0.3",
+    ),
+    TrainingTakes("partnet_above", f"--mix broad --level 1 2 {_ABOVE} --takes-per-object 2 --seed 500 --stretch 1.6"),
+    TrainingTakes(
+        "partnet_moving",
+        f"--mix broad --camera mixed {_IN_FRONT} --sensor stereo --views 2 --takes-per-object 2 --seed 10",
     ),
     TrainingTakes("partnet_gripper", "--mix broad --suite gripper --takes-per-object 2 --seed 20"),
     TrainingTakes("partnet_occlusion", "--mix broad --suite occlusion --takes-per-object 2 --seed 30"),
@@ -59,10 +69,13 @@ PARTNET = (
 PROCEDURAL = (
     TrainingTakes("usual", "--level 1 2 --views 2", 60, 0),
     TrainingTakes("broad", "--mix broad --level 1 2 --views 2", 200, 20_000),
+    TrainingTakes("broad_above", f"--mix broad --level 1 2 {_ABOVE} --views 2", 80, 22_000),
     TrainingTakes("broad_gripper", "--mix broad --suite gripper", 60, 30_000),
     TrainingTakes("broad_occlusion", "--mix broad --suite occlusion", 60, 40_000),
     TrainingTakes("broad_occlusion", "--mix broad --suite occlusion --look-alike", 30, 41_000),
-    TrainingTakes("broad_moving", "--mix broad --camera mixed --sensor structured-light --views 2", 60, 50_000),
+    TrainingTakes(
+        "broad_moving", f"--mix broad --camera mixed {_IN_FRONT} --sensor structured-light --views 2", 60, 50_000
+    ),
     TrainingTakes("lockers", "--suite lockers", 10, 60_000),
 )
 
@@ -186,6 +199,9 @@ class Release:
         choice = ("--out", self._takes_of("wide_validation"), "--split", "validation", *MAP_CHOICE.split())
         _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
         _quest("generate", *choice, "--no-partnet", "--seeds", "105000..105023", "--mix", "broad")
+        suites = ("--out", self._takes_of("suites_validation"), "--split", "validation")
+        _quest("generate", *suites, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
+        _quest("generate", *suites, "--suite", "lockers", "--seeds", "103000..103003")
 
     def _train(self) -> None:
         start = ("--weights", self.start) if self.start else ("--encoder", self._encoder())
@@ -214,7 +230,8 @@ class Release:
         """The tracker's settings, in a copy that gets its name when they are chosen."""
         untuned = self.work / "untuned.safetensors"
         shutil.copyfile(self.work / "flow" / "weights.safetensors", untuned)
-        _quest("weights", "tune", untuned, "--takes", self._takes_of("validation"))
+        choose = (self._takes_of("validation"), self._takes_of("suites_validation"))
+        _quest("weights", "tune", untuned, "--takes", *choose, "--level", 1, 4)
         _quest("weights", "tune", untuned, "--takes", self._takes_of("wide_validation"), "--discovery-only")
         untuned.rename(self._weights)
 

@@ -49,12 +49,12 @@ def weights(tmp_path: Path) -> Path:
 def test_own_objects_choose_the_settings(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = {}
 
-    def tuned(tracker, store, takes, *, report, discovery_only):
-        chosen.update(takes)
+    def tuned(tracker, takes, *, report, discovery_only):
+        chosen.update(takes[0][1])
         return Tuned(TrackerConfig(jump=0.3), (), 1.0, float(discovery_only))
 
     monkeypatch.setattr(tuning, "tune", tuned)
-    assert TuneWeights(weights, takes=str(takes)).run() == 0
+    assert TuneWeights(weights, takes=(str(takes),)).run() == 0
     assert chosen == {f"toolbox-{seed}": "validation" for seed in range(TAKES)}
     loaded = load_network(weights)
     assert TrackerConfig.from_json(loaded.settings).jump == 0.3

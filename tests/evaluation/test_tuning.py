@@ -33,7 +33,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> TakeStore:
 def test_the_best_value_of_every_setting_is_kept(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tuning, "GRID", {"jump": (0.001, 0.5), "hold_below": (0.0, 1.0)})
     told: list[Trial] = []
-    tuned = tune(make_tracker(), store, {NAME: "validation"}, report=told.append)
+    tuned = tune(make_tracker(), [(store, {NAME: "validation"})], report=told.append)
     assert list(tuned.trials) == told
     assert [(t.name, t.value) for t in told] == [
         ("jump", 0.001),
@@ -46,11 +46,24 @@ def test_the_best_value_of_every_setting_is_kept(store: TakeStore, monkeypatch: 
     assert np.isfinite([t.ape for t in told]).all()
 
 
+def test_takes_of_a_suite_count_as_much_as_ordinary_ones(store: TakeStore, tmp_path: Path, monkeypatch):
+    """However many there are: the mean is over sources and suites, and over every frame within them."""
+    monkeypatch.setattr(tuning, "GRID", {"jump": (0.001,)})
+    hard = TakeStore(tmp_path)
+    names = [f"panels-10000{i}-L1-occlusion60-s000000" for i in range(2, 4)]
+    for seed, name in enumerate(names, start=2):
+        hard.write(make_take(frames=10, views=1, entities=2, size=(64, 64), seed=seed, name=name))
+    chosen = [(store, dict.fromkeys([NAME], "validation")), (hard, dict.fromkeys(names, "validation"))]
+    ape = [tune(make_tracker(), takes, report=lambda t: None).trials[0].ape for takes in ([c] for c in chosen)]
+    (both,) = tune(make_tracker(), chosen, report=lambda t: None).trials
+    assert both.ape == pytest.approx(np.mean(ape))
+
+
 def test_other_objects_than_validation_are_refused(store: TakeStore):
     with pytest.raises(ConfigError, match="validation"):
-        tune(make_tracker(), store, {NAME: "test"}, report=lambda trial: None)
+        tune(make_tracker(), [(store, {NAME: "test"})], report=lambda trial: None)
     with pytest.raises(ConfigError, match="none"):
-        tune(make_tracker(), store, {}, report=lambda trial: None)
+        tune(make_tracker(), [(store, {})], report=lambda trial: None)
 
 
 def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
@@ -68,14 +81,14 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
         intent=torch.zeros(3, dtype=torch.long),
     )
     monkeypatch.setattr(Tracker, "candidates", lambda *_: peaks)
-    bias, precision, recall = discovery_bias(make_tracker(), store, [NAME])
+    bias, precision, recall = discovery_bias(make_tracker(), [(store, {NAME: "validation"})])
     assert (precision, recall) == pytest.approx((2 / 3, 1.0))
     assert bias == pytest.approx(1.0)
 
 
 def test_after_the_map_alone_only_discovery_is_tuned(store: TakeStore):
     tracker, told = make_tracker(), list[Trial]()
-    tuned = tune(tracker, store, {NAME: "validation"}, report=told.append, discovery_only=True)
+    tuned = tune(tracker, [(store, {NAME: "validation"})], report=told.append, discovery_only=True)
     assert not told
     assert tuned.config == replace(tracker.config, slot_bias=tuned.config.slot_bias)
     assert 0 <= tuned.precision <= 1

@@ -8,6 +8,7 @@ import pytest
 from quest.cli import main as program
 from quest.cli.generate import Generate
 from quest.errors import ConfigError, ObjectError
+from quest.sim.cameras import CameraStyle
 from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
 from quest.sim.procedural import CATEGORIES
 from quest.sim.suites import find_suites
@@ -83,6 +84,7 @@ def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
         "--out a --suite lockers --procedural 4 --level 2",
         "--out a --suite noise --variant 5 stereo --procedural 4",
         "--out s3://bucket/takes --procedural 2 --camera orbit --motion robot --overlap 0.5 --sensor stereo --physics",
+        "--out a --procedural 2 --camera orbit --azimuth -40.0 40.0 --elevation 30.0 80.0",
     ],
 )
 def test_recorded_command_makes_the_same_run(words: str) -> None:
@@ -94,6 +96,12 @@ def test_recorded_command_makes_the_same_run(words: str) -> None:
     assert sorted(shlex.split(words)) == sorted(again[1:])
 
 
+def test_cameras_of_a_suite_move_where_the_arguments_say() -> None:
+    command = Generate(out="a", procedural=1, suite="moving", variant=("pan",), elevation=(30.0, 80.0))
+    (suite,) = command._suites()
+    assert suite.settings.cameras == CameraStyle(motion="pan", elevation_deg=(30.0, 80.0))
+
+
 @pytest.mark.parametrize(
     ("words", "named"),
     [
@@ -102,6 +110,8 @@ def test_recorded_command_makes_the_same_run(words: str) -> None:
         ({"objects": ("partnet:1",), "takes_per_object": 0}, "--takes-per-object"),
         ({"objects": ("partnet:1",), "every": 9}, "every"),
         ({"objects": ("partnet:1",), "views": 0}, "view"),
+        ({"objects": ("partnet:1",), "elevation": (50.0, 20.0)}, "elevation"),
+        ({"objects": ("partnet:1",), "azimuth": (0.0, 200.0)}, "azimuth"),
         ({"seeds": "5..1"}, "A..B"),
         ({"seeds": "few"}, "A..B"),
         ({"procedural": 5, "seeds": "1..3"}, "do not fit"),

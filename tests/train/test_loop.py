@@ -128,6 +128,18 @@ def killed_at(step: int) -> Callable[..., torch.Tensor]:
     return until
 
 
+@pytest.mark.parametrize("decay", [0.0, 0.9])
+def test_the_best_checkpoint_is_the_mean_of_the_weights(run: Run, tmp_path: Path, decay: float):
+    """The last one, from which training goes on, has the weights themselves."""
+    network, reports = run(replace(SHORT, steps=2, average_decay=decay))
+    trained = weights_of(network)
+    load_checkpoint(tmp_path / "run" / "last", network, None)
+    assert all(torch.equal(tensor, trained[name]) for name, tensor in weights_of(network).items())
+    load_checkpoint(tmp_path / "run" / "best", network, None)
+    assert all(torch.equal(tensor, trained[name]) for name, tensor in weights_of(network).items()) == (decay == 0)
+    assert reports[-1].scores is not None
+
+
 @pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 def test_micro_batches_add_up_to_the_batch(run: Run, config: NetworkConfig):
     """Windows of different numbers of entities, so that the mean of the parts' means would be another one."""
@@ -231,7 +243,15 @@ def test_schedule():
 
 @pytest.mark.parametrize(
     "changes",
-    [{"steps": 0}, {"patience": 0}, {"precision": "16"}, {"validate_every": 0}, {"accumulate": 0}, {"devices": 0}],
+    [
+        {"steps": 0},
+        {"patience": 0},
+        {"precision": "16"},
+        {"validate_every": 0},
+        {"accumulate": 0},
+        {"devices": 0},
+        {"average_decay": 1.0},
+    ],
 )
 def test_settings_out_of_range(changes: dict):
     with pytest.raises(ConfigError):

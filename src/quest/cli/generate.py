@@ -67,6 +67,10 @@ class Generate:
     """Frames in which the joints open and close again and again; default: each once, in suite long 10000."""
     camera: Literal["static", "orbit", "handheld", "pan", "mixed"] | None = None
     """How cameras move; default: static."""
+    azimuth: tuple[float, float] | None = None
+    """Least and greatest direction of the first camera pose, degrees: 0 is the front; default: -60 60."""
+    elevation: tuple[float, float] | None = None
+    """The same of its height above the horizon, degrees; default: 5 50, for objects that lie flat 20 65."""
     motion: Literal["human", "robot", "creep", "mixed"] | None = None
     """How joints move: eased with stops and reversals, at constant speeds, slowly, or one of these; default: human."""
     overlap: float | None = None
@@ -166,8 +170,9 @@ class Generate:
             for name in ("views", "size", "every", "frames_per_joint", "frames")
             if getattr(self, name) is not None
         }
-        if self.camera is not None:
-            given["cameras"] = dataclasses.replace(preset.cameras, motion=self.camera)
+        cameras = {"motion": self.camera, "azimuth_deg": self.azimuth, "elevation_deg": self.elevation}
+        if said := {name: value for name, value in cameras.items() if value is not None}:
+            given["cameras"] = dataclasses.replace(preset.cameras, **said)
         if self.motion is not None or self.overlap is not None:
             kind = preset.motion.kind if self.motion is None else self.motion
             overlap = preset.motion.overlap if self.overlap is None else self.overlap

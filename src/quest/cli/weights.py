@@ -155,8 +155,8 @@ class TuneWeights:
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
-    takes: str = "takes"
-    """Store with takes of validation objects, or of your own."""
+    takes: tuple[str, ...] = ("takes",)
+    """Stores with takes of validation objects, or of your own. Ordinary takes and those of every suite count alike."""
     level: tuple[int, ...] = (1,)
     """Levels of the takes to use."""
     objects: tuple[str, ...] = ()
@@ -172,11 +172,10 @@ class TuneWeights:
         from quest.track import load
 
         console = Console(highlight=False)
-        store = TakeStore(self.takes)
-        takes = _to_choose_by(store, levels=self.level, objects=self.objects)
+        stores = [TakeStore(url) for url in self.takes]
+        takes = [(store, _to_choose_by(store, levels=self.level, objects=self.objects)) for store in stores]
         tuned = tune(
             load(self.weights),
-            store,
             takes,
             report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}"),
             discovery_only=self.discovery_only,

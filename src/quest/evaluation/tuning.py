@@ -1,8 +1,9 @@
 """Choose the tracker's settings on validation objects.
 
-One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``,
-PartNet-Mobility and procedural objects alike); the threshold of discovery by its F2 in the first frame, in which recall
-counts twice as much as precision: a false entity costs one more track, a missed one is not followed at all.
+One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``;
+PartNet-Mobility and procedural objects, ordinary takes and those of every suite alike); the threshold of discovery by
+its F2 in the first frame, in which recall counts twice as much as precision: a false entity costs one more track, a
+missed one is not followed at all.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import SplitPart
+from quest.evaluation.take_suite import TakeSuite
 from quest.geometry import transform
 from quest.model.discovery import Peaks, match_peaks
 from quest.track import Tracker, TrackerConfig
@@ -33,6 +35,9 @@ GRID: dict[str, tuple[float, ...]] = {
 """Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
 _BETA = 2.0
+
+Chosen = Sequence[tuple[TakeStore, Mapping[str, SplitPart]]]
+"""Stores, and by name the part of the object split of the takes in them that choose."""
 
 
 @dataclass(frozen=True)
@@ -69,8 +74,7 @@ class Tuned:
 
 def tune(
     tracker: Tracker,
-    store: TakeStore,
-    takes: Mapping[str, SplitPart],
+    takes: Chosen,
     *,
     report: Callable[[Trial], None],
     discovery_only: bool = False,
@@ -79,8 +83,7 @@ def tune(
 
     Args:
         tracker: network and settings to start from.
-        store: where the takes are.
-        takes: takes of validation objects, by name.
+        takes: stores with takes of validation objects.
         report: told of every trial.
         discovery_only: leave all settings but the threshold of discovery as they are, as after training the affordance
             map alone.
@@ -88,18 +91,19 @@ def tune(
     Raises:
         ConfigError: a take is not of a validation object, or nothing moves in them.
     """
-    wrong = [name for name, part in takes.items() if part != "validation"]
-    if wrong or not takes:
+    parts = [item for _, chosen in takes for item in chosen.items()]
+    wrong = [name for name, part in parts if part != "validation"]
+    if wrong or not parts:
         raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
     config, trials = tracker.config, []
     remember_frames(tracker.network, capacity=10_000)
-    bias, precision, recall = discovery_bias(tracker, store, list(takes))
+    bias, precision, recall = discovery_bias(tracker, takes)
     config = replace(config, slot_bias=bias)
     known: dict[TrackerConfig, float] = {}
     for name, values in () if discovery_only else GRID.items():
         configs = [replace(config, **{name: v}) for v in values]
         new = [c for c in configs if c not in known]
-        known |= zip(new, _scores(tracker, new, store, takes) if new else (), strict=True)
+        known |= zip(new, _scores(tracker, new, takes) if new else (), strict=True)
         tried = [Trial(name, v, known[c]) for v, c in zip(values, configs, strict=True)]
         for trial in tried:
             report(trial)
@@ -108,7 +112,7 @@ def tune(
     return Tuned(config, tuple(trials), precision, recall)
 
 
-def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> tuple[float, float, float]:
+def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float]:
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
     A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D.
@@ -116,7 +120,7 @@ def discovery_bias(tracker: Tracker, store: TakeStore, names: Sequence[str]) -> 
     logits: list[float] = []
     hits: list[bool] = []
     present = 0
-    for name in names:
+    for store, name in ((store, name) for store, chosen in takes for name in chosen):
         take = store.read(name, frames=slice(0, 1))
         for view in range(len(take.views)):
             clip = take.views[view].clip
@@ -148,20 +152,18 @@ def _match(take: Take, view: int, peaks: Peaks) -> tuple[list[bool], int]:
     return (found >= 0).tolist(), len(entities)
 
 
-def _scores(
-    tracker: Tracker, configs: Sequence[TrackerConfig], store: TakeStore, takes: Mapping[str, SplitPart]
-) -> list[float]:
-    """Mean over sources of the mean 3D distance of moved entities, for every configuration."""
+def _scores(tracker: Tracker, configs: Sequence[TrackerConfig], takes: Chosen) -> list[float]:
+    """Mean over sources and suites of the mean 3D distance of moved entities, for every configuration."""
     trials = [tracker.with_config(config, name=f"{i}") for i, config in enumerate(configs)]
-    records = evaluate(store, takes, trials, protocols=("point",)).records
+    records = [r for store, chosen in takes for r in evaluate(store, chosen, trials, protocols=("point",)).records]
     return [_ape([r for r in records if r.subject.tracker == trial.name]) for trial in trials]
 
 
 def _ape(records: list[EntityRecord]) -> float:
-    by_source: dict[str, list[np.ndarray]] = {}
+    alike: dict[tuple[str, str], list[np.ndarray]] = {}
     for r in records:
         if r.moved:
-            by_source.setdefault(r.subject.source, []).append(r.distance[r.first_frame :])
-    if not by_source:
+            alike.setdefault((r.subject.source, TakeSuite.of(r.take).name), []).append(r.distance[r.first_frame :])
+    if not alike:
         raise ConfigError("tuning: no entity moves in these takes")
-    return float(np.mean([np.concatenate(d).mean() for d in by_source.values()]))
+    return float(np.mean([np.concatenate(d).mean() for d in alike.values()]))

@@ -105,7 +105,7 @@ def _with(**changes: object) -> TakeSettings:
     return replace(TakeSettings(views=1), **changes)
 
 
-_ODD_VIEWPOINT = CameraStyle(azimuth_deg=(-70.0, 70.0), elevation_deg=(55.0, 75.0))
+_ODD_VIEWPOINT = CameraStyle(azimuth_deg=(50.0, 70.0), elevation_deg=(55.0, 75.0), mirrored=True)
 
 SUITES: dict[str, tuple[Suite, ...]] = {
     "occlusion": (Suite("occlusion", hiding=Hiding(None, False, before=(34, 41), after=(24, 30))),),

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from quest.errors import ConfigError
 from quest.extras import require
 from quest.model.network import QuestNetwork
+from quest.train.averaging import RunningMean
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
 from quest.train.devices import deterministic_algorithms, divide, generator_states, launch, restore_generators
@@ -135,6 +136,7 @@ class _Learner:
         for parameter in objective.network.parameters():
             parameter.requires_grad_(id(parameter) in chosen)
         self.optimizer = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self.mean = RunningMean(self.trained, self.optimizer, config.average_decay)
 
     def resume(self, rng: np.random.Generator, out: Path) -> Progress:
         """Take up the last checkpoint of a folder, or start, and hand everything to the devices."""
@@ -183,26 +185,30 @@ class _Learner:
             raise ConfigError(f"training: the loss became {values[0].item()} at step {step}; lower the learning rate")
         torch.nn.utils.clip_grad_norm_(self.trained, self.config.clip_norm)
         self.fabric_optimizer.step()
+        self.mean.update(step)
         return values
 
     def validate(self, sampler: WindowSampler) -> Scores:
-        """Scores, which the first process finds out and tells the others."""
+        """Scores of the mean of the weights, which the first process finds out and tells the others."""
         scores = None
         if self.fabric.is_global_zero:
             batches = self.config.validation_batches
-            with self.fabric.autocast():
+            with self.fabric.autocast(), self.mean.applied():
                 scores = self.objective.validate(sampler, batches=batches, device=self.fabric.device)
         scores = self.fabric.broadcast(scores)
         assert scores is not None
         return scores
 
     def save(self, progress: Progress, out: Path) -> None:
-        """Write the last checkpoint, and the best one where it is."""
+        """Write the last checkpoint, and the mean of the weights as the best one where it is."""
         generators = generator_states(self.fabric)
         if self.fabric.is_global_zero:
+            network = self.objective.network
             # The best first: a run that is killed in between does this step again, and finds the same.
-            for name in ("best", "last") if progress.best_step == progress.step else ("last",):
-                save_checkpoint(out / name, self.objective.network, self.optimizer, progress, generators)
+            if progress.best_step == progress.step:
+                with self.mean.applied():
+                    save_checkpoint(out / "best", network, self.optimizer, progress, generators)
+            save_checkpoint(out / "last", network, self.optimizer, progress, generators)
         self.fabric.barrier()
 
     def _count(self, parts: list[MicroBatch]) -> Tally:

@@ -18,6 +18,8 @@ class TrainingConfig:
         weight_decay: of AdamW.
         warmup_steps: steps of the warm-up.
         clip_norm: largest norm of the gradient.
+        average_decay: share of the running mean of the weights that a step keeps; the mean is what is validated and
+            becomes the best checkpoint. 0: the weights themselves.
         validate_every: steps between validations.
         checkpoint_every: steps between checkpoints, beside those at validations: what a kill can cost.
         validation_batches: fixed batches per validation.
@@ -38,6 +40,7 @@ class TrainingConfig:
     weight_decay: float = 0.01
     warmup_steps: int = 100
     clip_norm: float = 1.0
+    average_decay: float = 0.995
     validate_every: int = 250
     checkpoint_every: int = 100
     validation_batches: int = 12
@@ -55,6 +58,8 @@ class TrainingConfig:
         for name in counts:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: expected {name} to be at least 1, got {getattr(self, name)}")
+        if not 0 <= self.average_decay < 1:
+            raise ConfigError(f"training: expected average_decay from 0 to below 1, got {self.average_decay}")
         if self.devices != "auto" and self.devices < 1:
             raise ConfigError(f"training: expected at least one device or 'auto', got devices {self.devices}")
         if self.precision not in ("bf16-mixed", "32-true"):
