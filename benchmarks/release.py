@@ -12,13 +12,15 @@ from __future__ import annotations
 
 import shutil
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
+import quest
 from quest.cli.main import main
+from quest.model.weights import load_network
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
@@ -253,8 +255,10 @@ class Release:
                self.work / "streams_validation", "--weights", self._weights, "--out", out)  # fmt: skip
 
     def _ship(self) -> None:
+        licence = "Apache-2.0" + (", research use only for the PartNet-Mobility objects that taught" * self.partnet)
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(self._weights, ASSETS / "weights" / self._weights.name)
+        shipped = replace(load_network(self._weights), licence=licence, version=quest.__version__)
+        shipped.save(ASSETS / "weights" / self._weights.name)
 
     def _streams(self, part: str, *, first: int, count: int) -> Path:
         """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""

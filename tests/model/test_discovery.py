@@ -10,7 +10,7 @@ import torch
 from quest.baselines.clip_frames import ClipFrames
 from quest.data.mirror import mirror_take
 from quest.model.affordance import AffordanceMap
-from quest.model.discovery import _mirrored, find_peaks, match_peaks
+from quest.model.discovery import Candidates, Peaks, _mirrored, find_peaks, match_peaks
 from quest.model.observation import FrameBatch, Observation
 from quest.types import LABELS, Take
 from tests.synthetic import make_take
@@ -57,6 +57,19 @@ def test_a_rim_is_where_the_cells_along_it_point_to_in_the_mean():
     # Row 3 of 8: cells 0, 1, 2 point to 12, 14.4 and 21.6 px; cell 3 is 2.5 below the best, cell 7 points 48 px away.
     assert found["rim"].tolist() == pytest.approx([(12 + 14.4 + 21.6) / 3 / 64, 28 / 64])
     assert found["handle"].tolist() == pytest.approx([12 / 64, 28 / 64])
+
+
+def test_of_clashing_candidates_the_best_of_those_that_count_stays():
+    clash = torch.eye(4, dtype=torch.bool)
+    clash[0, 1] = clash[1, 0] = clash[1, 2] = clash[2, 1] = True
+    found = Candidates(
+        Peaks(torch.rand(4, 2), torch.rand(4, 3), torch.tensor([0, 2, 2, 1]), torch.arange(4.0), torch.zeros(4)), clash
+    )
+    assert found.apart() == [0, 2, 3]
+    assert found.apart([1, 2, 3]) == [1, 3]
+    assert found.apart([]) == []
+    assert found.peaks.select(found.apart()).label.tolist() == [0, 2, 1]
+    assert len(found.peaks.select([])) == 0
 
 
 def test_each_entity_is_found_once_by_the_best_near_candidate_of_its_label():

@@ -9,7 +9,7 @@ import torch
 
 from quest.errors import InputError
 from quest.model.decoder import Anchor
-from quest.model.discovery import Peaks
+from quest.model.discovery import Candidates, Peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import Observation
 from quest.types import Clip, Query
@@ -22,18 +22,19 @@ def clip() -> Clip:
     return make_clip()
 
 
-def peaks(*_: object, **__: object) -> Peaks:
-    return Peaks(
+def peaks(*_: object, **__: object) -> Candidates:
+    found = Peaks(
         uv=torch.tensor([[0.25, 0.25], [0.75, 0.75], [0.25, 0.75]]),
         point_m=torch.ones(3, 3),
         label=torch.tensor([2, 2, 0]),
         logit=torch.tensor([9.0, 8.0, 7.0]),
         intent=torch.tensor([0, 1, 1]),
     )
+    return Candidates(found, torch.eye(3, dtype=torch.bool))
 
 
 def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.binding.find_peaks", peaks)
+    monkeypatch.setattr("quest.track.binding.find_candidates", peaks)
     tracker, bound, bind = make_tracker(), [], QuestNetwork.bind
 
     def spy(self: QuestNetwork, observed: Observation, uv: torch.Tensor, *rest: torch.Tensor) -> Anchor:
@@ -47,7 +48,7 @@ def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_what_is_asked_for_to_be_lifted_by_stands_still(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.binding.find_peaks", peaks)
+    monkeypatch.setattr("quest.track.binding.find_candidates", peaks)
     tracker, frame = make_tracker(), clip.frame(0)
     queries = [Query.semantic("rim", intent=intent) for intent in ("lift", "open")]
     stream = tracker.stream(clip.camera, [*queries, Query.semantic("handle")], alpha=None)
@@ -55,6 +56,57 @@ def test_what_is_asked_for_to_be_lifted_by_stands_still(clip: Clip, monkeypatch:
     # Of a handle that nobody asked for to lift by, the network may only think so.
     for each in (stream, tracker.restore(tracker.save(stream))):
         assert [f.ground.fixed for f in each._following] == [True, False, False]
+
+
+def all_at_one_place(*_: object, **__: object) -> Candidates:
+    """A handle, a rim to open and the same rim to lift, which are no two rims but may be a rim and a handle."""
+    found = Peaks(
+        uv=torch.full((4, 2), 0.5),
+        point_m=torch.ones(4, 3),
+        label=torch.tensor([0, 2, 2, 2]),
+        logit=torch.tensor([9.0, 8.0, 7.0, 6.0]),
+        intent=torch.tensor([0, 0, 1, 1]),
+    )
+    clash = torch.ones(4, 4, dtype=torch.bool)
+    clash[1, 2:] = clash[2:, 1] = False
+    return Candidates(found, clash)
+
+
+def names_after(clip: Clip, *asked: list[Query]) -> list[str]:
+    """Who is followed after so many frames, with these prompts before each of them."""
+    stream = make_tracker().stream(clip.camera, [], alpha=None)
+    for t, queries in enumerate(asked):
+        for query in queries:
+            stream.add(query)
+        frame = clip.frame(t)
+        state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+    return list(state.names)
+
+
+HANDLE, OPEN, LIFT = (
+    Query.semantic("handle"),
+    Query.semantic("rim", intent="open"),
+    Query.semantic("rim", intent="lift"),
+)
+
+
+def test_a_prompt_is_not_kept_from_its_entity_by_another_label(clip: Clip, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("quest.track.binding.find_candidates", all_at_one_place)
+    assert names_after(clip, [HANDLE, OPEN, LIFT]) == ["handle 0", "rim 1", "rim 2"]
+    assert names_after(clip, [HANDLE, HANDLE, LIFT, LIFT]) == ["handle 0", "rim 2"]
+    assert len(make_tracker().track(clip).names) == 1, "who discovers has asked for nothing"
+
+
+def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_purpose(
+    clip: Clip, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("quest.track.binding.find_candidates", all_at_one_place)
+    monkeypatch.setattr("quest.track.binding.Binding._near", lambda _, uv, __, following: [[True] * len(following)] * 4)
+    assert names_after(clip, [OPEN], [LIFT]) == ["rim 0", "rim 1"]
+    assert names_after(clip, [OPEN], [OPEN]) == ["rim 0"]
+    assert names_after(clip, [HANDLE], [OPEN]) == ["handle 0", "rim 1"]
+    assert names_after(clip, [OPEN], [Query.semantic("rim")]) == ["rim 0"]
+    assert names_after(clip, [LIFT], [Query.slot()]) == ["rim 0"]
 
 
 def test_weights_that_know_no_intents_say_so(clip: Clip):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
@@ -42,14 +43,47 @@ class Peaks:
     logit: Float[Tensor, " K"]
     intent: Int[Tensor, " K"]
 
+    def __len__(self) -> int:
+        return len(self.label)
 
-def find_peaks(
+    def select(self, index: Sequence[int]) -> Peaks:
+        """Some of them."""
+        return Peaks(*(getattr(self, f.name)[list(index)] for f in fields(self)))
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """All peaks of a frame, of which those that are too close to each other cannot all be entities.
+
+    Attributes:
+        peaks: the peaks, best first.
+        clash: which are too close to each other.
+    """
+
+    peaks: Peaks
+    clash: Bool[Tensor, "K K"]
+
+    def apart(self, among: Sequence[int] | None = None) -> list[int]:
+        """Of peaks that are too close to each other the best alone.
+
+        Args:
+            among: indices of the peaks that count, best first; all by default. Who looks for one label does not mind
+                what is a better peak of another at the same place.
+        """
+        keep: list[int] = []
+        for i in range(len(self.peaks)) if among is None else among:
+            if not bool(self.clash[i, keep].any()):
+                keep.append(i)
+        return keep
+
+
+def find_candidates(
     network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
-) -> Peaks:
-    """Peaks of one frame (B = 1, T = 1), at most as many as the network has slots.
+) -> Candidates:
+    """Peaks of one frame (B = 1, T = 1).
 
     A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
-    places look alike, where its cells point to in the mean. Of peaks closer than ``radius_cells`` the best stays. The
+    places look alike, where its cells point to in the mean. Peaks clash that are closer than ``radius_cells``. The
     same label for another intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
 
     Args:
@@ -81,15 +115,19 @@ def find_peaks(
     apart_px = torch.where(other_purpose, _PURPOSES_APART_PX, radius_cells * cell)
     apart_px[rim] = torch.where(other_purpose[rim], 0.0, apart_px[rim])
     clash = torch.cdist(uv_px, uv_px) < apart_px
-    keep: list[int] = []
-    for i in range(len(value)):
-        if len(keep) < network.config.slots and not bool(clash[i, keep].any()):
-            keep.append(i)
     size = network.config.encoder.image_size
-    uv_px = uv_px[keep].clamp(0, size)
+    uv_px = uv_px.clamp(0, size)
     point = frames.near_point_at(uv_px[None, None])
     intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
-    return Peaks(uv_px / size, frames.to_camera(point)[0, 0], label[keep], value[keep], intent[keep])
+    return Candidates(Peaks(uv_px / size, frames.to_camera(point)[0, 0], label, value, intent), clash)
+
+
+def find_peaks(
+    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+) -> Peaks:
+    """Those of :func:`find_candidates` that do not clash, at most as many as the network has slots."""
+    found = find_candidates(network, frames, observed, radius_cells=radius_cells, mirror=mirror)
+    return found.peaks.select(found.apart()[: network.config.slots])
 
 
 def _agreed(

@@ -14,7 +14,7 @@ from torch import Tensor
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
 from quest.model.decoder import Anchor
-from quest.model.discovery import Peaks, find_peaks
+from quest.model.discovery import Peaks, find_candidates
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.track.following import Following
@@ -179,14 +179,16 @@ class Binding:
         if not (looking or self.discover):
             return []
         config = self._config
-        slots = find_peaks(self._network, frames, observed, radius_cells=config.slot_radius_cells)
-        existence = (config.slot_gain * (slots.logit + config.slot_bias)).sigmoid().tolist()
-        label, intent = [LABELS[int(n)] for n in slots.label], _intents(slots)
-        free = [i for i in range(len(label)) if not self._taken(slots.uv[i], frames, following)]
+        found_now = find_candidates(self._network, frames, observed, radius_cells=config.slot_radius_cells)
+        peaks, clash = found_now.peaks, found_now.clash.tolist()
+        existence = (config.slot_gain * (peaks.logit + config.slot_bias)).sigmoid().tolist()
+        label, intent = [LABELS[int(n)] for n in peaks.label], _intents(peaks)
+        near = self._near(peaks.uv, frames, following)
         found: list[Following] = []
         chosen: list[int] = []
         if self.discover:
-            chosen = [i for i in free if existence[i] > config.slot_threshold]
+            apart = found_now.apart()[: self._network.config.slots]
+            chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
             for i in chosen:
                 number = self._next_number()
                 lift = " (lift)" if intent[i] == "lift" else ""
@@ -197,26 +199,27 @@ class Binding:
             query = waiting.query
             fits = [
                 i
-                for i in free
-                if i not in chosen and query.label in (None, label[i]) and query.intent in (None, intent[i])
+                for i in found_now.apart(_asked_for(query, label, intent))
+                if i not in chosen
+                and not any(clash[i][j] for j in chosen if query.label in (None, label[j]))
+                and not any(close and _same(query, f) for close, f in zip(near[i], following, strict=True))
             ]
             if fits and existence[fits[0]] > config.prompt_threshold:
                 chosen.append(fits[0])
                 name = query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]]))
         if chosen:
-            self._join(observed, frames, slots.uv[chosen], slots.label[chosen], slots.intent[chosen])
+            self._join(observed, frames, peaks.uv[chosen], peaks.label[chosen], peaks.intent[chosen])
         return found
 
-    def _taken(self, uv: Tensor, frames: FrameBatch, following: Sequence[Following]) -> bool:
-        """Whether a query follows what is seen there."""
-        places = [f.place for f in following if f.place is not None]
-        if not places:
-            return False
+    def _near(self, uv: Float[Tensor, "K 2"], frames: FrameBatch, following: Sequence[Following]) -> list[list[bool]]:
+        """For every peak, which queries follow what is seen there."""
         size = self._network.config.encoder.image_size
-        at = torch.from_numpy(np.stack(places)).to(frames.depth_m)
-        gap_px = (frames.from_reference(at[None, None])[0, 0] - uv * size).norm(dim=-1)
-        return bool((gap_px < self._config.slot_radius_cells * self._network.config.cell_px).any())
+        unknown = np.full(3, np.nan)
+        places = [unknown if f.place is None else f.place for f in following]
+        at = torch.from_numpy(np.array(places).reshape(-1, 3)).to(frames.depth_m)
+        gap_px = torch.cdist(uv * size, frames.from_reference(at[None, None])[0, 0])
+        return (gap_px < self._config.slot_radius_cells * self._network.config.cell_px).tolist()
 
     def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor, intent: Tensor) -> None:
         """Bind more queries; the anchors of the others stay as they are."""
@@ -255,6 +258,18 @@ class Binding:
         return found
 
 
-def _intents(slots: Peaks) -> list[str | None]:
-    """What each slot is for; None where the network does not tell."""
-    return [None if n == UNKNOWN_INTENT else INTENTS[n] for n in slots.intent.tolist()]
+def _asked_for(query: Query, label: Sequence[str], intent: Sequence[str | None]) -> list[int]:
+    """The peaks that a prompt may mean."""
+    return [i for i in range(len(label)) if query.label in (None, label[i]) and query.intent in (None, intent[i])]
+
+
+def _same(query: Query, following: Following) -> bool:
+    """Whether what another query follows, at the place of a prompt's peak, may be what the prompt means."""
+    if query.label is not None and following.label not in (None, query.label):
+        return False
+    return query.intent is None or (query.intent == "lift") == following.ground.fixed
+
+
+def _intents(peaks: Peaks) -> list[str | None]:
+    """What each peak is for; None where the network does not tell."""
+    return [None if n == UNKNOWN_INTENT else INTENTS[n] for n in peaks.intent.tolist()]
