@@ -9,7 +9,7 @@ import pytest
 
 from quest.cli.weights import CalibrateWeights, TuneWeights
 from quest.data.store import TakeStore
-from quest.errors import ConfigError
+from quest.errors import ConfigError, WeightsError
 from quest.evaluation import calibrate, stream_record, tuning
 from quest.evaluation.calibrate import FitConfig
 from quest.evaluation.stream_record import StreamRecord
@@ -40,9 +40,12 @@ def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def weights(tmp_path: Path) -> Path:
-    """Weights that say more than a tracker needs."""
+    """Weights that say more than a tracker needs, and whose monitor is of another version of quest."""
     path = tmp_path / "weights.safetensors"
-    save_network(path, make_network(), settings="{}", about="a test", licence="MIT", version="3")
+    of_before = '{"format": 0}'
+    save_network(path, make_network(), settings="{}", about="a test", monitor=of_before, licence="MIT", version="3")
+    with pytest.raises(WeightsError, match="quest weights calibrate"):
+        load(path)
     return path
 
 

@@ -22,6 +22,9 @@ NORMAL = {
     "step": (0.01, 0.008),
     "spread": (0.03, 0.01),
     "held": (0.0, 0.0),
+    "travel": (0.2, 0.05),
+    "closing": (-0.2, 0.1),
+    "lead": (0.0, 1.0),
 }
 """Mean and spread of every signal while all is well."""
 

@@ -175,7 +175,7 @@ class TuneWeights:
         stores = [TakeStore(url) for url in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level, objects=self.objects)) for store in stores]
         tuned = tune(
-            load(self.weights),
+            load(self.weights, monitor=False),
             takes,
             report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}"),
             discovery_only=self.discovery_only,
@@ -222,7 +222,7 @@ class CalibrateWeights:
         stores = [TakeStore(path) for path in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
         recorded = record_streams(
-            load(self.weights),
+            load(self.weights, monitor=False),
             takes,
             self.records,
             shard=Shard.parse(self.shard),

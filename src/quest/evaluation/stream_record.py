@@ -162,7 +162,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
 
 
 def tracker_id(tracker: Tracker) -> str:
-    """Twelve hexadecimal digits that tell apart networks and settings by which given points are followed.
+    """Twelve hexadecimal digits that tell apart networks, settings by which given points are followed, and signals.
 
     Streams are asked for by points. So a better affordance map or flow head, another threshold of discovery, or what
     else is in a weights file leaves records, and with them the monitor's calibration, as good as they were.
@@ -172,7 +172,7 @@ def tracker_id(tracker: Tracker) -> str:
     if tracker.network.config.queries == "anchored":
         elsewhere += ("affordance",)
         settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
-    digest = hashlib.sha256(json.dumps([config | {"flow": None}, settings], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([config | {"flow": None}, settings, SIGNALS], sort_keys=True).encode())
     for name, tensor in sorted(tracker.network.state_dict().items()):
         if name.startswith(elsewhere):
             continue

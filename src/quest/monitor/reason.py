@@ -46,6 +46,9 @@ _WORDINGS: Final = {
     "step": _Wording(None, "leapt by {:.2f}"),
     "spread": _Wording(None, "place uncertain by {:.2f}"),
     "held": _Wording(None, "held on its joint without being seen"),
+    "travel": _Wording(None, "has gone {:.2f}"),
+    "closing": _Wording("has come close to another query (log of the distances' ratio {:.1f})", None),
+    "lead": _Wording("the query close by is surer of its identity (log odds {:.1f})", None),
 }
 
 

@@ -22,6 +22,9 @@ SIGNALS: tuple[str, ...] = (
     "step",  # distance that the answer moved since the last frame, reference units
     "spread",  # standard deviation of the belief over cells, reference units
     "held",  # 1 where the answer is held on the joint, else 0
+    "travel",  # distance of the answer from where the query was first, reference units
+    "closing",  # log of how much nearer another query is than it was at first, of the one that came closest (negative)
+    "lead",  # network: log odds that the identity is right, less those of that query
 )
 """Names of the signals, in the order of :attr:`Signals.values`."""
 

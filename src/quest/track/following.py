@@ -58,6 +58,7 @@ class Following:
         ground: its joint.
         belief: over the cells of the newest frame (K = 1).
         place: where it was at the newest frame.
+        home: where it was first.
         held: whether that is where its joint holds it, unseen.
         buried: whether it was hidden behind something that came before it, and has not been seen since.
         refused: frames in a row in which it was said to be seen off its joint, and was held instead.
@@ -76,6 +77,7 @@ class Following:
     ground: Ground
     belief: Belief | None = None
     place: Float[np.ndarray, "3"] | None = None
+    home: Float[np.ndarray, "3"] | None = None
     held: bool = False
     buried: bool = False
     refused: int = 0
@@ -89,7 +91,7 @@ class Following:
     def forget_places(self, config: TrackerConfig) -> None:
         """Begin anew in another reference frame."""
         self.ground = Ground(config, fixed=self.ground.fixed)
-        self.belief, self.place, self.held = None, None, False
+        self.belief, self.place, self.home, self.held = None, None, None, False
         self.safe.clear()
         self.since_safe = self.refused = 0
         self.buried = False
@@ -98,6 +100,7 @@ class Following:
         """Be somewhere else in the next frame; a place that is not known changes nothing."""
         if np.isfinite(place).all():
             self.place = place
+            self.home = place if self.home is None else self.home
         self.held = held
         if self.born is None:
             self.born = embedding.float().clone()
@@ -132,6 +135,8 @@ class Following:
             found["cell_point"] = self.belief.cell_point.cpu().numpy()
         if self.place is not None:
             found["place"] = self.place
+        if self.home is not None:
+            found["home"] = self.home
         if self.born is not None:
             found["born"] = self.born.float().cpu().numpy()
         if self.answer is not None:
@@ -186,6 +191,7 @@ class Following:
             ground=Ground.restored(config, part(state, "ground.")),
             belief=belief,
             place=state.get("place"),
+            home=state.get("home"),
             held=bool(held),
             buried=bool(buried),
             refused=refused,

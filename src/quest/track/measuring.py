@@ -18,6 +18,8 @@ from quest.track.following import Following
 from quest.track.placing import Placed, as_array
 
 _AWAY_CELLS = 3
+_TOUCHING = 0.02
+"""Queries that come closer than this are as good as in one place, reference units."""
 
 
 def measure(
@@ -45,11 +47,14 @@ def measure(
     logits, embedding = prediction.logits[0, 0], prediction.embedding[0, 0].float()
     before = np.stack([np.full(3, np.nan) if f.place is None else f.place for f in following])
     born = torch.stack([embedding[k] if f.born is None else f.born for k, f in enumerate(following)])
+    home = np.stack([np.full(3, np.nan) if f.home is None else f.home for f in following])
     best = as_array(newest.cell_point[0, 0, logits.argmax(dim=-1)])
+    right = as_array(prediction.right_logit[0, 0])
+    closing, lead = _rivals(placed.judged, home, right)
     values = {
         "anchor_cosine": as_array(_likeness(anchor.template, head.look.template(newest, uv[None].nan_to_num(0.5)))),
         "embedding_cosine": as_array(F.cosine_similarity(embedding, born, dim=-1)),
-        "right_logit": as_array(prediction.right_logit[0, 0]),
+        "right_logit": right,
         "visible_logit": as_array(prediction.visible_logit[0, 0]),
         "peak_log_p": as_array(logits.log_softmax(dim=-1).amax(dim=-1)),
         "margin": as_array(_margin(logits, prediction.peak[0, 0], network.config.cells)),
@@ -59,6 +64,9 @@ def measure(
         "step": np.linalg.norm(placed.judged - before, axis=-1),
         "spread": _spread(following),
         "held": placed.held.astype(np.float64),
+        "travel": np.linalg.norm(placed.judged - home, axis=-1),
+        "closing": closing,
+        "lead": lead,
     }
     return Signals(np.stack([values[name] for name in SIGNALS], axis=-1).astype(np.float32))
 
@@ -81,6 +89,30 @@ def _margin(logits: Float[Tensor, "K C"], peak: Tensor, side: int) -> Float[Tens
     gap = torch.maximum(across.abs(), down.abs())
     near = torch.where(gap <= 1, logits, -torch.inf).amax(dim=-1)
     return near - torch.where(gap > _AWAY_CELLS, logits, -torch.inf).amax(dim=-1)
+
+
+def _rivals(
+    place: Float[np.ndarray, "K 3"], home: Float[np.ndarray, "K 3"], right: Float[np.ndarray, " K"]
+) -> tuple[Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """How much nearer the other query is that came closest, and how much surer a query is than that one.
+
+    Entities keep apart; who slips onto another that is followed too comes to where that one is.
+
+    Args:
+        place: where queries are; NaN where unknown.
+        home: where they were first; NaN where unknown.
+        right: log odds that each identity is right.
+
+    Returns:
+        Logarithm of the distance now to the distance at first, and the difference of log odds; NaN without another.
+    """
+    now, first = (np.linalg.norm(at[:, None] - at[None], axis=-1) for at in (place, home))
+    closing = np.log((now + _TOUCHING) / (first + _TOUCHING))
+    np.fill_diagonal(closing, np.nan)
+    closing = np.where(np.isnan(closing), np.inf, closing)
+    rival, least = closing.argmin(axis=1), closing.min(axis=1)
+    alone = np.isinf(least)
+    return np.where(alone, np.nan, least), np.where(alone, np.nan, right - right[rival])
 
 
 def _spread(following: Sequence[Following]) -> np.ndarray:

@@ -161,13 +161,15 @@ class Tracker:
         return {"weights": self.weights_hash, "settings": self.config.to_json(), "camera": asdict(camera)}
 
 
-def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker:
+def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool = True) -> Tracker:
     """A tracker from shipped weights, from a file, or from the Hugging Face hub.
 
     Args:
         name: name of shipped weights; path of a safetensors file or of a folder of a run; or ``owner/name`` of a model
             repository on the hub, optionally ``owner/name@revision``. What was fetched once works without a network.
         device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto`` for the best there is.
+        monitor: whether to read the monitor's calibration, without which there are no alarms. One that is about to be
+            made anew may be of signals that are no more.
 
     Raises:
         WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or the
@@ -180,7 +182,7 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto") -> Tracker
         TrackerConfig.from_json(loaded.settings),
         device=pick_device(device),
         weights_hash=loaded.sha256,
-        calibration=Calibration.from_json(loaded.monitor) if loaded.monitor else None,
+        calibration=Calibration.from_json(loaded.monitor) if loaded.monitor and monitor else None,
     )
 
 
