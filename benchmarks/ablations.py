@@ -193,12 +193,9 @@ class Ablations:
             return config
         tracker = Tracker(network, config, device=pick_device("auto"))
         tracker = PixelsOnly.without_depth(tracker) if item.no_depth else tracker
-        scores = []
-        for path in self.validation:
-            store = TakeStore(path)
-            names = list(select_takes(store.infos(), split=("validation", "unlisted")))
-            scores.append((len(names), discovery_bias(tracker, store, names)[0]))
-        bias = sum(n * b for n, b in scores) / sum(n for n, _ in scores)
+        stores = [TakeStore(path) for path in self.validation]
+        chosen = [(store, select_takes(store.infos(), split=("validation", "unlisted"))) for store in stores]
+        bias, _, _ = discovery_bias(tracker, chosen)
         return replace(config, slot_bias=bias)
 
     def _settings(self, item: Variant, seed: int) -> dict[str, Any]:

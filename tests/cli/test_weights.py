@@ -16,7 +16,7 @@ from quest.evaluation.stream_record import StreamRecord
 from quest.evaluation.tuning import Tuned
 from quest.model.weights import load_network, save_network
 from quest.monitor import Calibration
-from quest.track import Tracker, TrackerConfig
+from quest.track import Tracker, TrackerConfig, load
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take

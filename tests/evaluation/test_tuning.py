@@ -13,6 +13,7 @@ from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation import tuning
 from quest.evaluation.memory import remember_frames
+from quest.evaluation.selection import SplitPart
 from quest.evaluation.tuning import Trial, discovery_bias, tune
 from quest.model.discovery import Peaks
 from quest.track import Tracker
@@ -53,7 +54,9 @@ def test_takes_of_a_suite_count_as_much_as_ordinary_ones(store: TakeStore, tmp_p
     names = [f"panels-10000{i}-L1-occlusion60-s000000" for i in range(2, 4)]
     for seed, name in enumerate(names, start=2):
         hard.write(make_take(frames=10, views=1, entities=2, size=(64, 64), seed=seed, name=name))
-    chosen = [(store, dict.fromkeys([NAME], "validation")), (hard, dict.fromkeys(names, "validation"))]
+    chosen: list[tuple[TakeStore, dict[str, SplitPart]]] = [
+        (store, {NAME: "validation"}), (hard, dict.fromkeys(names, "validation"))
+    ]  # fmt: skip
     ape = [tune(make_tracker(), takes, report=lambda t: None).trials[0].ape for takes in ([c] for c in chosen)]
     (both,) = tune(make_tracker(), chosen, report=lambda t: None).trials
     assert both.ape == pytest.approx(np.mean(ape))
