@@ -34,6 +34,9 @@ from quest.track.state import StreamState
 from quest.types import Camera, Query, State
 
 _LOST_ABOVE = 0.5
+_DOUBTED_ABOVE = 0.8
+"""Probability of a loss above which a query goes back to where it was right. Below it the answer of the newest frame is
+nearer in the mean, wrong as it may be: what is lost has often only drifted, and what is taken back is left behind."""
 
 
 class Stream:
@@ -316,7 +319,8 @@ class Stream:
     def _recover(self, verdict: Verdict, placed: Placed) -> None:
         """Search for what an alarm says is lost; end the alarm where what is seen matches the anchor again.
 
-        What is held on its joint, unseen, is held on; what is seen in a wrong place goes back to where it was right.
+        What is held on its joint, unseen, is held on; what is surely seen in a wrong place goes back to where it was
+        right.
         """
         assert self._monitor is not None
         for k, query in enumerate(self._following):
@@ -328,7 +332,7 @@ class Stream:
                 continue
             if alarm in verdict.raised:
                 query.good = 0
-                if not placed.held[k] and verdict.lost_p[k] > _LOST_ABOVE:
+                if not placed.held[k] and verdict.lost_p[k] > _DOUBTED_ABOVE:
                     query.doubt()
                 continue
             query.good = query.good + 1 if right and np.isfinite(placed.judged[k]).all() else 0
