@@ -63,7 +63,8 @@ def test_of_clashing_candidates_the_best_of_those_that_count_stays():
     clash = torch.eye(4, dtype=torch.bool)
     clash[0, 1] = clash[1, 0] = clash[1, 2] = clash[2, 1] = True
     found = Candidates(
-        Peaks(torch.rand(4, 2), torch.rand(4, 3), torch.tensor([0, 2, 2, 1]), torch.arange(4.0), torch.zeros(4)), clash
+        Peaks(torch.rand(4, 2), torch.rand(4, 3), torch.tensor([0, 2, 2, 1]), torch.arange(4.0), torch.zeros(4).long()),
+        clash,
     )
     assert found.apart() == [0, 2, 3]
     assert found.apart([1, 2, 3]) == [1, 3]
