@@ -48,7 +48,7 @@ class TrainingTakes:
 
 _IN_FRONT = "--azimuth -40 40"
 _ABOVE = f"{_IN_FRONT} --elevation 30 80"
-# What is high above and farther aside is left to the suite `shift`, and so are orbits that end there.
+"""Cameras from above and orbits begin in front: high above and farther aside is left to the suite `shift`."""
 
 PARTNET = (
     TrainingTakes("partnet", "--mix broad --level 1 2 4 --takes-per-object 2"),

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Literal
 
 from quest.data.split import PARTS, split_of
+from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError
 from quest.types import TakeInfo
 
@@ -19,6 +20,10 @@ def part_of(info: TakeInfo) -> SplitPart:
         return split_of(info)
     except ObjectError:
         return "unlisted"
+
+
+Chosen = Sequence[tuple[TakeStore, Mapping[str, SplitPart]]]
+"""Stores, and the part of the object split of the takes in them that are to be used, by name."""
 
 
 def select_takes(

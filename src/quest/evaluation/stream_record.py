@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, Int
 
-from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
 from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
-from quest.evaluation.selection import SplitPart
+from quest.evaluation.selection import Chosen
 from quest.monitor import SIGNALS
 from quest.track import Tracker
 from quest.types import Query, Take
@@ -221,7 +220,7 @@ class Recorded:
 
 def record_streams(
     tracker: Tracker,
-    takes: Sequence[tuple[TakeStore, Mapping[str, SplitPart]]],
+    takes: Chosen,
     folder: Path,
     *,
     shard: Shard,

@@ -8,18 +8,17 @@ missed one is not followed at all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
-from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
-from quest.evaluation.selection import SplitPart
+from quest.evaluation.selection import Chosen
 from quest.evaluation.take_suite import TakeSuite
 from quest.geometry import transform
 from quest.model.discovery import Peaks, match_peaks
@@ -35,9 +34,6 @@ GRID: dict[str, tuple[float, ...]] = {
 """Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
 _BETA = 2.0
-
-Chosen = Sequence[tuple[TakeStore, Mapping[str, SplitPart]]]
-"""Stores, and by name the part of the object split of the takes in them that choose."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from quest.model.decoder import Anchor
 from quest.model.discovery import Peaks, find_candidates
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch, Observation
-from quest.track.following import Following
+from quest.track.following import Following, as_rows
 from quest.track.grounded import Ground
 from quest.track.settings import TrackerConfig
 from quest.track.slots import Slots, slots_at
@@ -179,15 +179,15 @@ class Binding:
         if not (looking or self.discover):
             return []
         config = self._config
-        found_now = find_candidates(self._network, frames, observed, radius_cells=config.slot_radius_cells)
-        peaks, clash = found_now.peaks, found_now.clash.tolist()
+        candidates = find_candidates(self._network, frames, observed, radius_cells=config.slot_radius_cells)
+        peaks, clash = candidates.peaks, candidates.clash.tolist()
         existence = (config.slot_gain * (peaks.logit + config.slot_bias)).sigmoid().tolist()
         label, intent = [LABELS[int(n)] for n in peaks.label], _intents(peaks)
         near = self._near(peaks.uv, frames, following)
         found: list[Following] = []
         chosen: list[int] = []
         if self.discover:
-            apart = found_now.apart()[: self._network.config.slots]
+            apart = candidates.apart()[: self._network.config.slots]
             chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
             for i in chosen:
                 number = self._next_number()
@@ -199,7 +199,7 @@ class Binding:
             query = waiting.query
             fits = [
                 i
-                for i in found_now.apart(_asked_for(query, label, intent))
+                for i in candidates.apart(_asked_for(query, label, intent))
                 if i not in chosen
                 and not any(clash[i][j] for j in chosen if query.label in (None, label[j]))
                 and not any(close and _same(query, f) for close, f in zip(near[i], following, strict=True))
@@ -215,9 +215,7 @@ class Binding:
     def _near(self, uv: Float[Tensor, "K 2"], frames: FrameBatch, following: Sequence[Following]) -> list[list[bool]]:
         """For every peak, which queries follow what is seen there."""
         size = self._network.config.encoder.image_size
-        unknown = np.full(3, np.nan)
-        places = [unknown if f.place is None else f.place for f in following]
-        at = torch.from_numpy(np.array(places).reshape(-1, 3)).to(frames.depth_m)
+        at = torch.from_numpy(as_rows(f.place for f in following)).to(frames.depth_m)
         gap_px = torch.cdist(uv * size, frames.from_reference(at[None, None])[0, 0])
         return (gap_px < self._config.slot_radius_cells * self._network.config.cell_px).tolist()
 

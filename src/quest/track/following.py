@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -202,6 +202,12 @@ class Following:
             good=good,
             answer=answer,
         )
+
+
+def as_rows(places: Iterable[Float[np.ndarray, "3"] | None]) -> Float[np.ndarray, "K 3"]:
+    """Places of queries as one array; NaN where one is not known."""
+    unknown = np.full(3, np.nan)
+    return np.array([unknown if place is None else place for place in places]).reshape(-1, 3)
 
 
 def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from quest.model.decoder import Anchor, HeatmapHead, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import Observation
 from quest.monitor import SIGNALS, Signals
-from quest.track.following import Following
+from quest.track.following import Following, as_rows
 from quest.track.placing import Placed, as_array
 
 _AWAY_CELLS = 3
@@ -45,9 +45,8 @@ def measure(
     head = network.head
     assert isinstance(head, HeatmapHead)
     logits, embedding = prediction.logits[0, 0], prediction.embedding[0, 0].float()
-    before = np.stack([np.full(3, np.nan) if f.place is None else f.place for f in following])
+    before, home = as_rows(f.place for f in following), as_rows(f.home for f in following)
     born = torch.stack([embedding[k] if f.born is None else f.born for k, f in enumerate(following)])
-    home = np.stack([np.full(3, np.nan) if f.home is None else f.home for f in following])
     best = as_array(newest.cell_point[0, 0, logits.argmax(dim=-1)])
     right = as_array(prediction.right_logit[0, 0])
     closing, lead = _rivals(placed.judged, home, right)
