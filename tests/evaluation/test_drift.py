@@ -211,11 +211,11 @@ def test_rows(detectors: tuple[Detector, ...]):
 def test_false_alarms_keep_the_promise():
     """No detector alarms on more new loss-free streams than one block may spend of alpha, nor on far fewer."""
     share = spend(0.2, block=1, restart=0)
-    streams = make_streams(700, losses=0.0, queries=2, frames=40)
+    streams = make_streams(1500, losses=0.0, queries=2, frames=40)
     lossy = make_streams(60, first=5000, queries=2, frames=40, losses=1.0)
     rows = drift_rows(
-        rivals(streams[:400] + lossy, block_frames=40),
-        [replace(r, part="test") for r in streams[400:]],
+        rivals(streams[:1200] + lossy, block_frames=40),
+        [replace(r, part="test") for r in streams[1200:]],
         alphas=(0.2,),
         resamples=2,
         seed=0,

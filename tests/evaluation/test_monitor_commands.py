@@ -27,8 +27,8 @@ from tests.tiny import make_network
 
 
 def made_up(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
-    """Signals that do not come from the tracker, whose weights are random: it is lost everywhere."""
-    stream = make_stream(take.info.seed, frames=40, part=part)
+    """Signals that do not come from the tracker, whose weights are random: every second stream has a loss."""
+    stream = make_stream(take.info.seed, frames=40, part=part, losses=float(take.info.seed % 2))
     return replace(stream, take=take.info.name, view=view, object_id=take.info.object_id)
 
 

@@ -36,6 +36,8 @@ LOST = {
     "margin": -2.0,
     "disagreement": 0.15,
     "joint_residual": 3.0,
+    "closing": -0.5,
+    "lead": -1.5,
 }
 """What an occlusion and a loss add."""
 
@@ -52,13 +54,13 @@ def make_stream(
         losses: probability that one of the queries is lost at some time.
         part: part of the object split.
     """
-    rng = np.random.default_rng(seed)
+    rng, noise = np.random.default_rng(seed).spawn(2)  # what happens does not depend on how many signals there are
     mean, spread = np.array(list(NORMAL.values())).T
-    level = mean + 0.7 * spread * rng.normal(size=(queries, len(SIGNALS)))
+    level = mean + 0.7 * spread * noise.normal(size=(queries, len(SIGNALS)))
     values = np.empty((frames, queries, len(SIGNALS)))
-    state = rng.normal(size=(queries, len(SIGNALS)))
+    state = noise.normal(size=(queries, len(SIGNALS)))
     for t in range(frames):
-        state = 0.8 * state + 0.6 * rng.normal(size=state.shape)
+        state = 0.8 * state + 0.6 * noise.normal(size=state.shape)
         values[t] = level + spread * state
     spikes = rng.random((frames, queries)) < 0.02
     for name, size in (("step", 0.15), ("disagreement", 0.15), ("joint_residual", 3.0)):
