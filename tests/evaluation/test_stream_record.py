@@ -11,6 +11,7 @@ import torch
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
+from quest.evaluation import stream_record
 from quest.evaluation.selection import SplitPart
 from quest.evaluation.stream_record import (
     Shard,
@@ -116,9 +117,13 @@ def test_recording_goes_on_where_it_stopped(store: TakeStore, tmp_path: Path):
     assert not list(tmp_path.glob(".*"))
 
 
-def test_another_tracker_records_again(store: TakeStore, tmp_path: Path):
+def test_another_tracker_records_again(store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     first, second = make_tracker(), make_tracker(seed=1)
     assert tracker_id(first) == tracker_id(make_tracker()) != tracker_id(second)
+    with monkeypatch.context() as patched:
+        patched.setattr(stream_record, "REVISION", -1)
+        changed = tracker_id(first)
+    assert changed != tracker_id(first)
     record_streams(first, [(store, NAMES)], tmp_path, shard=Shard(0, 4))
     with pytest.raises(InputError, match="quest weights calibrate"):
         read_records(tmp_path, made_by=tracker_id(second))

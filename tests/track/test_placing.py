@@ -16,7 +16,7 @@ from quest.track.settings import TrackerConfig
 from tests.tiny import DEFAULT, make_frames
 
 WALL_M, DRAWER_M = 1.5, 1.46
-SLID = (35.0, DRAWER_M)
+HOME, SLID = (32.0, WALL_M), (35.0, DRAWER_M)
 CONFIG = TrackerConfig(point_sigma=0.02)
 ROW = BeliefRow(0.0, np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([0.4, 0.0, 0.0]), np.full(3, 0.2))
 
@@ -35,7 +35,7 @@ def at(x_px: float, depth_m: float) -> np.ndarray:
 
 def standing() -> Following:
     """A query that has been seen at one place of the wall, and was carried a little way at last."""
-    ground, home = Ground(CONFIG), at(32.0, WALL_M)
+    ground, home = Ground(CONFIG), at(*HOME)
     for _ in range(20):
         ground.see(home, ROW)
     return Following(0, "a", None, None, ground, place=at(34.0, WALL_M), home=home)
@@ -65,7 +65,7 @@ def test_what_opens_before_a_still_entity_does_not_carry_it_away(seen: float, ri
     found = placed(query, slid, depth_m=DRAWER_M, seen=seen, right=right)
     assert found.held.all()
     assert query.buried
-    np.testing.assert_allclose(found.point[0], query.home, atol=0.02)
+    np.testing.assert_allclose(found.point[0], at(*HOME), atol=0.02)
 
 
 def test_what_is_seen_plainly_is_followed():

@@ -19,6 +19,7 @@ from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
 from quest.evaluation.selection import Chosen
 from quest.monitor import SIGNALS
 from quest.track import Tracker
+from quest.track.settings import REVISION
 from quest.types import Query, Take
 
 LIFTING_PX = 8.0
@@ -161,7 +162,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
 
 
 def tracker_id(tracker: Tracker) -> str:
-    """Twelve hexadecimal digits that tell apart networks, settings by which given points are followed, and signals.
+    """Twelve hexadecimal digits that tell apart networks, ways and settings of following given points, and signals.
 
     Streams are asked for by points. So a better affordance map or flow head, another threshold of discovery, or what
     else is in a weights file leaves records, and with them the monitor's calibration, as good as they were.
@@ -171,7 +172,7 @@ def tracker_id(tracker: Tracker) -> str:
     if tracker.network.config.queries == "anchored":
         elsewhere += ("affordance",)
         settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
-    digest = hashlib.sha256(json.dumps([config | {"flow": None}, settings, SIGNALS], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([config | {"flow": None}, settings, REVISION, SIGNALS], sort_keys=True).encode())
     for name, tensor in sorted(tracker.network.state_dict().items()):
         if name.startswith(elsewhere):
             continue

@@ -141,11 +141,8 @@ class Placer:
         if query.place is None:
             return seen
         stood = query.ground.stood
-        away = (
-            stood is not None
-            and np.linalg.norm(own - stood) >= _AWAY
-            and min(float(self._seen[i]), float(self._right[i])) < _PLAIN
-        )
+        plain = min(seen, float(self._right[i])) >= _PLAIN
+        away = stood is not None and not plain and bool(np.linalg.norm(own - stood) >= _AWAY)
         leapt = away or not np.linalg.norm(own - query.place) < _LEAP
         if not (leapt or query.buried):
             return seen

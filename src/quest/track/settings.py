@@ -7,6 +7,9 @@ from dataclasses import asdict, dataclass
 
 from quest.errors import ConfigError, WeightsError
 
+REVISION = 2
+"""Grows when the same weights and settings give other answers, so that no monitor is fitted to streams of before."""
+
 
 @dataclass(frozen=True)
 class TrackerConfig:
