@@ -64,6 +64,16 @@ def test_to_reference_is_undone_by_projection():
     torch.testing.assert_close(back[seen], uv[seen], rtol=1e-4, atol=1e-3)
 
 
+def test_places_are_exact_where_the_network_computes_in_bfloat16():
+    frames = make_frames(batch=1, frames=2)
+    uv_px = 64 * torch.rand(1, 2, 50, 2, generator=torch.Generator().manual_seed(0))
+    depth_m = torch.full((1, 2, 50), 2.0)
+    point, pixel = frames.to_reference(uv_px, depth_m), frames.from_reference(frames.to_reference(uv_px, depth_m))
+    with torch.autocast("cpu", torch.bfloat16):
+        torch.testing.assert_close(frames.to_reference(uv_px, depth_m), point)
+        torch.testing.assert_close(frames.from_reference(point), pixel)
+
+
 def test_missing_depth_does_not_spoil_the_gradient():
     frames = make_frames(batch=1, frames=1)
     uv = torch.tensor([[[[10.0, 10.0], [20.0, 20.0]]]], requires_grad=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from quest.geometry import invert
+from quest.geometry import exact_product, invert
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, cell_depth, reference_of
 from quest.types import Camera
@@ -78,7 +78,7 @@ class Framer:
             features: the encoder's tokens of this image, if they are known.
         """
         image = torch.from_numpy(np.ascontiguousarray(rgb)).to(self._device)[None]
-        pose = reference.cam_from_world @ invert(cam_from_world)
+        pose = exact_product(reference.cam_from_world, invert(cam_from_world))
         return FrameBatch(
             features=self._network.encode(image)[:, None].float() if features is None else features,
             rgb=image[None],

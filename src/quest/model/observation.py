@@ -14,7 +14,7 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from quest.geometry import invert, transform
+from quest.geometry import exact_product, invert, transform
 from quest.model.config import NetworkConfig
 from quest.model.layers import DetailStem, PointCode, TokenLayer
 from quest.model.relief import relief
@@ -84,7 +84,7 @@ class FrameBatch:
         z = torch.where(valid, depth_m, torch.ones_like(depth_m))
         point = torch.stack(((uv_px[..., 0] - cx) / fx * z, (uv_px[..., 1] - cy) / fy * z, z), dim=-1)
         # One matrix per frame times many points: far faster than a product per point.
-        point = point @ self.ref_from_cam[..., :3, :3].mT + self.ref_from_cam[..., None, :3, 3]
+        point = exact_product(point, self.ref_from_cam[..., :3, :3].mT) + self.ref_from_cam[..., None, :3, 3]
         point = (point - self.center[:, None, None]) / self.scale[:, None, None, None]
         return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
 

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from quest.geometry import exact_product
 from quest.track.settings import TrackerConfig
 
 
@@ -42,7 +43,7 @@ def moved(
         cell_uv: the cells' centres in [-1, 1]^2, which stand in where depth is missing.
         sigma: how far things move.
     """
-    return belief.probability @ _move(belief.cell_point, cell_point, cell_uv, sigma)
+    return exact_product(belief.probability, _move(belief.cell_point, cell_point, cell_uv, sigma))
 
 
 def update(
