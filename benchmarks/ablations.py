@@ -278,7 +278,8 @@ class Ablations:
             )
             records = tuple(record for each in found for record in each.records)
             discoveries = tuple(discovery for each in found for discovery in each.discoveries)
-            write_results(Results(run, (), discoveries), self._answers_file(item, seed, name), records=records)
+            asked = Results(run, (), discoveries, notes=tuple(self.protocols))
+            write_results(asked, self._answers_file(item, seed, name), records=records)
             console.print(f"  {name}: {len(records)} answers")
 
     def _tracker(self, tracker: Tracker, name: str, test: TestTakes, seed: int) -> ClipTracker:
@@ -295,8 +296,10 @@ class Ablations:
         file = self._answers_file(item, seed, tracker)
         if not file.exists():
             return False
-        run = read_results(file).run
-        return run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
+        results = read_results(file)
+        run, asked = results.run, set(results.notes)
+        same = run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
+        return same and asked >= set(self.protocols)
 
     # Tables
 

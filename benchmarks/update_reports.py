@@ -283,6 +283,8 @@ def _section(table: Table, path: Path) -> str:
             lines.append(_line([_cell(row | {"each": entry}, where) for where in table.columns.values()]))
     run = report.get("run", report)
     notes = [f"`{run['command']}`, commit {run['commit']}."]
+    if report.get("complete") is False:
+        notes.insert(0, "**Unfinished**: the run was stopped before its last take; these are the takes so far.")
     if "n_takes" in report and "machine" in report:
         notes.insert(0, f"n = {report['n_takes']} takes, {report['machine']}.")
     if "steps" in report:

@@ -126,12 +126,13 @@ class Clip:
                 f"got {self.depth_m.shape}"
             )
         if self.stamp_s.shape != (t,) or self.cam_from_world.shape != (t, 4, 4):
+            got = f"{self.stamp_s.shape} and {self.cam_from_world.shape}"
+            raise InputError(f"clip {self.name!r}: expected {t} time stamps and poses, got {got}")
+        finite = np.isfinite(self.cam_from_world).all() and np.isfinite(self.stamp_s).all()
+        if not finite or (np.diff(self.stamp_s) < 0).any():
             raise InputError(
-                f"clip {self.name!r}: expected {t} time stamps and poses, got {self.stamp_s.shape} and "
-                f"{self.cam_from_world.shape}"
+                f"clip {self.name!r}: time stamps and poses must be finite, and times sorted; sort the frames"
             )
-        if not np.isfinite(self.cam_from_world).all() or not np.isfinite(self.stamp_s).all():
-            raise InputError(f"clip {self.name!r}: time stamps and poses must be finite")
 
     def __len__(self) -> int:
         return len(self.rgb)

@@ -155,23 +155,45 @@ def test_records_outlive_what_given_points_are_not_followed_by(take: Take):
 
 
 def test_a_view_with_nothing_to_follow_is_remembered(tmp_path: Path):
-    write_record(None, tmp_path / "empty.npz", made_by="me")
-    write_record(make_stream(0), tmp_path / "full.npz", made_by="me")
+    write_record(None, tmp_path / "empty.npz", made_by="me", take_hash="t")
+    write_record(make_stream(0), tmp_path / "full.npz", made_by="me", take_hash="t")
     (record,) = read_records(tmp_path, made_by="me")
     assert equal(record, make_stream(0))
 
 
 def test_damaged_files(tmp_path: Path):
     path = tmp_path / "a.npz"
-    write_record(make_stream(0), path, made_by="me")
+    write_record(make_stream(0), path, made_by="me", take_hash="t")
     whole = path.read_bytes()
     for torn in (b"", whole[:100], whole[: len(whole) // 2], b"PK"):
         path.write_bytes(torn)
         with pytest.raises(InputError, match="delete it"):
             read_records(tmp_path, made_by="me")
-    np.savez(path, format=np.array(0))
-    with pytest.raises(InputError, match="format"):
+    np.savez(path, format=np.array(0))  # of a version before: as if it were not there
+    with pytest.raises(InputError, match="found none"):
         read_records(tmp_path, made_by="me")
+
+
+def test_takes_that_were_made_again_are_recorded_again(
+    store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    tracker = make_tracker()
+    told: list[str] = []
+
+    def record(part: SplitPart = "validation") -> set[str]:
+        found = record_streams(
+            tracker,
+            [(store, dict.fromkeys(NAMES, part))],
+            tmp_path,
+            shard=Shard(0, 1),
+            progress=lambda name, i, n: told.append(name),
+        )
+        return {record.part for record in found.records}
+
+    assert (record(), len(told)) == ({"validation"}, 4)
+    assert (record("test"), len(told)) == ({"test"}, 4)  # the part is that of today
+    monkeypatch.setattr(TakeStore, "data_hash", lambda self, name: "another")
+    assert (record(), len(told)) == ({"validation"}, 8)
 
 
 def test_two_stores_with_one_name(store: TakeStore, tmp_path: Path):

@@ -7,11 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from quest.errors import InputError
 from quest.model.decoder import HeatmapHead
 from quest.monitor import SIGNALS, Alarm
 from quest.track import Stream, StreamState, Tracker
+from quest.track.saving import SavedStream
 from quest.types import Clip, Query, State
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
@@ -90,6 +92,48 @@ def test_missing_depth_and_poses_are_flagged(clip: Clip):
     assert "pose" in feed(stream, clip, range(2, 3), cam_from_world=None)[0].flags[0]
     unposed = make_tracker().stream(clip.camera, POINTS)
     assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
+
+
+def test_poses_that_begin_late_move_nothing(clip: Clip):
+    """Until a pose comes the camera is taken to stand still, so its first pose is where it has been."""
+    still, late = (make_tracker().stream(clip.camera, POINTS) for _ in range(2))
+    turned = np.eye(4)
+    turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    for t in range(6):
+        frame = clip.frame(t)
+        expected = still.step(frame.rgb, frame.depth_m, frame.stamp_s)
+        state = late.step(frame.rgb, frame.depth_m, frame.stamp_s, None if t < 3 else turned)
+        np.testing.assert_allclose(state.uv_px, expected.uv_px, atol=1e-3)
+        told = "poses begin" in " ".join(state.flags)
+        assert told == (t == 3)
+    np.testing.assert_allclose(state.point_world, expected.point_world @ turned[:3, :3], atol=1e-4)
+
+
+def test_poses_are_rigid_up_to_rounding(clip: Clip):
+    stream, frame = make_tracker().stream(clip.camera, POINTS), clip.frame(0)
+    rounded = np.eye(4)
+    rounded[:3, :3] = np.round(Rotation.from_euler("xyz", [0.3, 0.2, 0.1]).as_matrix(), 4)
+    for t in range(4):
+        with pytest.raises(InputError, match="rigid"):
+            stream.step(frame.rgb, frame.depth_m, t / 30, np.zeros((4, 4)))
+        assert stream.frame == t
+        state = stream.step(clip.frame(t).rgb, frame.depth_m, t / 30, rounded)
+    assert all(joint is not None for joint in state.joint)
+
+
+def test_specks_of_depth_make_no_reference(clip: Clip):
+    """A sensor that warms up: one pixel, then all."""
+    first, full = clip.frame(0), clip.frame(1)
+    assert first.depth_m is not None
+    specks = np.zeros_like(first.depth_m)
+    specks[5, 5] = first.depth_m[5, 5]
+    stream, whole = (make_tracker().stream(clip.camera, ()) for _ in range(2))
+    stream.step(first.rgb, specks, 0.0)
+    stream.step(full.rgb, full.depth_m, 0.1)
+    whole.step(full.rgb, full.depth_m, 0.1)
+    assert stream._intake.reference is not None
+    assert whole._intake.reference is not None
+    torch.testing.assert_close(stream._intake.reference.scale, whole._intake.reference.scale)
 
 
 def test_queries_come_and_go(clip: Clip):
@@ -190,6 +234,40 @@ def test_an_alarm_is_told_and_searched(clip: Clip):
     assert not states[-1].visible.any()
 
 
+def test_a_callback_may_save_the_stream_or_fail(clip: Clip):
+    tracker = watched(alarming=True)
+    stream, saved = tracker.stream(clip.camera, POINTS, alpha=0.1), []
+
+    def keep(alarm: Alarm) -> None:
+        saved.append(tracker.save(stream))
+        raise RuntimeError(alarm.name)
+
+    stream.on_alarm(keep)
+    with pytest.raises(RuntimeError):
+        feed(stream, clip, range(4))
+    assert len(saved) == 1
+    begun = stream.frame
+    after, again = (feed(s, clip, range(begun, 8)) for s in (stream, tracker.restore(saved[0])))
+    for a, b in zip(after, again, strict=True):
+        assert_equal(a, b)
+
+
+def test_a_watched_stream_is_not_restored_unwatched(clip: Clip):
+    tracker = watched()
+    data = tracker.save(tracker.stream(clip.camera, POINTS, alpha=0.1))
+    with pytest.raises(InputError, match="calibration"):
+        make_tracker().restore(data)
+    unwatched = tracker.save(tracker.stream(clip.camera, POINTS, alpha=None))
+    assert make_tracker().restore(unwatched).alpha is None
+
+
+def test_numbers_of_numpy_are_saved():
+    """Cameras and queries are often made of them."""
+    saved = SavedStream({"fx": np.float32(1.5)}, None, {"frame": np.int64(3)}, {"place": np.zeros(3)})
+    again = SavedStream.from_bytes(saved.to_bytes())
+    assert (again.maker, again.words) == ({"fx": 1.5}, {"frame": 3})
+
+
 def test_without_alpha_there_are_no_alarms(clip: Clip):
     stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=None)
     assert stream.alpha is None
@@ -217,9 +295,10 @@ def test_what_is_found_again_ends_the_alarm(clip: Clip):
 
 
 @pytest.mark.parametrize("alarming", [False, True])
-@pytest.mark.parametrize("after", [1, 3, 5])
-def test_a_saved_stream_goes_on_to_the_bit(after: int, alarming: bool, clip: Clip):
+@pytest.mark.parametrize(("after", "bfloat16"), [(1, False), (3, True), (5, False)])
+def test_a_saved_stream_goes_on_to_the_bit(after: int, bfloat16: bool, alarming: bool, clip: Clip):
     tracker = watched(alarming)
+    tracker._autocast = bfloat16
     stream = tracker.stream(clip.camera, [*POINTS, Query.semantic("handle"), Query.point(6, 9, 9, name="late")])
     feed(stream, clip, range(after))
     data = tracker.save(stream)
@@ -245,5 +324,5 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip):
         with pytest.raises(InputError, match="saved stream"):
             tracker.restore(torn)
     other = make_tracker(config=replace(EAGER, jump=0.2))
-    with pytest.raises(InputError, match="other weights or settings"):
+    with pytest.raises(InputError, match="other weights, settings"):
         other.restore(data)

@@ -287,7 +287,7 @@ def test_memory_is_bounded(clip: Clip):
         ({"depth_m": np.zeros((32, 64), np.float32)}, "32"),
         ({"depth_m": np.zeros((64, 64), np.uint16)}, "units"),
         ({"cam_from_world": np.eye(3)}, "4 x 4"),
-        ({"cam_from_world": np.full((4, 4), np.nan)}, "finite"),
+        ({"cam_from_world": np.full((4, 4), np.nan)}, "rigid"),
         ({"stamp_s": float("nan")}, "stamp"),
     ],
 )

@@ -119,6 +119,14 @@ def test_another_network_is_refused(tmp_path: Path):
     folder = saved(tmp_path / "last")
     with pytest.raises(WeightsError, match="do not fit"):
         load_checkpoint(folder, make_network(width=64), None)
-    check_same_run(PROGRESS, DEFAULT, "stage-1", folder)
+    check_same_run(PROGRESS, DEFAULT, "stage-1", "abc", folder)
     with pytest.raises(WeightsError, match="another network"):
-        check_same_run(PROGRESS, replace(DEFAULT, slots=7), "stage-1", folder)
+        check_same_run(PROGRESS, replace(DEFAULT, slots=7), "stage-1", "abc", folder)
+
+
+def test_other_starting_weights_are_refused(tmp_path: Path):
+    """What a stage does not train is in its checkpoints too, and would replace that of the new weights."""
+    begun = replace(PROGRESS, begun="abc")
+    check_same_run(begun, DEFAULT, "stage-1", "abc", tmp_path)
+    with pytest.raises(WeightsError, match="began with other weights"):
+        check_same_run(begun, DEFAULT, "stage-1", "def", tmp_path)

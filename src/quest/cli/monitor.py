@@ -70,6 +70,8 @@ class Monitor(Source):
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
                 "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
             )
+        elif tracker.calibration is not None and (shortfall := tracker.calibration.shortfall(stream.alpha)):
+            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {shortfall}; `quest weights calibrate`")
         view = LiveView(console, name=source.name, frames=length, alpha=stream.alpha)
         state = None
         try:

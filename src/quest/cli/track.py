@@ -28,16 +28,20 @@ class Track(Source):
     def run(self) -> int:
         """Track, write, summarise."""
         from quest.data.tracks_file import write_tracks
+        from quest.errors import InputError
         from quest.viz.overlay import write_overlay
 
         console = Console(highlight=False)
         clip = self.read()
         queries = self.queries(clip)
         tracker = self.tracker()
+        out = self.out or Path("outputs") / Path(self.clip).stem
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--out {out}: cannot be made a folder ({error.strerror}); name another") from error
         with console.status(f"tracking {len(clip)} frames on {tracker.device}"):
             tracks = tracker.track(clip, queries)
-        out = self.out or Path("outputs") / Path(self.clip).stem
-        out.mkdir(parents=True, exist_ok=True)
         write_tracks(tracks, out / "tracks.parquet")
         console.print(_summary(clip, tracks))
         for flag in tracks.frame_flags:

@@ -167,22 +167,29 @@ class TuneWeights:
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
         from quest.data.store import TakeStore
+        from quest.evaluation.stream_record import tracker_id
         from quest.evaluation.tuning import tune
         from quest.model.weights import load_network
         from quest.track import load
 
+        _must_be_a_file(self.weights)
         console = Console(highlight=False)
         stores = [TakeStore(url) for url in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level, objects=self.objects)) for store in stores]
+        tracker = load(self.weights, monitor=False)
         tuned = tune(
-            load(self.weights, monitor=False),
+            tracker,
             takes,
             report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}"),
             discovery_only=self.discovery_only,
         )
         console.print(f"discovery: precision {tuned.precision:.1%}, recall {tuned.recall:.1%}")
         console.print(f"settings {tuned.config.to_json()}")
-        replace(load_network(self.weights), settings=tuned.config.to_json()).save(self.weights)
+        found = replace(load_network(self.weights), settings=tuned.config.to_json())
+        if found.monitor and tracker_id(tracker) != tracker_id(tracker.with_config(tuned.config, name=tracker.name)):
+            console.print("other settings make other signals: the monitor is dropped; run `quest weights calibrate`")
+            found = replace(found, monitor=None)
+        found.save(self.weights)
         return 0
 
 
@@ -218,6 +225,7 @@ class CalibrateWeights:
         from quest.model.weights import load_network
         from quest.track import load
 
+        _must_be_a_file(self.weights)
         console = Console(highlight=False)
         stores = [TakeStore(path) for path in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
@@ -238,7 +246,7 @@ class CalibrateWeights:
         about = fitted.calibration.about
         if self.unit == "take":
             about = about.replace(" objects", " takes") + "; all of the same objects"
-        console.print(about)
+        console.print(f"{about}; alpha of at least {fitted.calibration.least_alpha:.3g} can be promised")
         console.print(
             f"cross-validated: AUROC {fitted.auroc:.4f}, ECE {fitted.ece:.4f}, mean delay {fitted.delay:.1f} frames; "
             f"{fitted.hidden} hidden units, decay {fitted.decay}, {fitted.calibration.statistic}"
@@ -297,13 +305,24 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
     }
 
 
+def _must_be_a_file(weights: Path) -> None:
+    """Told before the work: what is found is written into the file itself."""
+    from quest.errors import ConfigError
+
+    if not weights.is_file():
+        raise ConfigError(
+            f"{weights}: expected the safetensors file itself, which is rewritten; `quest weights save` makes one of "
+            "a folder, a shipped name or a hub id"
+        )
+
+
 def _monitor(calibration: str | None) -> str:
     from quest.monitor import Calibration
 
     if calibration is None:
         return "not calibrated: no alarms; see `quest weights calibrate`"
     monitor = Calibration.from_json(calibration)
-    return f"{monitor.about}; alpha of at least {1 / (len(monitor.maxima) + 1):.3g} can be promised"
+    return f"{monitor.about}; alpha of at least {monitor.least_alpha:.3g} can be promised"
 
 
 def _pairs(values: Mapping[str, Any]) -> str:

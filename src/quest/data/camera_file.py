@@ -13,6 +13,7 @@ from jaxtyping import Float
 from quest.data.distortion import Distortion
 from quest.data.registration import Rig
 from quest.errors import InputError, RecordingError
+from quest.geometry.poses import is_rigid
 from quest.types import Camera
 
 DEFAULT_DEPTH_SCALE_M = 1e-3
@@ -30,7 +31,6 @@ _OPTIONAL = (
     "depth_camera",
     "colour_from_depth",
 )
-_RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -213,9 +213,6 @@ def _parse_poses(name: str, value: Any, *, one: bool = False) -> np.ndarray:
     if poses.shape[-2:] != (4, 4) or poses.ndim not in ((2,) if one else (2, 3)):
         expected = "one 4 x 4 matrix" if one else "one 4 x 4 matrix or one per frame"
         raise ValueError(f"{name} has shape {poses.shape}, expected {expected}")
-    rotation = poses[..., :3, :3]
-    off = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(3)).max()
-    rigid = off < _RIGID_TOLERANCE and (np.linalg.det(rotation) > 0).all()  # a NaN compares false
-    if not rigid or not np.isfinite(poses).all() or not np.allclose(poses[..., 3, :], [0, 0, 0, 1]):
+    if not is_rigid(poses):
         raise ValueError(f"{name} is not a rigid transform (rotation, translation in metres, last row 0 0 0 1)")
     return poses

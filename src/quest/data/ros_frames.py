@@ -233,6 +233,10 @@ class _Play:
         at_ns = log_ns if self._it.by_log else header_ns(message)
         if topic == self._it.chosen.depth:
             self._depths.append((at_ns, number, message))
+            # Without colours nothing else would make room.
+            oldest_ns = max(self._newest_ns, at_ns) - _PATIENCE_NS - round(self._it.parts.sync_s * 1e9)
+            while not self._colours and self._depths[0][0] < oldest_ns:
+                self._depths.popleft()
         else:
             last_ns = self._colours[-1][0] if self._colours else self._emitted_ns
             if last_ns is not None and at_ns < last_ns:

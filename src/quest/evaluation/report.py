@@ -61,7 +61,12 @@ def gather(paths: Sequence[Path]) -> tuple[tuple[EntityRecord, ...], tuple[Origi
 
 def _origin(path: Path) -> Origin:
     beside = path.with_name(f"{path.name.removesuffix(RECORDS_SUFFIX)}.json")
-    return Origin(path.name, file_hash(path), read_results(beside).run if beside.is_file() else None)
+    if not beside.is_file():
+        return Origin(path.name, file_hash(path), None)
+    run, own = read_results(beside).run, file_hash(path)
+    if json.loads(beside.read_text(encoding="utf-8")).get("records_hash", own) != own:
+        raise InputError(f"records {path}: they are not those of {beside.name}; run `quest eval` again")
+    return Origin(path.name, own, run)
 
 
 def provenance() -> dict[str, Any]:

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from quest.data.provenance import file_hash
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.records import (
@@ -95,11 +96,15 @@ def write_results(results: Results, path: str | Path, *, records: tuple[EntityRe
     if path.suffix != ".json":
         raise InputError(f"results {path}: expected a file name that ends in .json; the records go beside it")
     path.parent.mkdir(parents=True, exist_ok=True)
+    beside = records_path(path)
     if records:
-        write_records(records, records_path(path))
+        write_records(records, beside)
+    else:
+        beside.unlink(missing_ok=True)  # of an earlier run
     raw = {
         "format": FORMAT,
-        "records": records_path(path).name if records else None,
+        "records": beside.name if records else None,
+        "records_hash": file_hash(beside) if records else None,
         "run": asdict(results.run),
         "rows": [asdict(row) for row in results.rows],
         "notes": list(results.notes),

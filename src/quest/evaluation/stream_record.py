@@ -6,8 +6,9 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from quest.types import Query, Take
 LIFTING_PX = 8.0
 """A seen entity whose pixel is this near to the true one is not lost, whatever its 3D point: pixels of the input."""
 
-FORMAT = 1
+FORMAT = 2
 """Version of the files."""
 
 
@@ -230,7 +231,8 @@ def record_streams(
     """Record every view of every take that the folder does not have yet, and read back what it has.
 
     Args:
-        tracker: its monitor is switched off. Streams that another tracker recorded are recorded again.
+        tracker: its monitor is switched off. Streams that another tracker recorded, or of takes that were made
+            again since, are recorded again.
         takes: stores with the takes to use and their part of the object split.
         folder: one ``.npz`` per stream, written whole or not at all.
         shard: the part of the streams that this process records.
@@ -245,29 +247,31 @@ def record_streams(
         twice = sorted({name for name in names if names.count(name) > 1})
         raise ConfigError(f"records: expected different names of takes in all stores, {twice[0]!r} comes twice")
     made_by = tracker_id(tracker)
+    hashes = {name: store.data_hash(name) for store, chosen in takes for name in chosen}
     streams = []
     for store, chosen in takes:
         headers = store.headers()
         streams += [(store, n, part, v) for n, part in chosen.items() for v in range(len(headers[n].cameras))]
     take: Take | None = None
     for i, (store, name, part, view) in enumerate(streams):
-        path = folder / f"{name}-view{view}.npz"
-        if i % shard.count != shard.index or (path.exists() and _read(path)[0] == made_by):
+        path, of = folder / f"{name}-view{view}.npz", _Origin(made_by, hashes[name])
+        if i % shard.count != shard.index or _origin(path) == of:
             continue
         progress(f"{name} view {view}", i, len(streams))
         take = take if take is not None and take.info.name == name else store.read(name)
-        write_record(record_stream(tracker, take, view, part=part), path, made_by=made_by)
+        write_record(record_stream(tracker, take, view, part=part), path, made_by=made_by, take_hash=hashes[name])
     # Only now, since other shards went on meanwhile.
-    paths = [folder / f"{name}-view{view}.npz" for _, name, _, view in streams]
-    found = [_read(path) for path in paths if path.exists()]
-    own = [record for who, record in found if who == made_by]
-    return Recorded(tuple(record for record in own if record is not None), len(streams) - len(own))
+    paths = [(folder / f"{name}-view{view}.npz", part, hashes[name]) for _, name, part, view in streams]
+    own = [(_read(path), part) for path, part, of in paths if _origin(path) == _Origin(made_by, of)]
+    records = tuple(replace(record, part=part) for record, part in own if record is not None)
+    return Recorded(records, len(streams) - len(own))
 
 
-def write_record(record: StreamRecord | None, path: Path, *, made_by: str) -> None:
+def write_record(record: StreamRecord | None, path: Path, *, made_by: str, take_hash: str) -> None:
     """Write a record whole or not at all; None leaves a mark that the stream has nothing to follow."""
     path.parent.mkdir(parents=True, exist_ok=True)
     values: dict[str, Any] = {"format": np.array(FORMAT), "made_by": np.array(made_by)}
+    values["take_hash"] = np.array(take_hash)
     values |= {} if record is None else {f.name: np.asarray(getattr(record, f.name)) for f in fields(StreamRecord)}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -288,33 +292,54 @@ def read_records(folder: str | Path, *, made_by: str) -> tuple[StreamRecord, ...
     Raises:
         InputError: there are none, or one is damaged.
     """
-    found = [_read(path) for path in sorted(Path(folder).glob("*.npz"))]
-    records = tuple(record for who, record in found if record is not None and who == made_by)
+    paths = sorted(Path(folder).glob("*.npz"))
+    own = [_read(path) for path in paths if (origin := _origin(path)) is not None and origin.made_by == made_by]
+    records = tuple(record for record in own if record is not None)
     if not records:
         raise InputError(
-            f"records {folder}: expected streams of the tracker {made_by}, found none among {len(found)} files; "
+            f"records {folder}: expected streams of the tracker {made_by}, found none among {len(paths)} files; "
             "record them with `quest weights calibrate`"
         )
     return records
 
 
-def _read(path: Path) -> tuple[str, StreamRecord | None]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            if int(file["format"]) != FORMAT:
-                raise InputError(f"record {path}: expected format {FORMAT}, got {file['format']}; delete it")
-            made_by = str(file["made_by"])
-            if "take" not in file:
-                return made_by, None
-            raw = {f.name: file[f.name] for f in fields(StreamRecord)}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(f"record {path}: not a whole record ({error}); delete it and record again") from error
+@dataclass(frozen=True)
+class _Origin:
+    """What a record is of: a tracker and a take."""
+
+    made_by: str
+    take_hash: str
+
+
+def _origin(path: Path) -> _Origin | None:
+    """What a record is of; None where there is none, or one of a format before."""
+    if not path.exists():
+        return None
+    with _opened(path) as file:
+        if int(file["format"]) != FORMAT:
+            return None
+        return _Origin(str(file["made_by"]), str(file["take_hash"]))
+
+
+def _read(path: Path) -> StreamRecord | None:
+    """A record; None where the stream has nothing to follow."""
+    with _opened(path) as file:
+        if "take" not in file:
+            return None
+        raw: dict[str, Any] = {f.name: file[f.name] for f in fields(StreamRecord)}
     plain = {name: value.item() if value.ndim == 0 else value for name, value in raw.items()}
     if plain["signals"].shape[-1] != len(SIGNALS):
         raise InputError(f"record {path}: it has other signals than this version of quest; delete it and record again")
-    return made_by, StreamRecord(**plain)
+    return StreamRecord(**plain)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            yield file
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise InputError(f"record {path}: not a whole record ({error}); delete it and record again") from error
 
 
 def _confidence(signals: Float32[np.ndarray, "T K S"]) -> Float32[np.ndarray, "T K"]:

@@ -1,7 +1,7 @@
 """Rigid transforms as 4 x 4 matrices, named ``target_from_source``.
 
-Products are taken in the precision of their factors, also where a network computes in bfloat16 (``torch.autocast``): eight
-bits of mantissa would be centimetres.
+Products are taken in the precision of their factors, also where a network computes in bfloat16 (``torch.autocast``):
+eight bits of mantissa would be centimetres.
 
 Reference: Murray, Li and Sastry, A Mathematical Introduction to Robotic Manipulation, chapter 2.
 """

@@ -57,7 +57,11 @@ class Framer:
         """The reference frame that begins with a frame."""
         cells = cell_depth(depth, self._network.config.cell_px)
         centre, scale = reference_of(cells, self._intrinsics, self._network.config.encoder.image_size)
-        return Reference(cam_from_world, centre, scale, bool((depth > 0).any()))
+        return Reference(cam_from_world, centre, scale, bool((cells > 0).any()))
+
+    def shows_depth(self, depth: Float[Tensor, "1 S S"]) -> bool:
+        """Whether depth suffices to make a reference frame of it: more than specks."""
+        return bool((cell_depth(depth, self._network.config.cell_px) > 0).any())
 
     def frame(
         self,

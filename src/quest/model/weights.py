@@ -13,6 +13,7 @@ import torch
 from huggingface_hub import ModelCard, PyTorchModelHubMixin
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import nn
 
 from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
@@ -184,6 +185,15 @@ def save_network(
     save_file(tensors, partial, metadata=metadata)
     partial.chmod(0o644)  # safetensors makes files that only their owner can read
     partial.replace(path)
+
+
+def weights_digest(module: nn.Module, *, beside: str = "") -> str:
+    """SHA-256 of all weights of a module, and of a text that goes with them, in hexadecimal."""
+    digest = hashlib.sha256(beside.encode())
+    for name, tensor in sorted(module.state_dict().items()):
+        digest.update(name.encode())
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def shipped_weights() -> dict[str, Path]:

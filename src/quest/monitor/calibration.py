@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from quest.errors import ConfigError, WeightsError
 from quest.monitor import memory as memories
 from quest.monitor.calibrator import Calibrator
-from quest.monitor.conformal import Threshold, threshold
+from quest.monitor.conformal import Threshold, least_alpha, spend, threshold
 from quest.monitor.signals import SIGNALS
 from quest.monitor.statistic import Cusum
 
@@ -57,6 +57,23 @@ class Calibration:
             ConfigError: alpha is not in (0, 1).
         """
         return threshold(self.maxima, alpha)
+
+    @property
+    def least_alpha(self) -> float:
+        """Smallest alpha of a stream whose first block has a threshold that is promised, not extrapolated."""
+        return least_alpha(len(self.maxima))
+
+    def shortfall(self, alpha: float) -> str | None:
+        """Which alarms there will never be at an alpha, because too few streams were calibrated on; None if all can be.
+
+        Raises:
+            ConfigError: alpha is not in (0, 1).
+        """
+        first, later = (np.isfinite(self.threshold(spend(alpha, block=b, restart=0)).value) for b in (1, 2))
+        if later:
+            return None
+        rest = f"after {self.block_frames} frames" if first else "at all"
+        return f"no alarm {rest} at alpha {alpha:g}: calibrated on {len(self.maxima)} loss-free streams only"
 
     def to_json(self) -> str:
         """One line of text, stored with the weights.

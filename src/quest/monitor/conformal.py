@@ -81,6 +81,11 @@ def spend(alpha: float, *, block: int, restart: int) -> float:
     return math.ldexp(alpha * share, -min(restart, _MOST_HALVINGS))
 
 
+def least_alpha(streams: int) -> float:
+    """Smallest alpha of a stream that so many loss-free streams resolve in its first block, without a tail."""
+    return 1 / (_FIRST_BLOCK * (streams + 1))
+
+
 def _tail_quantile(maxima: np.ndarray, alpha: float) -> float:
     """Value that is exceeded with probability alpha, by probability-weighted moments of the excesses."""
     n = len(maxima)

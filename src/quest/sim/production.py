@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from quest.data.provenance import code_commit, package_versions
 from quest.data.take_format import hash_take
-from quest.errors import ObjectError, TakeError
+from quest.errors import ConfigError, ObjectError, TakeError
 from quest.sim.generate import generate_take
 from quest.sim.objects import find_objects
 from quest.sim.plan import ObjectShelf, TakeSpec
@@ -194,8 +194,18 @@ def make_take(
 
 
 def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]:
-    """Those takes that the store does not have as a whole, each once."""
-    wanted = {spec.name: spec for spec in specs}
+    """Those takes that the store does not have as a whole, each once.
+
+    Raises:
+        ConfigError: two different takes have the same name, as those of objects whose folders have.
+    """
+    wanted: dict[str, TakeSpec] = {}
+    for spec in specs:
+        if wanted.setdefault(spec.name, spec) != spec:
+            raise ConfigError(
+                f"take {spec.name}: it is planned of {wanted[spec.name].object_id} and of {spec.object_id}; rename the "
+                "folder of one of them, or use two stores"
+            )
     there = store.present(wanted)
     return [spec for name, spec in wanted.items() if name not in there]
 

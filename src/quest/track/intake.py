@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from enum import Enum
 
 import numpy as np
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
+from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.framing import Framer, Reference
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
@@ -68,7 +70,8 @@ class Intake:
         """Refuse what no camera sends.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
+            InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
+                rigid.
         """
         camera = self.letterbox.source
         expected = (camera.height, camera.width, 3)
@@ -82,8 +85,11 @@ class Intake:
         if not np.isfinite(stamp_s):
             raise InputError(f"frame {frame}: expected a finite time stamp in seconds, got {stamp_s}")
         pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise InputError(f"frame {frame}: expected a finite 4 x 4 cam_from_world, got {pose.tolist()}")
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise InputError(
+                f"frame {frame}: expected cam_from_world as a rigid 4 x 4 transform (rotation, translation in metres, "
+                f"last row 0 0 0 1), got {pose.tolist()}; None where it is unknown"
+            )
 
     def admit(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> Arrival:
         """Whether a frame is the next one; what comes too late or twice changes nothing.
@@ -122,10 +128,9 @@ class Intake:
         """
         depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
         pose = torch.from_numpy(self._pose_of(cam_from_world))
-        has_depth = bool((depth > 0).any())
-        if not has_depth:
+        if not (depth > 0).any():
             self.flags += ("no depth: pixels only, world points are NaN",)
-        renewed = self.reference is None or (has_depth and not self.reference.has_depth)
+        renewed = self.reference is None or (not self.reference.has_depth and self._framer.shows_depth(depth))
         if renewed:
             self.reference = self._framer.reference(depth, pose)
         assert self.reference is not None
@@ -135,9 +140,15 @@ class Intake:
         return frames, renewed
 
     def _pose_of(self, cam_from_world: np.ndarray | None) -> np.ndarray:
-        """The frame's pose; where a posed stream misses one, the last one."""
+        """The frame's pose; where a posed stream misses one, the last one.
+
+        A stream whose poses begin late was taken to stand still until then.
+        """
         if cam_from_world is not None:
-            self._pose = np.array(cam_from_world, np.float64)
+            if self._pose is None and self.reference is not None:
+                self.reference = replace(self.reference, cam_from_world=torch.from_numpy(nearest_rigid(cam_from_world)))
+                self.flags += ("poses begin: world points were in the camera's axes before",)
+            self._pose = nearest_rigid(cam_from_world)
         elif self._pose is not None:
             self.flags += ("no pose: that of the frame before is used",)
         return np.eye(4) if self._pose is None else self._pose

@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-3"
+FORMAT = "quest-stream-4"
 _KEY = "quest-stream"
 
 
@@ -37,7 +37,7 @@ class SavedStream:
         header = {"format": FORMAT, "maker": self.maker, "alpha": self.alpha, "words": self.words}
         arrays = {key: np.asarray(value, order="C") for key, value in self.arrays.items()}
         # One entry: the order of several is not fixed.
-        return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True)})
+        return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True, default=_plain)})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> SavedStream:
@@ -57,3 +57,10 @@ class SavedStream:
         if header.get("format") != FORMAT:
             raise InputError(f"saved stream: expected format {FORMAT!r}, got {header.get('format')!r}")
         return cls(header["maker"], header["alpha"], header["words"], arrays)
+
+
+def _plain(value: Any) -> Any:
+    """A number of numpy as Python's: what cameras and queries were given."""
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"{type(value).__name__} is no number")

@@ -46,7 +46,7 @@ def state_line(state: StreamState, *, frame: int) -> str:
         for k, number in enumerate(state.query)
     ]
     line = {"frame": frame, "stamp_s": float(state.stamp_s), "flags": list(state.flags), "queries": queries}
-    return json.dumps(line, ensure_ascii=False, allow_nan=False)
+    return json.dumps(line, allow_nan=False)
 
 
 class StateLines:

@@ -81,6 +81,7 @@ class Stream:
         self._callbacks: list[Callable[[Alarm], None]] = []
         self._t = 0
         self._stamp_s, self._has_depth = 0.0, False
+        self._raised: tuple[Alarm, ...] = ()
 
     @property
     def camera(self) -> Camera:
@@ -145,7 +146,7 @@ class Stream:
         ]
 
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
-        """Call a function with every alarm in the step that raises it, before the step returns."""
+        """Call a function with every alarm at the end of the step that raises it; it may save the stream."""
         self._callbacks.append(callback)
 
     def step(
@@ -167,9 +168,11 @@ class Stream:
             cam_from_world: pose of the camera; the last one if None, and if there was none, the world is the camera.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
+            InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
+                rigid; the stream stays as it was.
         """
-        intake = self._intake
+        intake, self._raised = self._intake, ()
+        stamp_s = float(stamp_s)
         intake.check(self._t, rgb, depth_m, stamp_s, cam_from_world)
         if intake.admit(rgb, stamp_s) is not Arrival.NEW:
             self._t += 1
@@ -196,6 +199,9 @@ class Stream:
             self._stamp_s, self._has_depth = stamp_s, bool((frames.depth_m > 0).any())
             self._answer(frames, slots)
         self._t += 1
+        for alarm in self._raised:
+            for callback in self._callbacks:
+                callback(alarm)
         return self._state()
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -289,7 +295,7 @@ class Stream:
         right: Float[np.ndarray, " K"],
         signals: Signals,
     ) -> None:
-        """Judge the answers and keep them; begin or end recoveries; tell of alarms."""
+        """Judge the answers and keep them; begin or end recoveries; note what alarms were raised."""
         size, following = self._network.config.encoder.image_size, self._following
         inside = ((uv >= 0) & (uv <= 1)).all(-1).cpu().numpy()
         uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
@@ -312,9 +318,7 @@ class Stream:
                 lost_p=lost_p,
                 signals=signals.values[k],
             )
-        for alarm in () if verdict is None else verdict.raised:
-            for callback in self._callbacks:
-                callback(alarm)
+        self._raised = () if verdict is None else tuple(verdict.raised)
 
     def _recover(self, verdict: Verdict, placed: Placed) -> None:
         """Search for what an alarm says is lost; end the alarm where what is seen matches the anchor again.
@@ -389,4 +393,6 @@ class Stream:
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy()
+    values = tensor.detach().cpu()
+    # numpy has no bfloat16; the network takes the same numbers in float32 and rounds them back.
+    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -114,7 +116,7 @@ class Tracker:
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
         arrays, words = stream.state()
-        return SavedStream(self._maker(stream.camera), stream.alpha, words, arrays).to_bytes()
+        return SavedStream(self._maker(stream.camera, stream.alpha), stream.alpha, words, arrays).to_bytes()
 
     def restore(self, data: bytes) -> Stream:
         """Go on with a stream that :meth:`save` gave, as if nothing had happened in between.
@@ -124,8 +126,10 @@ class Tracker:
         """
         saved = SavedStream.from_bytes(data)
         camera = Camera(**saved.maker["camera"])
-        if saved.maker != self._maker(camera):
-            raise InputError("saved stream: it belongs to other weights or settings; load those that it was made with")
+        if saved.maker != self._maker(camera, saved.alpha):
+            raise InputError(
+                "saved stream: it belongs to other weights, settings or calibration; load those that it was made with"
+            )
         stream = self.stream(camera, (), alpha=saved.alpha)
         stream.restore(saved.arrays, saved.words)
         return stream
@@ -156,9 +160,15 @@ class Tracker:
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
         return collect(states, queries)
 
-    def _maker(self, camera: Camera) -> dict[str, Any]:
+    def _maker(self, camera: Camera, alpha: float | None) -> dict[str, Any]:
         """What a saved stream must be restored with."""
-        return {"weights": self.weights_hash, "settings": self.config.to_json(), "camera": asdict(camera)}
+        watched = "" if alpha is None or self.calibration is None else self.calibration.to_json()
+        return {
+            "weights": self.weights_hash,
+            "settings": self.config.to_json(),
+            "monitor": hashlib.sha256(watched.encode()).hexdigest(),
+            "camera": asdict(camera),
+        }
 
 
 def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool = True) -> Tracker:
@@ -241,6 +251,8 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
     lost = [names[i] for i in range(k) if i not in last.query]
     flags += [f"query {name!r} found no entity: lost in every frame" for name in lost]
     flags += [NOTHING_FOUND_FLAG] if queries is None and not k else []
+    told = Counter(flag.partition(":")[0] for s in states for flag in s.flags)
+    flags += [f"{what}: {count} of {t} frames" for what, count in told.items() if what != "no depth"]
     stamps = np.array([s.stamp_s for s in states])
     return Tracks(
         names=tuple(names),

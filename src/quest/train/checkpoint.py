@@ -36,6 +36,7 @@ class Progress:
         rng: state of the generator that draws windows, as JSON.
         network: the network's configuration, as JSON.
         objective: name of what is learned.
+        begun: hash of the weights that the run began with; empty in checkpoints from before it was kept.
     """
 
     step: int
@@ -45,6 +46,7 @@ class Progress:
     rng: str
     network: str
     objective: str = "stage-1"
+    begun: str = ""
 
 
 def save_checkpoint(
@@ -132,8 +134,8 @@ def _load_optimizer(
         ) from error
 
 
-def check_same_run(progress: Progress, config: NetworkConfig, objective: str, folder: Path) -> None:
-    """Refuse to resume with another network or another objective.
+def check_same_run(progress: Progress, config: NetworkConfig, objective: str, begun: str, folder: Path) -> None:
+    """Refuse to resume with another network or objective, or from other weights: what is not trained is kept too.
 
     Raises:
         WeightsError: the checkpoint's differs.
@@ -145,6 +147,8 @@ def check_same_run(progress: Progress, config: NetworkConfig, objective: str, fo
     # Parsed, so that a run that was started before a setting came up goes on with its default.
     if NetworkConfig.from_json(progress.network) != config:
         raise WeightsError(f"{folder}: this run was started with another network; use another --out or its settings")
+    if progress.begun not in ("", begun):
+        raise WeightsError(f"{folder}: this run began with other weights; use another --out, or the weights of then")
 
 
 def _trained(network: nn.Module) -> dict[str, torch.Tensor]:

@@ -1,14 +1,16 @@
 """Frozen encoder features of every frame of a store, computed once and read by memory map.
 
-One folder per view of a take, written beside its place and renamed, so that a killed run leaves whole
-entries or nothing. An entry is stale when the take or the encoder changed, and is then made again.
+One folder per encoder, in it one per view of a take, written beside its place and renamed, so that a killed run leaves
+whole entries or nothing. An entry is stale when the take changed, and is then made again. Runs with different encoders
+can share a cache.
 """
 
 from __future__ import annotations
 
+import contextlib
 import glob
-import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -25,6 +27,7 @@ from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder
 from quest.model.observation import cell_depth
+from quest.model.weights import weights_digest
 from quest.types import LABELS, Camera, Take
 
 _VERSION = 1
@@ -114,20 +117,17 @@ class FeatureCache:
     """Views of the takes of a store with their features.
 
     Args:
-        root: folder of the cache.
+        root: folder of the cache; the entries of this encoder are in one of its folders.
         config: network that will read it.
         encoder: encoder with its initial weights.
     """
 
     def __init__(self, root: Path, config: NetworkConfig, encoder: Encoder) -> None:
-        self.root = root
         self.config = config
         self.encoder = encoder.eval()
-        digest = hashlib.sha256(json.dumps([_VERSION, asdict(config.encoder), config.cell_px]).encode())
-        for name, tensor in sorted(encoder.state_dict().items()):
-            digest.update(name.encode())
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-        self.encoder_hash = digest.hexdigest()
+        layout = json.dumps([_VERSION, asdict(config.encoder), config.cell_px])
+        self.encoder_hash = weights_digest(encoder, beside=layout)
+        self.root = root / self.encoder_hash[:12]
 
     def build(
         self,
@@ -154,8 +154,8 @@ class FeatureCache:
             stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
             entries = self._entries(mirrored_name(name) if mirrored else name)
             if not self._complete(entries, stamp):
-                for entry in entries:
-                    shutil.rmtree(entry)  # also of views that the take no longer has
+                for entry in entries:  # also of views that the take no longer has
+                    _remove(entry)
                 take = _read(store, name, mirrored)
                 entries = [self._write(take, view, stamp, device) for view in range(len(take.views))]
             if enlarged and not all((entry / "owner.npy").exists() for entry in entries):
@@ -186,7 +186,10 @@ class FeatureCache:
 
     def _complete(self, entries: list[Path], stamp: dict[str, str]) -> bool:
         """Whether every view of a take is there and of this take and encoder."""
-        metas = [json.loads((entry / "meta.json").read_text()) for entry in entries]
+        try:
+            metas = [json.loads((entry / "meta.json").read_text()) for entry in entries]
+        except (OSError, ValueError):  # what a killed removal left
+            return False
         return bool(metas) and all(m["stamp"] == stamp and m.get("views", len(metas)) == len(metas) for m in metas)
 
     def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> Path:
@@ -221,13 +224,13 @@ class FeatureCache:
             "half_diagonal_m": take.info.half_diagonal_m,
         }
         entry = self.root / f"{take.info.name}-v{view}"
-        partial = self.root / f".partial-{entry.name}"
-        for stale in (partial, entry):
-            shutil.rmtree(stale, ignore_errors=True)
+        partial = self.root / f".partial-{entry.name}.{os.getpid()}"
+        shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         for name in _MAPPED + _READ:
             np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
         (partial / "meta.json").write_text(json.dumps(meta))
+        _remove(entry)  # another process may have made it meanwhile
         partial.rename(entry)
         return entry
 
@@ -272,6 +275,14 @@ def owner_of(take: Take, view: int, config: NetworkConfig) -> Int8[np.ndarray, "
         most = pixels.argmax(axis=-1) if len(take.tracked) else owner
         owners.append(np.where(pixels.max(axis=-1, initial=0) * 16 >= cell * cell, most, owner).ravel())
     return np.stack(owners).astype(np.int8)
+
+
+def _remove(entry: Path) -> None:
+    """Remove an entry whole or not at all, as far as others can see."""
+    gone = entry.with_name(f".gone-{entry.name}.{os.getpid()}")
+    with contextlib.suppress(FileNotFoundError):
+        entry.rename(gone)
+    shutil.rmtree(gone, ignore_errors=True)
 
 
 def _read(store: TakeStore, name: str, mirrored: bool) -> Take:

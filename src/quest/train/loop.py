@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from quest.errors import ConfigError
 from quest.extras import require
 from quest.model.network import QuestNetwork
+from quest.model.weights import weights_digest
 from quest.train.averaging import RunningMean
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
@@ -141,15 +142,16 @@ class _Learner:
     def resume(self, rng: np.random.Generator, out: Path) -> Progress:
         """Take up the last checkpoint of a folder, or start, and hand everything to the devices."""
         network = self.objective.network
+        begun = weights_digest(network)
         if self.config.compile:
             _compile(network)
         # First to the devices: the optimiser's state is loaded to where the parameters are.
         self.module, self.fabric_optimizer = self.fabric.setup(_Step(self.objective), self.optimizer)
-        start = Progress(0, math.inf, 0, 0, _state(rng), network.config.to_json(), self.objective.name)
+        start = Progress(0, math.inf, 0, 0, _state(rng), network.config.to_json(), self.objective.name, begun)
         generators = {}
         if (out / "last").exists() or (out / ".old-last").exists():
             start = load_checkpoint(out / "last", network, self.optimizer)
-            check_same_run(start, network.config, self.objective.name, out)
+            check_same_run(start, network.config, self.objective.name, begun, out)
             rng.bit_generator.state = json.loads(start.rng)
             generators = load_generators(out / "last")
         network.train()
