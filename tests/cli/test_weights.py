@@ -49,19 +49,33 @@ def weights(tmp_path: Path) -> Path:
     return path
 
 
-def test_own_objects_choose_the_settings(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize(("setting", "kept"), [("jump", False), ("slot_bias", True)])
+def test_own_objects_choose_the_settings(
+    takes: Path, weights: Path, setting: str, kept: bool, monkeypatch: pytest.MonkeyPatch
+):
+    """Other settings of following make other signals; the monitor then belongs to settings that are no more."""
     chosen = {}
 
     def tuned(tracker, takes, *, report, discovery_only):
         chosen.update(takes[0][1])
-        return Tuned(TrackerConfig(jump=0.3), (), 1.0, float(discovery_only))
+        return Tuned(replace(TrackerConfig(), **{setting: 0.3}), (), 1.0, float(discovery_only))
 
     monkeypatch.setattr(tuning, "tune", tuned)
     assert TuneWeights(weights, takes=(str(takes),)).run() == 0
     assert chosen == {f"toolbox-{seed}": "validation" for seed in range(TAKES)}
     loaded = load_network(weights)
-    assert TrackerConfig.from_json(loaded.settings).jump == 0.3
+    assert getattr(TrackerConfig.from_json(loaded.settings), setting) == 0.3
+    assert (loaded.monitor is not None) == kept
     assert (loaded.about, loaded.licence, loaded.version) == ("a test", "MIT", "3")
+
+
+def test_only_files_are_rewritten(takes: Path, tmp_path: Path):
+    """Told before anything is tracked."""
+    for name in (tmp_path, Path("quest-s16")):
+        with pytest.raises(ConfigError, match="quest weights save"):
+            TuneWeights(name, takes=(str(takes),)).run()
+        with pytest.raises(ConfigError, match="quest weights save"):
+            CalibrateWeights(name, (str(takes),), tmp_path / "records").run()
 
 
 def test_own_takes_calibrate_the_monitor(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):

@@ -11,7 +11,7 @@ import pytest
 
 from quest.data.frame_source import Parts
 from quest.data.recording import open_recording, read_recording
-from quest.data.ros_frames import CAMERA_CHANGED, LATE, NO_DEPTH, NO_POSE, NO_STAMP
+from quest.data.ros_frames import CAMERA_CHANGED, LATE, NO_DEPTH, NO_POSE, NO_STAMP, _Play
 from quest.errors import RecordingError
 from quest.types import Camera
 from tests.data.bag_drive import (
@@ -101,6 +101,25 @@ def test_the_nearest_depth_in_time_is_taken(tmp_path: Path):
     frames, flags = frames_of(path, sync_s=0.03)
     assert all(frame.depth_m is not None for frame in frames)
     assert flags == (NO_POSE,)
+
+
+def test_depth_before_the_first_colours_is_not_kept(tmp_path: Path):
+    """However long the depth camera runs alone, memory stays as it is."""
+    early = [depths(0, at_ns=BEGIN - i * STEP) for i in range(200, 0, -1)]
+    source = open_recording(write_mcap(tmp_path / "bag.mcap", [info(), *early, colours(0), depths(0)]))
+    held = []
+    original = _Play._take
+
+    def watched(self: _Play, topic: str, log_ns: int, message: Any) -> None:
+        original(self, topic, log_ns, message)
+        held.append(len(self._depths))
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(_Play, "_take", watched)
+        (frame,) = source
+    assert len(held) > 200
+    assert max(held) < 100
+    assert frame.depth_m is not None
 
 
 def test_a_clip_has_zeros_where_depth_is_missing(tmp_path: Path):

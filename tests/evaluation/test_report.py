@@ -37,6 +37,16 @@ def test_records_come_with_their_origin(tmp_path: Path):
         gather([*paths, paths[0]])
 
 
+def test_records_of_another_run_are_refused(tmp_path: Path):
+    for name, take in (("a", "t0"), ("b", "t1")):
+        write_results(Results(RUN, ()), tmp_path / f"{name}.json", records=(make_answer(np.zeros(5), take=take),))
+    (tmp_path / "b.records.parquet").replace(tmp_path / "a.records.parquet")
+    with pytest.raises(InputError, match="not those of"):
+        gather([tmp_path / "a.records.parquet"])
+    write_results(Results(RUN, ()), tmp_path / "a.json")
+    assert not (tmp_path / "a.records.parquet").exists()
+
+
 def test_no_number_is_written_that_is_none(tmp_path: Path):
     with pytest.raises(ValueError, match="JSON"):
         write_report({"value": float("nan")}, tmp_path / "report.json")

@@ -23,6 +23,17 @@ def made(hidden: int = 3) -> Calibration:
     return Calibration(make_calibrator(hidden=hidden), Cusum(-1.0, 0.85), MAXIMA, 60, "a test")
 
 
+@pytest.mark.parametrize(
+    ("streams", "never"), [(19, "at all"), (24, "after 60 frames"), (45, "after 60 frames"), (46, None)]
+)
+def test_alarms_that_cannot_come_are_told(streams: int, never: str | None):
+    few = replace(made(), maxima=np.sort(np.random.default_rng(0).random(streams)))
+    told = few.shortfall(0.05)
+    assert (told is None) == (never is None)
+    assert never is None or (told is not None and never in told)
+    assert (few.least_alpha <= 0.05) == (streams >= 24)
+
+
 def test_squashing_and_back():
     calibrator = make_calibrator()
     values = 10 * np.random.default_rng(1).normal(size=(3, len(SIGNALS)))

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from quest.data.store import TakeStore
-from quest.errors import ObjectError, RendererError, TakeError
+from quest.errors import ConfigError, ObjectError, RendererError, TakeError
 from quest.sim.plan import TakeSpec
 from quest.sim.production import (
     Event,
@@ -66,6 +66,12 @@ def test_missing_takes_come_once() -> None:
     specs = plan(3)
     produce(specs[1:2], store, StubStudio(), report=lambda event: None)
     assert missing_takes([*specs, *specs], store) == [specs[0], specs[2]]
+
+
+def test_two_objects_of_one_name_are_refused() -> None:
+    specs = [replace(spec, source="own", object_id=f"{where}/urdf") for spec in plan(1) for where in ("a", "b")]
+    with pytest.raises(ConfigError, match="a/urdf and of b/urdf"):
+        missing_takes(specs, TakeStore("memory://one-name"))
 
 
 def test_what_was_made_before_a_failure_is_kept(store: TakeStore) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def build(cache: FeatureCache, store: TakeStore) -> tuple[int, ...]:
 
 
 def times(folder: Path) -> list[int]:
-    return [path.stat().st_mtime_ns for path in sorted(folder.glob("cache/*/features.npy"))]
+    return [path.stat().st_mtime_ns for path in sorted(folder.glob("cache/*/*/features.npy"))]
 
 
 def test_what_is_cached_is_what_the_take_holds(tmp_path: Path):
@@ -77,20 +78,30 @@ def test_another_encoder_makes_features_again(tmp_path: Path):
     store = store_with(tmp_path)
     build(cache_in(tmp_path), store)
     old = np.array(cache_in(tmp_path).views([NAME])[0].features)
+    reading = cache_in(tmp_path).views([NAME])[0]
     build(cache_in(tmp_path, seed=1), store)
-    assert not np.allclose(cache_in(tmp_path).views([NAME])[0].features, old)
+    assert not np.allclose(cache_in(tmp_path, seed=1).views([NAME])[0].features, old)
+    np.testing.assert_array_equal(reading.features, old)  # two runs share the folder
 
 
 def test_a_killed_run_leaves_nothing_that_is_taken_for_whole(tmp_path: Path):
     store, cache = store_with(tmp_path), cache_in(tmp_path)
     build(cache, store)
-    whole = tmp_path / "cache" / f"{NAME}-v1"
-    whole.rename(tmp_path / "cache" / f".partial-{NAME}-v1")
-    (tmp_path / "cache" / f".partial-{NAME}-v1" / "features.npy").write_bytes(b"torn")
+    left = cache.root / f".partial-{NAME}-v1.12345"
+    (cache.root / f"{NAME}-v1").rename(left)
+    (left / "features.npy").write_bytes(b"torn")
+    os.utime(left, (0, 0))
     assert len(cache.views([NAME])) == 1
     assert build(cache, store) == (4, 4)
     assert len(cache.views([NAME])) == 2
-    assert not list((tmp_path / "cache").glob(".partial*"))
+    assert not list(cache.root.glob(".*"))
+
+
+def test_a_removal_that_was_killed_is_made_good(tmp_path: Path):
+    store, cache = store_with(tmp_path), cache_in(tmp_path)
+    build(cache, store)
+    (cache.root / f"{NAME}-v0" / "meta.json").unlink()
+    assert build(cache, store) == (4, 4)
 
 
 def test_names_that_begin_alike_stay_apart(tmp_path: Path):
@@ -106,7 +117,7 @@ def test_names_that_begin_alike_stay_apart(tmp_path: Path):
 def test_entries_of_before_the_number_of_views_was_kept(tmp_path: Path):
     store = store_with(tmp_path)
     build(cache_in(tmp_path), store)
-    for path in tmp_path.glob("cache/*/meta.json"):
+    for path in tmp_path.glob("cache/*/*/meta.json"):
         meta = json.loads(path.read_text())
         del meta["views"]
         path.write_text(json.dumps(meta))
@@ -150,7 +161,7 @@ def test_tokens_of_enlarged_images_join_an_entry_when_they_are_asked_for(tmp_pat
     store, cache = store_with(tmp_path), cache_in(tmp_path)
     assert build(cache, store) == (4, 4)
     before = times(tmp_path)
-    assert not list(tmp_path.glob("cache/*/enlarged.npy"))
+    assert not list(tmp_path.glob("cache/*/*/enlarged.npy"))
     assert tuple(cache.build(store, store.names(), device=CPU, enlarged=True)) == (4, 4)
     assert times(tmp_path) == before
     for v, view in enumerate(cache.views([NAME])):

@@ -12,6 +12,7 @@ import glob
 import json
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -32,6 +33,8 @@ from quest.types import LABELS, Camera, Take
 
 _VERSION = 1
 _DEPTH_UNIT_M = 1e-4
+_LEFT_AFTER_S = 3600.0
+"""Age at which what is half made or half removed belongs to no process any more."""
 
 
 @dataclass(frozen=True)
@@ -224,8 +227,10 @@ class FeatureCache:
             "half_diagonal_m": take.info.half_diagonal_m,
         }
         entry = self.root / f"{take.info.name}-v{view}"
+        for left in self.root.glob(f".*-{glob.escape(entry.name)}.*"):
+            if time.time() - left.stat().st_mtime > _LEFT_AFTER_S:
+                shutil.rmtree(left, ignore_errors=True)
         partial = self.root / f".partial-{entry.name}.{os.getpid()}"
-        shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         for name in _MAPPED + _READ:
             np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
