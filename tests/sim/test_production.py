@@ -68,9 +68,16 @@ def test_missing_takes_come_once() -> None:
     assert missing_takes([*specs, *specs], store) == [specs[0], specs[2]]
 
 
-def test_two_objects_of_one_name_are_refused() -> None:
-    specs = [replace(spec, source="own", object_id=f"{where}/urdf") for spec in plan(1) for where in ("a", "b")]
-    with pytest.raises(ConfigError, match="a/urdf and of b/urdf"):
+def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:
+    for where in ("a", "b"):
+        (tmp_path / where / "urdf").mkdir(parents=True)
+        (tmp_path / where / "urdf" / "mobility.urdf").touch()
+    specs = [
+        replace(spec, source="own", object_id=str(tmp_path / where / "urdf"))
+        for spec in plan(1)
+        for where in ("a", "b")
+    ]
+    with pytest.raises(ConfigError, match="rename the folder"):
         missing_takes(specs, TakeStore("memory://one-name"))
 
 
