@@ -35,7 +35,7 @@ def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[floa
     )
     fabric = launch(config)
     network = make_network()
-    names = sorted({path.name.rsplit("-v", 1)[0] for path in cache.iterdir()})
+    names = sorted({path.name.rsplit("-v", 1)[0] for path in cache.glob("*/*-v*")})
     views = FeatureCache(cache, network.config, network.encoder).views(names)
     sampler = WindowSampler(views, network.config, WindowConfig(batch=8))
     reports: list[StepReport] = []
