@@ -160,12 +160,6 @@ class Ground:
         """The joint that the track so far shows; None before the first point."""
         return self._estimator.joint
 
-    @property
-    def stood(self) -> Float[np.ndarray, "3"] | None:
-        """Where a query was in the mean that has not moved yet; None if it has, or was never seen."""
-        joint = self.joint
-        return joint.rest if joint is not None and joint.kind is JointKind.STATIC else None
-
     def see(self, point: Float[np.ndarray, "3"], row: BeliefRow) -> None:
         """Learn from a frame in which the query is seen and trusted."""
         if not (self.fixed and self._expectation.rows >= _STANDING):
@@ -222,9 +216,8 @@ class Ground:
             frame: what the newest frame says of places.
             elapsed: frames since then.
         """
-        stood = self.stood
-        if not self._curves or stood is not None:
-            return float(frame.room((before if stood is None else stood)[None])[0] < -_TOLERANCE)
+        if not self._curves or self.joint is None or self.joint.kind is JointKind.STATIC:
+            return float(frame.room(before[None])[0] < -_TOLERANCE)
         return float(self._predicted(before, elapsed) @ self._buried(frame))
 
     def expected(
@@ -334,9 +327,7 @@ class Ground:
         curve = self._best_curve
         sigma = self._config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1) * elapsed
         if self._along is None:
-            # What never moved may have been carried a little way before it was known to be hidden.
-            stood = self.stood
-            at = float(curve.joint.locate((before if stood is None else stood)[None])[0])
+            at = float(curve.joint.locate(before[None])[0])
             start = _normalised(-0.5 * np.square((curve.q - at) / sigma))
         else:
             start = self._along

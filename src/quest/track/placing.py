@@ -22,8 +22,6 @@ LOST_BELOW = 0.3
 """Probability of the right identity below which a query is lost and its joint learns nothing."""
 
 _LEAP = 0.12
-_AWAY = 0.06
-_PLAIN = 0.62
 _COVERED = 0.5
 _AFTER_ALL = 0.2
 _OFF_JOINT_SIGMAS = 4.0
@@ -132,18 +130,13 @@ class Placer:
         """How probably a query is seen where the network sees it, given what is before the places its joint allows.
 
         Where something came before them and the answer leapt away, it leapt onto what came or onto a look-alike: the
-        entity is behind it. The answer for what never moved may also be carried away step by step, as a drawer opens
-        before it; there it is enough to be away from where it stood, unless the network sees it plainly. What was so
-        buried and is said to be seen again must lie on its joint, unless the network insists; where it is seen just
-        where the joint holds it, and nothing is before that any more, it is seen.
+        entity is behind it. What was so buried and is said to be seen again must lie on its joint, unless the network
+        insists; where it is seen just where the joint holds it, and nothing is before that any more, it is seen.
         """
         query, seen = self._following[i], float(self._seen[i])
         if query.place is None:
             return seen
-        stood = query.ground.stood
-        plain = min(seen, float(self._right[i])) >= _PLAIN
-        away = stood is not None and not plain and bool(np.linalg.norm(own - stood) >= _AWAY)
-        leapt = away or not np.linalg.norm(own - query.place) < _LEAP
+        leapt = not np.linalg.norm(own - query.place) < _LEAP
         if not (leapt or query.buried):
             return seen
         covered = query.ground.covered(query.place, self._evidence[i], self._elapsed) > _COVERED
