@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from quest.cli.main import main
@@ -38,6 +40,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         ("plain", eager, None),
         ("calm", eager, make_calibration(alarming=False).to_json()),
         ("alarming", eager, make_calibration(alarming=True).to_json()),
+        ("few", eager, replace(make_calibration(alarming=True), maxima=np.arange(20.0)).to_json()),
         ("blind", blind, None),
     ):
         save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test", monitor=monitor)
@@ -65,6 +68,13 @@ def test_without_a_calibration(take: str, weights: dict[str, str], tmp_path: Pat
     assert (left["query"], left["name"], left["label"]) == (0, "left", None)
     assert left["lost_p"] is None
     assert left["alarm"] is None
+
+
+def test_too_few_streams_for_an_alarm(take: str, weights: dict[str, str], capsys):
+    """Nothing may look as if it were watched."""
+    assert main(["monitor", take, "--weights", weights["few"], *POINTS]) == 0
+    out = " ".join(capsys.readouterr().out.split())
+    assert "no alarm at all at alpha 0.05: calibrated on 20 loss-free streams only" in out
 
 
 def test_no_alarm(take: str, weights: dict[str, str], capsys):
