@@ -130,7 +130,7 @@ class Clip:
             raise InputError(f"clip {self.name!r}: expected {t} time stamps and poses, got {got}")
         finite = np.isfinite(self.cam_from_world).all() and np.isfinite(self.stamp_s).all()
         if not finite or (np.diff(self.stamp_s) < 0).any():
-            raise InputError(f"clip {self.name!r}: stamps and poses must be finite, times rising; sort the frames")
+            raise InputError(f"clip {self.name!r}: stamps and poses must be finite, times not falling; sort the frames")
 
     def __len__(self) -> int:
         return len(self.rgb)

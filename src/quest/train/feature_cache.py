@@ -228,8 +228,9 @@ class FeatureCache:
         }
         entry = self.root / f"{take.info.name}-v{view}"
         for left in self.root.glob(f".*-{glob.escape(entry.name)}.*"):
-            if time.time() - left.stat().st_mtime > _LEFT_AFTER_S:
-                shutil.rmtree(left, ignore_errors=True)
+            with contextlib.suppress(FileNotFoundError):  # another process has just finished it
+                if time.time() - left.stat().st_mtime > _LEFT_AFTER_S:
+                    shutil.rmtree(left, ignore_errors=True)
         partial = self.root / f".partial-{entry.name}.{os.getpid()}"
         partial.mkdir()
         for name in _MAPPED + _READ:
