@@ -119,6 +119,7 @@ def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, c
         (["--view", "7"], "view"),
         (["--device", "abacus"], "abacus"),
         (["--weights", "none.safetensors"], "none.safetensors"),
+        (["--out", __file__], "cannot be made a folder"),
     ],
 )
 def test_track_with_bad_arguments(store: Path, weights: Path, tmp_path: Path, capsys, arguments: list[str], named: str):
