@@ -4,19 +4,23 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import quest
+from quest.baselines import HoldStill
 from quest.cli.evaluate import Eval
 from quest.data.split import object_split, split_of
 from quest.data.store import TakeStore
-from quest.errors import ConfigError, ObjectError, TakeError
+from quest.errors import ConfigError, InputError, ObjectError, TakeError
 from quest.evaluation import evaluate, read_records, read_results
+from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.results import records_path
-from quest.evaluation.selection import part_of, select_takes
-from quest.types import Take, TakeInfo
+from quest.evaluation.selection import Shard, SplitPart, part_of, select_takes
+from quest.types import Clip, Query, Take, TakeInfo, Tracks
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take
 from tests.tiny import make_network
@@ -88,8 +92,6 @@ def test_selection(store: TakeStore) -> None:
 
 
 def test_evaluate_refuses_what_no_tracker_can(store: TakeStore) -> None:
-    from quest.baselines import HoldStill
-
     with pytest.raises(ConfigError, match="has the protocol semantic"):
         evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], protocols=("semantic",))
     with pytest.raises(ConfigError, match="different names"):
@@ -97,8 +99,6 @@ def test_evaluate_refuses_what_no_tracker_can(store: TakeStore) -> None:
 
 
 def test_progress_counts_every_frame(store: TakeStore) -> None:
-    from quest.baselines import HoldStill
-
     seen: list[int] = []
     evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], progress=lambda _, frames: seen.append(frames))
     assert sum(seen) == 2 * 20
@@ -173,3 +173,74 @@ def test_torn_takes_are_left_out_and_named(tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "torn.zarr").mkdir()
     assert Eval(takes=str(tmp_path), trackers=("hold-still",), resamples=5).run() == 0
     assert "torn takes of the store were left out: torn" in capsys.readouterr().out
+
+
+class _Counting(HoldStill):
+    """Counts what it is asked, and is stopped before the clip of a name."""
+
+    def __init__(self, stop_at: str | None = None) -> None:
+        self.clips: list[str] = []
+        self._stop_at = stop_at
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        if self._stop_at is not None and clip.name.startswith(self._stop_at):
+            raise KeyboardInterrupt
+        self.clips.append(clip.name)
+        return super().track(clip, queries)
+
+
+VALIDATION: Mapping[str, SplitPart] = dict.fromkeys(
+    ("panels-100000-1", "panels-100000-2", "panels-100001-1"), "validation"
+)
+
+
+def test_what_was_stopped_goes_on(store: TakeStore, tmp_path: Path) -> None:
+    whole = evaluate(store, VALIDATION, [HoldStill()])
+    folder = tmp_path / "parts"
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(store, VALIDATION, [_Counting("panels-100001")], finished=FinishedTakes(folder, made_by="a"))
+    assert len(list(folder.iterdir())) == 2
+    second, frames = _Counting(), list[int]()
+    found = evaluate(
+        store,
+        VALIDATION,
+        [second],
+        finished=FinishedTakes(folder, made_by="a"),
+        progress=lambda _, n: frames.append(n),
+    )
+    assert [name.partition("/")[0] for name in second.clips] == ["panels-100001-1"] * 2
+    assert sum(frames) == 3 * 2 * 20
+    assert [r.subject for r in found.records] == [r.subject for r in whole.records]
+    for a, b in zip(found.records, whole.records, strict=True):
+        np.testing.assert_array_equal(a.distance, b.distance)
+    assert (found.unscored, found.notes, found.missing) == (whole.unscored, whole.notes, 0)
+
+
+def test_finished_takes_of_other_code_or_data_do_not_count(store: TakeStore, tmp_path: Path) -> None:
+    evaluate(store, VALIDATION, [HoldStill()], finished=FinishedTakes(tmp_path, made_by="a"))
+    name = "panels-100001-1"
+    assert FinishedTakes(tmp_path, made_by="a").read(name, store.data_hash(name)) is not None
+    assert FinishedTakes(tmp_path, made_by="b").read(name, store.data_hash(name)) is None
+    assert FinishedTakes(tmp_path, made_by="a").read(name, "other") is None
+    (tmp_path / f"{name}.parquet").write_bytes(b"PAR1")
+    with pytest.raises(InputError, match="Parquet"):
+        FinishedTakes(tmp_path, made_by="a").read(name, store.data_hash(name))
+
+
+def test_shards_share_an_evaluation(store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    def command(shard: str, out: str) -> Eval:
+        return Eval(
+            takes=str(store.root), trackers=("lk",), split=("validation",), resamples=5, shard=shard, out=tmp_path / out
+        )
+
+    assert command("1/2", "shared.json").run() == 0
+    assert "2 takes are left to other shards" in capsys.readouterr().err
+    assert not (tmp_path / "shared.json").exists()
+    assert command("0/2", "shared.json").run() == 0
+    assert command("0/1", "alone.json").run() == 0
+    assert read_results(tmp_path / "shared.json").rows == read_results(tmp_path / "alone.json").rows
+    assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".json", ".parquet", ".parquet"]
+    with pytest.raises(ConfigError, match="--out"):
+        dataclasses.replace(command("0/2", "x.json"), out=None).run()
+    with pytest.raises(ConfigError, match="finished takes"):
+        evaluate(store, VALIDATION, [HoldStill()], shard=Shard(0, 2))

@@ -12,9 +12,8 @@ import torch
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
 from quest.evaluation import stream_record
-from quest.evaluation.selection import SplitPart
+from quest.evaluation.selection import Shard, SplitPart
 from quest.evaluation.stream_record import (
-    Shard,
     StreamRecord,
     lasting,
     lost,

@@ -16,6 +16,7 @@ import pytest
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, RendererError, TakeError
+from quest.sim.cameras import CameraStyle
 from quest.sim.plan import TakeSpec
 from quest.sim.production import (
     Event,
@@ -27,6 +28,8 @@ from quest.sim.production import (
     produce,
     write_once,
 )
+from quest.sim.sensor import SENSORS
+from quest.sim.settings import TakeSettings
 from quest.types import Take
 from tests.s3_server import s3_store
 from tests.sim.stub_studio import StubStudio, plan, produce_missing
@@ -66,6 +69,19 @@ def test_missing_takes_come_once() -> None:
     specs = plan(3)
     produce(specs[1:2], store, StubStudio(), report=lambda event: None)
     assert missing_takes([*specs, *specs], store) == [specs[0], specs[2]]
+
+
+def test_takes_made_with_other_settings_do_not_count() -> None:
+    store = TakeStore("memory://other-settings")
+    settings = TakeSettings(views=1, cameras=CameraStyle(motion="orbit"))
+    spec = replace(plan(1)[0], settings=settings)
+    take, _ = StubStudio().make(spec)
+    made = {"settings": settings.digest, "command": "quest generate --camera orbit"}
+    store.write(replace(take, info=replace(take.info, provenance=made)))
+    assert missing_takes([spec], store) == []
+    for other in (TakeSettings(), TakeSettings(views=1), replace(settings, sensor=SENSORS["stereo"])):
+        with pytest.raises(ConfigError, match="other settings, made by `quest generate --camera orbit`"):
+            missing_takes([replace(spec, settings=other)], store)
 
 
 def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -104,4 +104,5 @@ def test_takes_of_stretched_objects_differ_in_shape_and_say_so(cabinet: SimObjec
     assert first.info == again.info
     assert first.info.half_diagonal_m != other.info.half_diagonal_m
     assert first.info.provenance["stretch"] == again.info.provenance["stretch"] != other.info.provenance["stretch"]
+    assert first.info.provenance["settings"] == settings.digest
     np.testing.assert_array_equal(first.views[0].clip.rgb, again.views[0].clip.rgb)

@@ -16,10 +16,11 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from quest.data.store import TakeStore
+    from quest.evaluation.finished import FinishedTakes
     from quest.evaluation.protocols import ClipTracker
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
-    from quest.evaluation.selection import SplitPart
+    from quest.evaluation.selection import Shard, SplitPart
 
 TrackerName = Literal[
     "quest",
@@ -40,6 +41,9 @@ TrackerName = Literal[
 class Eval:
     """Evaluate trackers on takes: a table in the terminal and, with --out, a result file.
 
+    With --out, takes are kept beside it as they are done (OUT.parts) until the file is written: run a command that was
+    stopped again and it goes on, or run it in several processes with --shard.
+
     The protocol point always has the tracker hold-still for comparison; lk and hold-still do not have the protocol
     semantic.
 
@@ -55,6 +59,7 @@ class Eval:
         same_objects: keep only objects that have takes of every level, so that levels compare.
         resamples: of the bootstrap over objects.
         seed: of the bootstrap and of the noise of chained flow.
+        shard: part of the takes, such as 0/2 and 1/2 for two processes side by side; the last one reports. Needs --out.
         out: result file (.json); the per-frame records go beside it (.records.parquet).
     """
 
@@ -68,6 +73,7 @@ class Eval:
     same_objects: bool = False
     resamples: int = 1000
     seed: int = 0
+    shard: str = "0/1"
     out: Path | None = None
 
     def run(self) -> int:
@@ -82,7 +88,7 @@ class Eval:
 
         from quest.errors import ConfigError
         from quest.evaluation.results import write_results
-        from quest.evaluation.selection import select_takes
+        from quest.evaluation.selection import Shard, select_takes
         from quest.evaluation.tables import FULL_WIDTH, results_table
 
         if not self.protocol or not self.trackers or self.resamples < 1:
@@ -92,6 +98,9 @@ class Eval:
             )
         if self.out is not None and self.out.suffix != ".json":
             raise ConfigError(f"eval: expected --out to end in .json, got {self.out}")
+        shard = Shard.parse(self.shard)
+        if self.out is None and shard.count > 1:
+            raise ConfigError(f"eval: --shard {self.shard} needs --out, beside which the processes share what is done")
         start_s = time.monotonic()
         store, broken = self._open_store()
         chosen = select_takes(
@@ -99,7 +108,11 @@ class Eval:
         )
         trackers = self._load_trackers(store)
         console = Console(stderr=True)
-        found = self._evaluate(store, chosen, trackers, console)
+        finished = self._finished(trackers)
+        found = self._evaluate(store, chosen, trackers, finished, shard, console)
+        if found.missing:
+            console.print(f"{found.missing} takes are left to other shards; nothing is reported yet")
+            return 0
         results = self._results(found, broken, self._run(store, chosen, trackers, start_s))
         output = Console()
         if not output.is_terminal:  # a file or pipe has no width of its own: show every column
@@ -108,7 +121,27 @@ class Eval:
         if self.out is not None:
             write_results(results, self.out, records=found.records)
             console.print(f"wrote {self.out}", highlight=False)
+        if finished is not None:
+            finished.remove()
         return 0
+
+    def _finished(self, trackers: list[ClipTracker]) -> FinishedTakes | None:
+        """Where takes are kept while the evaluation runs; nowhere without --out."""
+        import hashlib
+
+        from quest.data.provenance import code_hash, package_versions
+        from quest.evaluation.finished import FinishedTakes
+
+        if self.out is None:
+            return None
+        answers = [code_hash(), package_versions(), self.protocol, [t.name for t in trackers], self.seed]
+        digest = hashlib.sha256(repr([*answers, self.weights, self._weights_hash(trackers)]).encode())
+        return FinishedTakes(self.out.with_suffix(".parts"), made_by=digest.hexdigest())
+
+    def _weights_hash(self, trackers: list[ClipTracker]) -> str | None:
+        from quest.data.provenance import file_hash
+
+        return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(self.weights)
 
     def _open_store(self) -> tuple[TakeStore, list[str]]:
         """The store, and the names of its torn takes."""
@@ -131,7 +164,13 @@ class Eval:
         return list(line_up(names, weights=self.weights, unit_m=units_of([store]), seed=self.seed))
 
     def _evaluate(
-        self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], console: Console
+        self,
+        store: TakeStore,
+        chosen: Mapping[str, SplitPart],
+        trackers: list[ClipTracker],
+        finished: FinishedTakes | None,
+        shard: Shard,
+        console: Console,
     ) -> Evaluated:
         from rich.progress import (
             BarColumn,
@@ -146,7 +185,8 @@ class Eval:
 
         runs = sum(has_protocol(t, p) for t in trackers for p in self.protocol)
         headers = store.headers()
-        frames = sum(headers[name].frames * len(headers[name].cameras) for name in chosen) * runs
+        own = [headers[name] for i, name in enumerate(chosen) if i in shard]
+        frames = sum(header.frames * len(header.cameras) for header in own) * runs
         bar = (
             TextColumn("{task.description}"),
             BarColumn(),
@@ -160,22 +200,29 @@ class Eval:
             def advance(doing: str, done: int) -> None:
                 progress.update(task, description=doing, advance=done)
 
-            return evaluate(store, chosen, trackers, protocols=self.protocol, progress=advance)
+            return evaluate(
+                store,
+                chosen,
+                trackers,
+                protocols=self.protocol,
+                finished=finished,
+                shard=shard,
+                progress=advance,
+            )
 
     def _run(
         self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], start_s: float
     ) -> Run:
-        from quest.data.provenance import code_commit, combined_hash, file_hash, machine, package_versions
+        from quest.data.provenance import code_commit, combined_hash, machine, package_versions
         from quest.evaluation.results import Run
 
         with_quest = any(name not in ("lk", "hold-still") for name in self.trackers)
-        known = next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None)
         return Run(
             command=shlex.join(["quest", *sys.argv[1:]]),
             commit=code_commit(),
             data_hash=combined_hash((name, store.data_hash(name)) for name in chosen),
             weights=self.weights if with_quest else None,
-            weights_hash=(known or file_hash(self.weights)) if with_quest else None,
+            weights_hash=self._weights_hash(trackers) if with_quest else None,
             resamples=self.resamples,
             seed=self.seed,
             machine=machine(),

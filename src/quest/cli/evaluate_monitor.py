@@ -65,8 +65,8 @@ class EvalMonitor:
         from quest.errors import ConfigError
         from quest.evaluation.detectors import our_monitor, rivals
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
-        from quest.evaluation.selection import select_takes
-        from quest.evaluation.stream_record import Shard, read_records, record_streams, tracker_id
+        from quest.evaluation.selection import Shard, select_takes
+        from quest.evaluation.stream_record import read_records, record_streams, tracker_id
         from quest.track import load
 
         if self.resamples < 1 or not self.alpha or not all(0 < a < 1 for a in self.alpha):

@@ -221,7 +221,8 @@ class CalibrateWeights:
         """Record, fit, rewrite the file."""
         from quest.data.store import TakeStore
         from quest.evaluation.calibrate import fit_calibration
-        from quest.evaluation.stream_record import Shard, record_streams
+        from quest.evaluation.selection import Shard
+        from quest.evaluation.stream_record import record_streams
         from quest.model.weights import load_network
         from quest.track import load
 

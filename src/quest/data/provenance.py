@@ -35,6 +35,16 @@ def code_commit() -> str:
     return f"version {quest.__version__}"
 
 
+def code_hash() -> str:
+    """SHA-256 over the package's code and its object split; what was changed without a commit differs too."""
+    folder = Path(quest.__file__).resolve().parent
+    digest = hashlib.sha256()
+    for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.json")]):
+        data = path.read_bytes()
+        digest.update(f"{path.relative_to(folder).as_posix()}\0{len(data)}\n".encode() + data)
+    return digest.hexdigest()
+
+
 def _git(folder: Path, *arguments: str) -> str:
     done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
     return done.stdout.strip()

@@ -92,10 +92,6 @@ class TakeStore:
         """Names of the whole takes, sorted; empty if the folder does not exist. See :meth:`problems` for the others."""
         return list(self.headers())
 
-    def present(self, names: Iterable[str]) -> set[str]:
-        """Those of some names that are whole takes of this store."""
-        return {name for name, found in self._headers(names) if isinstance(found, TakeHeader)}
-
     def problems(self) -> dict[str, str]:
         """What is wrong with each group that looks like a take but cannot be read, by name."""
         found = self._headers(self._location.names())
@@ -105,9 +101,13 @@ class TakeStore:
         """Descriptions of all whole takes by name; reads no pixels."""
         return {name: header.info for name, header in self.headers().items()}
 
-    def headers(self) -> dict[str, TakeHeader]:
-        """Headers (description, number of frames, cameras, hash) of all whole takes by name; reads no pixels."""
-        found = self._headers(self._location.names())
+    def headers(self, names: Iterable[str] | None = None) -> dict[str, TakeHeader]:
+        """Headers (description, number of frames, cameras, hash) of whole takes by name; reads no pixels.
+
+        Args:
+            names: those of these names that are there as a whole; all by default.
+        """
+        found = self._headers(self._location.names() if names is None else names)
         return {name: header for name, header in found if isinstance(header, TakeHeader)}
 
     def header(self, name: str) -> TakeHeader:

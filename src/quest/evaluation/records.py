@@ -6,7 +6,7 @@ Every number in a table can be computed again from these; they are stored as Par
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -114,12 +114,13 @@ class Unscored:
 _PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}
 
 
-def write_records(records: Sequence[EntityRecord], path: Path) -> None:
+def write_records(records: Sequence[EntityRecord], path: Path, *, about: Mapping[str, str] | None = None) -> None:
     """Write records as Parquet, one row each with lists over frames; atomic.
 
     Args:
-        records: at least one.
+        records: what to write.
         path: the file.
+        about: written beside the rows, as the table's metadata.
     """
     flat = [f.name for f in fields(EntityRecord) if f.name != "subject" and f.name not in _PER_FRAME]
     columns: dict[str, list] = {f.name: [getattr(r.subject, f.name) for r in records] for f in fields(Subject)}
@@ -130,7 +131,7 @@ def write_records(records: Sequence[EntityRecord], path: Path) -> None:
         arrays[name] = pa.array([getattr(r, name) for r in records], type=pa.list_(item))
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        pq.write_table(pa.table(arrays), temporary, compression="zstd")
+        pq.write_table(pa.table(arrays).replace_schema_metadata(about), temporary, compression="zstd")
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -142,19 +143,28 @@ def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
     Raises:
         InputError: the file is missing or is no such file.
     """
+    return read_described(path)[0]
+
+
+def read_described(path: str | Path) -> tuple[tuple[EntityRecord, ...], dict[str, str]]:
+    """Read what :func:`write_records` wrote, and what was written beside it.
+
+    Raises:
+        InputError: the file is missing or is no such file.
+    """
     try:
         table = pq.read_table(path)
-        rows = table.to_pylist()
         records = []
-        for row in rows:
+        for row in table.to_pylist():
             subject = Subject(**{f.name: row.pop(f.name) for f in fields(Subject)})
             per_frame: dict[str, Any] = {
                 name: np.array(row.pop(name), dtype=dtype) for name, dtype in _PER_FRAME.items()
             }
             records.append(EntityRecord(subject=subject, **row, **per_frame))
+        about = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
         raise InputError(f"records {path}: expected a Parquet file written by `quest eval --out` ({error})") from error
-    return tuple(records)
+    return tuple(records), about
 
 
 def discovery_to_json(found: Discovery) -> dict:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
+from quest.evaluation.finished import FinishedTakes, TakeOutcome
 from quest.evaluation.protocols import (
     ClipTracker,
     ProtocolName,
@@ -17,7 +18,7 @@ from quest.evaluation.protocols import (
     unscored_entities,
 )
 from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
-from quest.evaluation.selection import SplitPart
+from quest.evaluation.selection import WHOLE, Shard, SplitPart
 from quest.types import Take
 
 
@@ -30,12 +31,14 @@ class Evaluated:
         discoveries: per tracker, take and view of the semantic protocol.
         unscored: entities not scored, per take and view.
         notes: what a reader must know, in words.
+        missing: takes that are left to other shards; what is known is not whole before there are none.
     """
 
     records: tuple[EntityRecord, ...]
     discoveries: tuple[Discovery, ...]
     unscored: tuple[Unscored, ...]
     notes: tuple[str, ...]
+    missing: int = 0
 
 
 def has_protocol(tracker: ClipTracker, protocol: ProtocolName) -> bool:
@@ -49,6 +52,8 @@ def evaluate(
     trackers: Sequence[ClipTracker],
     *,
     protocols: Sequence[ProtocolName] = ("point",),
+    finished: FinishedTakes | None = None,
+    shard: Shard = WHOLE,
     progress: Callable[[str, int], None] = lambda doing, frames: None,
 ) -> Evaluated:
     """Evaluate trackers on takes.
@@ -58,39 +63,79 @@ def evaluate(
         takes: names and part of the object split, from :func:`quest.evaluation.selection.select_takes`.
         trackers: with names of their own.
         protocols: each tracker is evaluated under those that it has.
+        finished: where takes are kept as they are done, and taken up again; nothing is kept by default.
+        shard: the part of the takes that this process evaluates; those of the others are taken from ``finished``.
         progress: called before each view with what is being done, and the number of frames done since the last call.
 
     Raises:
-        ConfigError: two trackers have one name, or no tracker has any of the protocols.
+        ConfigError: two trackers have one name, none has any of the protocols, or a shard has nothing to share by.
+        InputError: a finished take is damaged.
         TakeError: a take cannot be read.
     """
     names = [tracker.name for tracker in trackers]
     if len(set(names)) < len(names):
         raise ConfigError(f"trackers: expected different names, got {', '.join(names)}")
+    if finished is None and shard.count > 1:
+        raise ConfigError("shard: expected a folder of finished takes that the processes share, got none")
     runs: list[tuple[ProtocolName, ClipTracker]] = [
         (protocol, tracker) for protocol in protocols for tracker in trackers if has_protocol(tracker, protocol)
     ]
     if not runs:
         raise ConfigError(f"no tracker of {', '.join(names)} has the protocol {' or '.join(protocols)}; add quest")
+    hashes = {} if finished is None else {name: store.data_hash(name) for name in takes}
+    done: dict[str, TakeOutcome] = {}
+    frames = 0
+
+    def tell(doing: str, coming: int) -> None:
+        nonlocal frames
+        progress(doing, frames)
+        frames = coming
+
+    def take_up(name: str) -> bool:
+        known = None if finished is None else finished.read(name, hashes[name])
+        if known is not None:
+            done[name] = known
+        return known is not None
+
+    for name in [name for i, name in enumerate(takes) if i in shard]:
+        if take_up(name):
+            header = store.header(name)
+            tell(f"{name} is there", header.frames * len(header.cameras) * len(runs))
+            continue
+        done[name] = _evaluate_take(store.read(name), runs, takes[name], tell)
+        if finished is not None:
+            finished.write(name, hashes[name], done[name])
+    tell("done", 0)
+    missing = sum(not take_up(name) for name in takes if name not in done)  # only now: other shards went on meanwhile
+    return _joined({name: done[name] for name in takes if name in done}, protocols, missing)
+
+
+def _evaluate_take(
+    take: Take, runs: Sequence[tuple[ProtocolName, ClipTracker]], part: SplitPart, tell: Callable[[str, int], None]
+) -> TakeOutcome:
     records: list[EntityRecord] = []
     discoveries: list[Discovery] = []
-    unscored: list[Unscored] = []
-    moving = []
-    done = 0
-    for name, part in takes.items():
-        take = store.read(name)
-        unscored += unscored_entities(take)
-        if not starts_at_rest(take):
-            moving.append(name)
-        for view in range(len(take.views)):
-            for protocol, tracker in runs:
-                progress(f"{tracker.name} {protocol} {name}", done)
-                outcome = _evaluate_view(tracker, protocol, take, view, part)
-                records += outcome.records
-                discoveries += () if outcome.discovery is None else (outcome.discovery,)
-                done = len(take)
-    progress("done", done)
-    return Evaluated(tuple(records), tuple(discoveries), tuple(unscored), _notes(unscored, moving, protocols))
+    for view in range(len(take.views)):
+        for protocol, tracker in runs:
+            tell(f"{tracker.name} {protocol} {take.info.name}", len(take))
+            outcome = _evaluate_view(tracker, protocol, take, view, part)
+            records += outcome.records
+            discoveries += () if outcome.discovery is None else (outcome.discovery,)
+    return TakeOutcome(
+        tuple(records), tuple(discoveries), tuple(unscored_entities(take)), moving=not starts_at_rest(take)
+    )
+
+
+def _joined(done: Mapping[str, TakeOutcome], protocols: Sequence[ProtocolName], missing: int) -> Evaluated:
+    unscored = tuple(u for outcome in done.values() for u in outcome.unscored)
+    moving = [name for name, outcome in done.items() if outcome.moving]
+    return Evaluated(
+        tuple(r for outcome in done.values() for r in outcome.records),
+        tuple(d for outcome in done.values() for d in outcome.discoveries),
+        unscored,
+        _notes(unscored, moving, protocols),
+        missing,
+    )
 
 
 def _evaluate_view(tracker: ClipTracker, protocol: ProtocolName, take: Take, view: int, part: SplitPart) -> ViewOutcome:
@@ -100,7 +145,7 @@ def _evaluate_view(tracker: ClipTracker, protocol: ProtocolName, take: Take, vie
     return run(tracker, take, view, subject)
 
 
-def _notes(unscored: list[Unscored], moving: list[str], protocols: Sequence[ProtocolName]) -> tuple[str, ...]:
+def _notes(unscored: Sequence[Unscored], moving: Sequence[str], protocols: Sequence[ProtocolName]) -> tuple[str, ...]:
     notes = []
     if unscored:
         notes.append(

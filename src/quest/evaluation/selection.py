@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 from quest.data.split import PARTS, split_of
@@ -20,6 +21,38 @@ def part_of(info: TakeInfo) -> SplitPart:
         return split_of(info)
     except ObjectError:
         return "unlisted"
+
+
+@dataclass(frozen=True)
+class Shard:
+    """A part of the takes or streams, for processes side by side.
+
+    Attributes:
+        index: from 0.
+        count: how many parts there are.
+    """
+
+    index: int = 0
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """Read ``0/2``, the first of two.
+
+        Raises:
+            ConfigError: the text is of another form or the index too large.
+        """
+        index, _, count = text.partition("/")
+        if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+            raise ConfigError(f"shard {text!r}: expected index/count such as 0/2, the index below the count")
+        return cls(int(index), int(count))
+
+    def __contains__(self, i: int) -> bool:
+        return i % self.count == self.index
+
+
+WHOLE = Shard()
+"""All of it."""
 
 
 Chosen = Sequence[tuple[TakeStore, Mapping[str, SplitPart]]]

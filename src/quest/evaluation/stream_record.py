@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float32, Int
 
 from quest.errors import ConfigError, InputError
 from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
-from quest.evaluation.selection import Chosen
+from quest.evaluation.selection import Chosen, Shard
 from quest.monitor import SIGNALS
 from quest.track import Tracker
 from quest.track.settings import REVISION
@@ -183,31 +183,6 @@ def tracker_id(tracker: Tracker) -> str:
 
 
 @dataclass(frozen=True)
-class Shard:
-    """A part of the streams, for processes side by side.
-
-    Attributes:
-        index: from 0.
-        count: how many parts there are.
-    """
-
-    index: int = 0
-    count: int = 1
-
-    @classmethod
-    def parse(cls, text: str) -> Shard:
-        """Read ``0/2``, the first of two.
-
-        Raises:
-            ConfigError: the text is of another form or the index too large.
-        """
-        index, _, count = text.partition("/")
-        if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
-            raise ConfigError(f"shard {text!r}: expected index/count such as 0/2, the index below the count")
-        return cls(int(index), int(count))
-
-
-@dataclass(frozen=True)
 class Recorded:
     """What a folder has of the streams that were asked for.
 
@@ -255,7 +230,7 @@ def record_streams(
     take: Take | None = None
     for i, (store, name, part, view) in enumerate(streams):
         path, of = folder / f"{name}-view{view}.npz", _Origin(made_by, hashes[name])
-        if i % shard.count != shard.index or _origin(path) == of:
+        if i not in shard or _origin(path) == of:
             continue
         progress(f"{name} view {view}", i, len(streams))
         take = take if take is not None and take.info.name == name else store.read(name)

@@ -123,7 +123,7 @@ def _shaped(
 
 
 def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
-    """What is unusual about how a take is made, for its provenance."""
+    """How a take is made, for its provenance: a digest of all settings, and what is unusual in plain words."""
     ordinary, found = TakeSettings(), {}
     for what in ("cameras", "motion", "sensor"):
         if getattr(settings, what) != getattr(ordinary, what):
@@ -131,7 +131,8 @@ def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     for what in ("physics", "gripper", "disturbance", "broad_materials"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = getattr(settings, what)
-    return {**({"variant": suite.variant} if suite is not None and suite.variant else {}), **found}
+    variant = {"variant": suite.variant} if suite is not None and suite.variant else {}
+    return {"settings": settings.digest, **variant, **found}
 
 
 def _record(

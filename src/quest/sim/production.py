@@ -197,7 +197,8 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
     """Those takes that the store does not have as a whole, each once.
 
     Raises:
-        ConfigError: two different takes have the same name, as those of objects whose folders have.
+        ConfigError: two different takes have the same name, as those of objects whose folders have; or the store has
+            one that was made with other settings.
     """
     wanted: dict[str, TakeSpec] = {}
     for spec in specs:
@@ -206,7 +207,14 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
                 f"take {spec.name}: it is planned of {wanted[spec.name].object_id} and of {spec.object_id}; rename the "
                 "folder of one of them, or use two stores"
             )
-    there = store.present(wanted)
+    there = store.headers(wanted)
+    for name, header in there.items():
+        about, digest = header.info.provenance, wanted[name].settings.digest
+        if about.get("settings", digest) != digest:  # older takes do not say
+            raise ConfigError(
+                f"take {name}: {store.url} has it with other settings, made by `{about.get('command', 'unknown')}`; "
+                "use another store, another --seed, or delete it there"
+            )
     return [spec for name, spec in wanted.items() if name not in there]
 
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+import json
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import Any
 
 from quest.errors import ConfigError
 from quest.sim.cameras import CameraStyle
@@ -68,3 +71,19 @@ class TakeSettings:
             raise ConfigError(
                 f"take: unknown disturbance {self.disturbance!r}; expected one of {', '.join(DISTURBANCES)}"
             )
+
+    @property
+    def digest(self) -> str:
+        """Short hash of what differs from the defaults: takes of one name and digest show the same."""
+        return hashlib.sha256(json.dumps(_unusual(self, TakeSettings()), sort_keys=True).encode()).hexdigest()[:12]
+
+
+def _unusual(settings: Any, ordinary: Any) -> dict[str, Any]:
+    """Fields that differ, so that a field that comes with a later version changes no digest by its default."""
+    found: dict[str, Any] = {}
+    for f in fields(settings):
+        value, usual = getattr(settings, f.name), getattr(ordinary, f.name)
+        if value != usual:
+            plain = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+            found[f.name] = _unusual(value, usual) if type(value) is type(usual) and plain is not value else plain
+    return found
