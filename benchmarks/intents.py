@@ -77,10 +77,13 @@ def _table(rows: tuple[IntentRow, ...]) -> Table:
         "objects",
         "objects/takes/views",
         "both stable %",
+        "both on their link %",
         "APE open",
         "APE lift",
         "Acc open %",
         "Acc lift %",
+        "bound open",
+        "bound lift",
     ):
         table.add_column(heading)
     for row in rows:
@@ -88,10 +91,13 @@ def _table(rows: tuple[IntentRow, ...]) -> Table:
             f"{row.source}, {row.part}",
             f"{row.objects}/{row.takes}/{row.views}",
             shown(row.both, decimals=0, factor=100),
+            shown(row.kept, decimals=0, factor=100),
             shown(row.open_ape),
             shown(row.lift_ape),
             shown(row.open_acc, decimals=0, factor=100),
             shown(row.lift_acc, decimals=0, factor=100),
+            shown(row.open_bound),
+            shown(row.lift_bound),
         )
     return table
 

@@ -49,8 +49,9 @@ def _ablation(file: str, title: str, columns: dict[str, str]) -> Table:
 
 
 def _intents(file: str, title: str) -> Table:
-    shares = {"both stable %": "%both", "APE open": "open_ape", "APE lift": "lift_ape"}
+    shares = {"both stable %": "%both", "both on their link %": "%kept", "APE open": "open_ape", "APE lift": "lift_ape"}
     right = {"Acc open %": "%open_acc", "Acc lift %": "%lift_acc"}
+    right |= {"bound open": "open_bound", "bound lift": "lift_bound"}
     counts = {"objects/takes/views": "objects/takes/views"}
     return Table(f"intents/{file}.json", title, "rows", OBJECTS | counts | shares | right)
 

@@ -6,16 +6,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from quest.data.cut import cut_clip
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
 from quest.evaluation.metrics import GATE, Sums, distance, identity
 from quest.evaluation.protocols import ClipTracker, first_visible
+from quest.geometry import invert, transform
 from quest.types import INTENTS, Query, Take, View
 
 STABLE = 0.95
 """A track is stable if it is nearest to its own entity, and within the gate, in so many of the frames."""
+
+
+MEASURED = (
+    "both",
+    "kept",
+    *(f"{intent}_{what}" for what in ("ape", "acc", "bound", "kept") for intent in ("open", "lift")),
+)
+"""What a row says of its answers."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +44,11 @@ class IntentAnswer:
         lift_ape: the same to the entity to lift by.
         open_acc: share of frames in which the answer is nearest to its own entity and within 0.1.
         lift_acc: the same to lift by.
+        open_bound: 3D distance of the first answer to the entity to open by; 1 if there is none.
+        lift_bound: the same to lift by.
+        open_kept: share of frames in which the answer is within 0.1 of the spot of the entity's own link on which the
+            first answer was. It says whether the right link is followed, wherever on it the track began.
+        lift_kept: the same to lift by.
     """
 
     take: str
@@ -47,11 +62,20 @@ class IntentAnswer:
     lift_ape: float
     open_acc: float
     lift_acc: float
+    open_bound: float
+    lift_bound: float
+    open_kept: float
+    lift_kept: float
 
     @property
     def both(self) -> bool:
-        """Whether the answers are two distinct, stable tracks."""
+        """Whether the answers are two distinct, stable tracks of the entities themselves."""
         return min(self.open_acc, self.lift_acc) >= STABLE
+
+    @property
+    def kept(self) -> bool:
+        """Whether they are two distinct, stable tracks on the entities' links."""
+        return min(self.open_kept, self.lift_kept) >= STABLE
 
 
 @dataclass(frozen=True)
@@ -64,11 +88,16 @@ class IntentRow:
         objects: how many.
         takes: how many.
         views: how many were judged.
-        both: share of views with two distinct, stable tracks.
+        both: share of views with two distinct, stable tracks of the entities themselves.
+        kept: share of views with two distinct, stable tracks on the entities' links.
         open_ape: mean 3D distance of what opens, normalised units.
         lift_ape: of what lifts.
         open_acc: share of frames in which what opens is followed.
         lift_acc: what lifts.
+        open_bound: mean 3D distance of the first answer to the entity to open by.
+        lift_bound: to the one to lift by.
+        open_kept: share of frames in which the spot of its link is followed on which the first answer was.
+        lift_kept: what lifts.
     """
 
     part: str
@@ -77,10 +106,15 @@ class IntentRow:
     takes: int
     views: int
     both: Value | None
+    kept: Value | None
     open_ape: Value | None
     lift_ape: Value | None
     open_acc: Value | None
     lift_acc: Value | None
+    open_bound: Value | None
+    lift_bound: Value | None
+    open_kept: Value | None
+    lift_kept: Value | None
 
 
 def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
@@ -126,6 +160,9 @@ def judge_intents(
         queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
         tracks = tracker.track(cut_clip(clip, slice(begin, None)), queries)
         gap, right = _score(take, tracks.point_world, pair, begin)
+        (open_first, open_kept), (lift_first, lift_kept) = (
+            _kept(take, tracks.point_world[:, i], entity, begin) for i, entity in enumerate(pair)
+        )
         answers.append(
             IntentAnswer(
                 take=info.name,
@@ -139,6 +176,10 @@ def judge_intents(
                 lift_ape=float(gap[:, 1].mean()),
                 open_acc=float(right[:, 0].mean()),
                 lift_acc=float(right[:, 1].mean()),
+                open_bound=float(gap[open_first, 0]),
+                lift_bound=float(gap[lift_first, 1]),
+                open_kept=open_kept,
+                lift_kept=lift_kept,
             )
         )
     return answers
@@ -160,6 +201,19 @@ def _score(
     return gap, (nearest == rank) & (gap <= GATE)
 
 
+def _kept(take: Take, point_world: Float[np.ndarray, "T 3"], entity: int, begin: int) -> tuple[int, float]:
+    """Frame of the first answer (0 if there is none), and the share of frames on that spot of the entity's link."""
+    known = np.flatnonzero(np.isfinite(point_world).all(axis=-1))
+    if not len(known):
+        return 0, 0.0
+    first = int(known[0])
+    world_from_link = torch.from_numpy(take.link_pose[begin:, take.info.entities[entity].link]).double()
+    spot = transform(invert(world_from_link[first]), torch.from_numpy(point_world[first]).double())
+    carried = transform(world_from_link, spot).numpy()
+    gap = distance(point_world.astype(np.float64), carried, half_diagonal_m=take.info.half_diagonal_m)
+    return first, float((gap <= GATE).mean())
+
+
 def intent_rows(answers: Sequence[IntentAnswer], *, resamples: int = 1000, seed: int = 0) -> tuple[IntentRow, ...]:
     """One row per part and source."""
     rows = []
@@ -172,6 +226,6 @@ def intent_rows(answers: Sequence[IntentAnswer], *, resamples: int = 1000, seed:
             numbers = np.array([float(getattr(a, name)) for a in chosen])
             return mean_value(Sums(numbers, np.ones(len(numbers))), owner, draws)
 
-        measured = {name: value(name) for name in ("both", "open_ape", "lift_ape", "open_acc", "lift_acc")}
+        measured = {name: value(name) for name in MEASURED}
         rows.append(IntentRow(part, source, len(objects), len({a.take for a in chosen}), len(chosen), **measured))
     return tuple(rows)
