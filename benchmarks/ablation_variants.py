@@ -10,9 +10,9 @@ from quest.evaluation.lineup import FLOW_NOISES
 from quest.model.config import PRESETS, NetworkConfig
 from quest.train.settings import LossWeights, WindowConfig
 
-TableName = Literal["parts", "window", "slots", "losses", "design"]
+TableName = Literal["parts", "window", "slots", "losses", "design", "data"]
 PresetName = Literal["default", "paper"]
-TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "design")
+TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "design", "data")
 
 LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 """Losses that know of 3D; the others are of pixels, features and confidences."""
@@ -35,6 +35,7 @@ class Variant:
         windows: how windows are drawn.
         flow: whether stage 2 trains a flow head.
         no_depth: whether it never sees depth.
+        sources: of the takes that teach it; None for all.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Variant:
     windows: WindowConfig = field(default_factory=WindowConfig)
     flow: bool = False
     no_depth: bool = False
+    sources: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,15 @@ def no_3d(preset: PresetName) -> Variant:
 
 def lines_of(table: TableName, presets: Sequence[PresetName]) -> tuple[Line, ...]:
     """The rows of a table; every variant of a preset is compared with that preset as it is."""
-    rows = {"parts": _parts, "window": _window, "slots": _slots, "losses": _losses, "design": _design}[table]
+    makers = {
+        "parts": _parts,
+        "window": _window,
+        "slots": _slots,
+        "losses": _losses,
+        "design": _design,
+        "data": _data,
+    }
+    rows = makers[table]
     return tuple(line for preset in presets for line in rows(preset))
 
 
@@ -163,3 +173,10 @@ def _design(preset: PresetName) -> list[Line]:
         codes = changed(preset, "points3d", points3d=True)
         lines.append(Line(f"{preset}: 3D position codes", codes, "quest", own))
     return lines
+
+
+def _data(preset: PresetName) -> list[Line]:
+    """Objects free for any use against all; the steps are the same."""
+    own = f"{preset}: all training objects"
+    free = replace(full(preset), name=f"{preset}-procedural", flow=False, sources=("procedural",))
+    return [Line(own, full(preset)), Line(f"{preset}: procedural objects only", free, "quest", own)]

@@ -161,6 +161,7 @@ class Ablations:
             windows=replace(item.windows, batch=self.batch),
             device=pick_device("auto"),
             report=lambda done, total, frames: None,
+            sources=item.sources,
         )
 
     def _fit(
@@ -209,6 +210,7 @@ class Ablations:
             "network": json.loads(item.network.to_json()),
             "losses": asdict(item.losses),
             "windows": asdict(item.windows),
+            "sources": None if item.sources is None else list(item.sources),
             "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
             "training_hash": self.training_hash,
         }

@@ -96,6 +96,7 @@ TABLES = (
     _ablation("slots", "K learned queries", SIZES),
     _ablation("losses", "Every loss left out by itself", PARTS),
     _ablation("design", "Heatmap against regression, anchors against learned queries, 3D position codes", PARTS),
+    _ablation("data", "Trained on procedural objects only", PARTS),
     Table(
         "monitor/test.json",
         "Drift per frame: the monitor beside plainer rules",

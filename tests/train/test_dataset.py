@@ -18,7 +18,9 @@ from tests.train.prepared import CPU, make_store
 TRAIN, VALIDATION, TEST, UNLISTED = 3, 100003, 110003, 999999
 
 
-def opened(tmp_path: Path, seeds: Sequence[int], validation: Sequence[int] = ()) -> tuple[Dataset, list[tuple]]:
+def opened(
+    tmp_path: Path, seeds: Sequence[int], validation: Sequence[int] = (), sources: Sequence[str] | None = None
+) -> tuple[Dataset, list[tuple]]:
     stores = [make_store(tmp_path / "a", seeds, frames=4).root]
     chosen = [make_store(tmp_path / "b", validation, frames=4).root] if validation else []
     told: list[tuple] = []
@@ -30,6 +32,7 @@ def opened(tmp_path: Path, seeds: Sequence[int], validation: Sequence[int] = ())
         windows=WindowConfig(),
         device=CPU,
         report=lambda *values: told.append(values),
+        sources=sources,
     )
     return dataset, told
 
@@ -44,6 +47,13 @@ def test_one_store_is_divided_by_the_split(tmp_path: Path):
     assert objects(dataset) == (["panels-3"], ["panels-100003"])
     assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
     assert told == [(1, 2, 4), (2, 2, 8)]
+
+
+def test_sources_are_those_of_takes_that_teach(tmp_path: Path):
+    dataset, _ = opened(tmp_path / "one", (TRAIN, VALIDATION), sources=("procedural",))
+    assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
+    with pytest.raises(ConfigError, match="no train takes"):
+        opened(tmp_path / "other", (TRAIN, VALIDATION), sources=("partnet-mobility",))
 
 
 def test_own_objects_need_a_store_to_choose_by(tmp_path: Path):

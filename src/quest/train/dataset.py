@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -61,6 +61,7 @@ def open_dataset(
     device: torch.device,
     report: Callable[[int, int, int], None],
     anchors_only: bool = False,
+    sources: Collection[str] | None = None,
 ) -> Dataset:
     """Select takes by the object split and prepare their features.
 
@@ -79,6 +80,7 @@ def open_dataset(
         device: where the encoder runs.
         report: told takes done, takes in all, frames so far.
         anchors_only: whether windows are anchor frames alone, for the affordance map.
+        sources: of the takes that teach (``partnet-mobility``, ``procedural``, ``own``); all by default
 
     Raises:
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
@@ -95,7 +97,9 @@ def open_dataset(
                 part = _part(info)
                 if part == "unlisted":
                     part = role if validation_stores else "none"
-                if part == role or (not validation_stores and not mirrored and part == "validation"):
+                teaches = part == "train" == role and (sources is None or info.source in sources)
+                chooses = part == "validation" and not mirrored and (role == "validation" or not validation_stores)
+                if teaches or chooses:
                     wanted.append(_Wanted(store, name, part, mirrored))
     takes = {part: [w.entry for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
