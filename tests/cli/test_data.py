@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
 from quest.cli import main as program
+from quest.cli.data_stats import finite
+from quest.data.consistency import Check
 from quest.data.store import TakeStore
 from quest.extras import is_installed
 from tests.synthetic import make_take
@@ -116,6 +120,24 @@ def test_verify(whole: Path, broken: Path, tmp_path: Path, capsys: pytest.Captur
     assert quest("verify", broken / "nowhere.zarr") == 1
 
 
+def test_verify_writes_finite_json(broken: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    class Endless(Check):
+        def __init__(self, *arguments: Any, **named: Any) -> None:
+            super().__init__(*arguments, **named)
+            object.__setattr__(self, "worst", math.inf)
+
+    monkeypatch.setattr("quest.data.consistency.Check", Endless)
+    path = tmp_path / "verify.json"
+    assert quest("verify", broken / "whole.zarr", "--json", path) == 0
+    found = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    assert found["worst"]["reprojection"]["worst"] is None
+
+
+def test_finite():
+    found = finite({"a": [1.0, math.inf, {"b": math.nan}], "c": (-math.inf, 2, "inf"), "d": None})
+    assert found == {"a": [1.0, None, {"b": None}], "c": [None, 2, "inf"], "d": None}
+
+
 def test_export(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert quest("export", whole, "--out", tmp_path) == 0
     files = sorted(path.name for path in tmp_path.iterdir())
@@ -145,6 +167,8 @@ def test_export_to_mcap(whole: Path, tmp_path: Path):
         (["show", "takes/nowhere.zarr"], "no folder"),
         (["show", "takes", "--rrd", "x.rrd"], "is a store; name one, such as takes/panels.zarr"),
         (["show", "takes/single.zarr", "--every", "0"], "at least 1"),
+        (["show", "takes/single.zarr", "--out", "sheet.txt"], "expected a picture, .png"),
+        (["show", "takes", "--out", "sheets"], "expected a picture, .png"),
         (["show", "empty"], "no takes"),
         (["stats", "takes/single.zarr"], "expected a store"),
         (["verify", "empty"], "no takes"),

@@ -8,13 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tyro
 
 from quest.cli.main import main
 from quest.cli.source import Source
+from quest.cli.track import Track
 from quest.data.frame_source import FrameSource
 from quest.data.lerobot_export import Episode, export_lerobot
 from quest.data.mcap_export import export_mcap
 from quest.data.recording import write_recording
+from quest.data.store import TakeStore
 from quest.data.tracks_file import read_tracks
 from quest.errors import RecordingError
 from quest.model.weights import save_network
@@ -114,6 +117,47 @@ def test_points_beyond_the_end(sources: dict[str, str]):
     source = Source(sources["clip.mcap"], point=(f"{FRAMES},1,1",))
     with pytest.raises(ValueError, match=f"0 to {FRAMES - 1}, got {FRAMES}"):
         source.queries(source.open())
+
+
+def test_every_clip_has_a_folder_of_its_own(
+    clip: Clip, sources: dict[str, str], weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    store = TakeStore(tmp_path / "takes")
+    take = make_take(frames=FRAMES, views=2, entities=2, size=(64, 48), name="a.b")
+    store.write(take)
+    store.write(replace(take, info=replace(take.info, name="a.c")))
+    write_recording(clip, tmp_path / "drawer.1", rgb="png")
+    write_recording(clip, tmp_path / "drawer.2", rgb="png")
+    command = ["--weights", weights, "--point", "0,20,30", "--no-overlay"]
+    for source in (["takes/a.b.zarr/"], ["takes/a.b.zarr", "--view", "1"], ["takes/a.c.zarr"], ["drawer.1"]):
+        assert main(["track", *source, *command]) == 0
+    assert main(["track", "drawer.2/", *command]) == 0
+    for episode in ("0", "1"):
+        assert main(["track", sources["lerobot"], "--episode", episode, *command]) == 0
+    assert sorted(file.parent.name for file in Path("outputs").glob("*/tracks.parquet")) == [
+        "a.b-view0",
+        "a.b-view1",
+        "a.c-view0",
+        "drawer.1",
+        "drawer.2",
+        "lerobot-000000-front",
+        "lerobot-000001-front",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "folder"),
+    [("a/b", "a-b"), ("..", "clip"), ("C:\\x", "C--x"), ("sample", "sample"), ("Küche 1.5", "Küche 1.5")],
+)
+def test_names_become_folders(clip: Clip, name: str, folder: str):
+    assert Track("anything")._name(replace(clip, name=name)) == folder
+
+
+@pytest.mark.parametrize("words", [["--depth", "d"], ["--camera", "c.json"], ["--depth-scale-m", "0.001"]])
+def test_a_take_has_depth_and_a_camera_of_its_own(words: list[str]):
+    with pytest.raises(RecordingError, match="of its own"):
+        tyro.cli(Track, args=["takes/a.zarr", *words]).open()
 
 
 def test_no_such_recording():

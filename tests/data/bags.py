@@ -121,14 +121,17 @@ def write_bag(path: Path, sent: Sequence[Sent], *, storage: str = "sqlite3") -> 
     return path
 
 
-def write_ros1(path: Path, sent: Sequence[Sent]) -> Path:
+def write_ros1(path: Path, sent: Sequence[Sent], *, compression: str | None = None) -> Path:
     """A ROS 1 bag, by the writer of the rosbags library."""
     from rosbags.rosbag1 import Writer
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store, connections = get_typestore(Stores.ROS1_NOETIC), {}
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
-    with Writer(path) as writer:
+    writer = Writer(path)
+    if compression is not None:
+        writer.set_compression(Writer.CompressionFormat[compression])
+    with writer:
         for number, (topic, kind, fields, log_ns) in enumerate(sent):
             if topic not in connections:
                 connections[topic] = writer.add_connection(topic, kind, typestore=store)

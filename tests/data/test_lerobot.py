@@ -13,8 +13,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
+from quest.data.camera_file import CameraFile, write_camera
 from quest.data.frame_source import Parts
 from quest.data.lerobot import DepthRange
 from quest.data.lerobot_export import Episode, export_lerobot
@@ -259,6 +260,66 @@ def test_pictures_in_the_rows(tmp_path: Path):
     np.testing.assert_array_equal(found.rgb, rgb[8:])
     assert found.depth_m is not None
     np.testing.assert_allclose(found.depth_m, depth_mm[8:] / 1000, atol=1e-6)
+
+
+def edit_rows(folder: Path, **columns: list[Any]) -> None:
+    path = next(folder.glob("data/*/*.parquet"))
+    table = pq.read_table(path)
+    for name, values in columns.items():
+        table = table.set_column(table.column_names.index(name), name, pa.array(values))
+    pq.write_table(table, path)
+
+
+def test_units_of_depth_in_the_rows(tmp_path: Path):
+    folder, _, depth_mm = foreign(tmp_path / "set", keep="image")
+    found = read_recording(folder, camera=CAMERA, depth_scale_m=2e-3)
+    assert found.depth_m is not None
+    np.testing.assert_allclose(found.depth_m, depth_mm[:8] / 500, atol=1e-6)
+    camera = CameraFile(CAMERA, depth_scale_m=5e-4)
+    write_camera(camera, tmp_path / "camera.json")
+    found = read_recording(folder, camera=tmp_path / "camera.json")
+    assert found.depth_m is not None
+    np.testing.assert_allclose(found.depth_m, depth_mm[:8] / 2000, atol=1e-6)
+    with pytest.raises(RecordingError, match="depth_scale_m is -1, expected a positive number"):
+        open_recording(folder, camera=CAMERA, depth_scale_m=-1)
+    with pytest.raises(RecordingError, match=r"with depth_scale_m = 1, .*depth_scale_m = 0\.001 would give"):
+        read_recording(folder, camera=CAMERA, depth_scale_m=1)
+    with pytest.raises(RecordingError, match="but a LeRobot dataset has its depth in a feature of its own"):
+        open_recording(folder, camera=CAMERA, depth=tmp_path)
+
+
+def test_a_depth_video_has_units_of_its_own(dataset: Path):
+    with pytest.raises(RecordingError, match=r"view_0_depth is a video, whose metres info\.json gives"):
+        open_recording(dataset, depth_scale_m=1e-3)
+
+
+def test_deep_and_turned_colours_in_the_rows(tmp_path: Path):
+    folder, rgb, _ = foreign(tmp_path / "set", keep="image")
+    key = "observation.images.top"
+    grey = rgb[..., 0].astype(np.uint16) * 256 + 77
+    edit_rows(folder, **{key: [{"bytes": encoded(picture, "PNG"), "path": "frame"} for picture in grey]})
+    np.testing.assert_array_equal(read_recording(folder, camera=CAMERA).rgb[..., 1], rgb[:8, ..., 0])
+    buffer, exif = io.BytesIO(), Image.Exif()
+    exif[ExifTags.Base.Orientation] = 3
+    Image.fromarray(rgb[0]).save(buffer, format="PNG", exif=exif)
+    edit_rows(folder, **{key: [{"bytes": buffer.getvalue(), "path": "frame"}] * 20})
+    with pytest.raises(RecordingError, match=r"a picture of observation\.images\.top .*depth is not turned with them"):
+        read_recording(folder, camera=CAMERA)
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    edit_info(folder, features={key: info["features"][key]})
+    np.testing.assert_array_equal(read_recording(folder, camera=CAMERA).rgb[0], rgb[0, ::-1, ::-1])
+
+
+def test_damaged_pictures_in_the_rows(tmp_path: Path):
+    folder, _, _ = foreign(tmp_path / "set", keep="image")
+    path = next(folder.glob("data/*/*.parquet"))
+    column = pq.read_metadata(path).row_group(0).column(5)
+    assert column.path_in_schema.startswith("observation.images.top.bytes")
+    data, begin = bytearray(path.read_bytes()), column.dictionary_page_offset or column.data_page_offset
+    data[begin : begin + 400] = b"\xff" * 400
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"(?s)file-000\.parquet: cannot be read.*copy it again"):
+        read_recording(folder, camera=CAMERA)
 
 
 def test_depth_codes():

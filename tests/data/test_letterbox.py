@@ -26,9 +26,8 @@ def test_pixels_there_and_back(size: tuple[int, int], x: float, y: float):
     uv = np.array([[x * size[0], y * size[1]]])
     canvas = letterbox.to_canvas(uv)
     np.testing.assert_allclose(letterbox.to_source(canvas), uv, atol=1e-9 * max(size))
-    # The image is scaled to whole pixels, so its edge may be one off.
-    assert (canvas >= -1).all()
-    assert (canvas <= letterbox.size + 1).all()
+    assert (canvas >= -1e-6).all()
+    assert (canvas <= letterbox.size + 1e-6).all()
 
 
 @given(sizes)
@@ -55,6 +54,22 @@ def test_a_dot_lands_where_its_pixel_says(width: int, height: int):
     y, x = np.mgrid[:64, :64] + 0.5
     found = np.array([(placed * x).sum(), (placed * y).sum()]) / placed.sum()
     np.testing.assert_allclose(found, letterbox.to_canvas(centre), atol=0.5)
+
+
+@pytest.mark.parametrize(("width", "height"), [(100, 3), (3, 100), (101, 37), (2000, 8), (64, 64), (640, 480)])
+def test_the_corners_of_the_image_are_where_its_pixels_end(width: int, height: int):
+    letterbox = box(width, height)
+    seen = letterbox.rgb(np.full((height, width, 3), 255, np.uint8))[..., 0] > 0
+    rows, columns = np.nonzero(seen)
+    corners = letterbox.to_canvas(np.array([[0.0, 0.0], [width, height]]))
+    found = [[columns.min(), rows.min()], [columns.max() + 1, rows.max() + 1]]
+    np.testing.assert_allclose(corners, found, atol=1e-6)
+
+
+def test_square_frames_have_one_scale():
+    letterbox = box(333, 333)
+    assert letterbox.scale_xy == (letterbox.scale, letterbox.scale)
+    assert letterbox.camera.fx == letterbox.source.fx * letterbox.scale
 
 
 def test_a_square_frame_of_the_right_size_stays_as_it_is():

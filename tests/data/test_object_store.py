@@ -180,6 +180,75 @@ def test_a_lost_answer_to_the_last_step_is_no_failure(take: Take, monkeypatch: p
     store.verify("panels")
 
 
+def lost_answer(*_: Any) -> None:
+    raise obstore.exceptions.GenericError("no route to host")
+
+
+def ctrl_c(*_: Any) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("error", [lost_answer, ctrl_c])
+def test_what_a_header_may_name_is_kept(take: Take, error: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The header arrived, and its writer does not know."""
+    store = TakeStore(f"memory://kept/{error.__name__}")
+    put = obstore.put
+
+    def put_and_fail(place: Any, path: str, data: Any, **options: Any) -> None:
+        put(place, path, data, **options)
+        if options:
+            error()
+
+    with monkeypatch.context() as patched:
+        patched.setattr(obstore, "put", put_and_fail)
+        with pytest.raises((StoreError, KeyboardInterrupt)):
+            store.write(take)
+    store.verify("panels")
+    assert_equal(store.read("panels"), take)
+
+
+def test_a_take_survives_what_is_interrupted_after_it(take: Take, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = TakeStore("memory://interrupted/takes")
+    with monkeypatch.context() as patched:
+        patched.setattr(ObjectPrefix, "_remove", ctrl_c)
+        with pytest.raises(KeyboardInterrupt):
+            store.write(take)
+    store.verify("panels")
+
+
+def test_a_header_that_did_not_arrive_leaves_rubbish_in_nobodys_way(
+    take: Take, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = TakeStore("memory://rubbish/takes")
+    put = obstore.put
+    with monkeypatch.context() as patched:
+        patched.setattr(obstore, "put", lambda *args, **options: lost_answer() if options else put(*args))
+        with pytest.raises(StoreError, match="no route to host"):
+            store.write(take)
+    assert "panels" not in store
+    left = objects(store, "panels")
+    store.write(take)
+    store.verify("panels")
+    assert not left.keys() & objects(store, "panels").keys()
+
+
+def test_the_second_of_two_writers_removes_its_files(take: Take, monkeypatch: pytest.MonkeyPatch) -> None:
+    store, other = TakeStore("memory://second/takes"), replace(take, point_world=take.point_world + 1)
+    commit = ObjectPrefix.commit
+
+    def be_late(self: ObjectPrefix, name: str, writer: str, header: bytes) -> None:
+        with monkeypatch.context() as patched:
+            patched.setattr(ObjectPrefix, "commit", commit)
+            TakeStore("memory://second/takes").write(other)
+        commit(self, name, writer, header)
+
+    monkeypatch.setattr(ObjectPrefix, "commit", be_late)
+    with pytest.raises(TakeError, match="written by another process meanwhile"):
+        store.write(take)
+    assert_equal(store.read("panels"), other)
+    assert objects(store, "panels").keys() == {*store.header("panels").files, "zarr.json"}
+
+
 def test_a_store_that_cannot_compare(take: Take, monkeypatch: pytest.MonkeyPatch) -> None:
     store = TakeStore("memory://cannot/compare")
     put = obstore.put

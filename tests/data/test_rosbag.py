@@ -349,3 +349,18 @@ def test_a_camera_file_overrules_the_bag(tmp_path: Path):
     path = write_mcap(tmp_path / "bag.mcap", [colours(0)])
     other = Camera(50.0, 50.0, 16.0, 12.0, 32, 24)
     assert open_recording(path, camera=other).camera == other
+
+
+@pytest.mark.parametrize("d", [(0.0,) * 5, (-0.1, 0.02, 0.0, 0.0, 0.0)])
+def test_a_camera_file_overrules_the_camera_of_registered_depth(d: tuple[float, ...], tmp_path: Path):
+    other = Camera(50.0, 50.0, 16.0, 12.0, 32, 24)
+    aligned = "/camera/aligned_depth_to_color"
+    own = (f"{aligned}/camera_info", INFO, camera_info(CAMERA, BEGIN, d=d), BEGIN)
+    sent = [info(d=d), own, colours(0), depths(0, topic=f"{aligned}/image_raw")]
+    found = read_recording(write_mcap(tmp_path / "bag.mcap", sent), camera=other)
+    assert found.depth_m is not None
+    np.testing.assert_allclose(found.depth_m[0], DEPTH_MM[0] / 1000, atol=1e-6)
+    sent[1] = (f"{aligned}/camera_info", INFO, camera_info(Camera(20.0, 20.0, 16, 12, 32, 24), BEGIN), BEGIN)
+    found = read_recording(write_mcap(tmp_path / "bag.mcap", sent), camera=other)
+    assert found.depth_m is not None
+    assert (found.depth_m[0] != DEPTH_MM[0] / np.float32(1000)).any(), "depth of another lens is registered"

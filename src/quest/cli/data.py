@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from quest.data.store import TakeStore
 
 MOST_FRAMES_SHOWN = 600
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class DataShow:
     """Folder or URL of a take (STORE/NAME.zarr), or of a store."""
 
     out: Path | None = None
-    """Picture to write (PNG, JPEG); default: its name and .png in the current folder, unless Rerun is asked for."""
+    """Picture to write (PNG, JPEG, WebP); default: NAME.png in the current folder, unless Rerun is asked for."""
 
     columns: int = 8
     """Frames on the sheet, spread evenly from the first to the last."""
@@ -52,6 +53,8 @@ class DataShow:
 
         if (self.every is not None and self.every < 1) or self.rows < 1 or self.columns < 1:
             raise ConfigError("show: expected --every, --rows and --columns of at least 1")
+        if self.out is not None and self.out.suffix.lower() not in PICTURES:
+            raise ConfigError(f"show: --out {self.out}: expected a picture, {', '.join(PICTURES)}")
         store, names = open_takes(self.takes)
         if names is not None:
             return self._show_take(store, names[0])

@@ -44,7 +44,7 @@ class DataStats:
             found = store_stats(store, report=lambda done, of: progress.update(task, completed=done, total=of))
         if self.json is not None:
             self.json.parent.mkdir(parents=True, exist_ok=True)
-            self.json.write_text(json.dumps(_finite(asdict(found)), indent=2) + "\n", encoding="utf-8")
+            self.json.write_text(json.dumps(finite(asdict(found)), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         table = Table(box=None, show_header=False)
         table.add_column(no_wrap=True, style="dim")
         table.add_column(overflow="fold")
@@ -96,8 +96,10 @@ def _spread(s: Spread) -> str:
     return f"{s.median:.2f} ({s.low:.2f} to {s.high:.2f}; {s.least:.2f} to {s.most:.2f})" if s.n else "?"
 
 
-def _finite(value: Any) -> Any:
-    """The same for JSON, which has no NaN: null instead."""
+def finite(value: Any) -> Any:
+    """The same for JSON, which has neither NaN nor infinity: null instead."""
     if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    return None if isinstance(value, float) and math.isnan(value) else value
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from quest.cli.data_stats import finite
+
 if TYPE_CHECKING:
     from quest.data.store import TakeStore
     from quest.data.verify import StoreReport
@@ -104,4 +106,4 @@ def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
         "command": shlex.join(["quest", *sys.argv[1:]]),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    path.write_text(json.dumps(finite(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")

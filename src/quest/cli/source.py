@@ -59,8 +59,13 @@ class Source:
         from quest.data.recording import open_recording
         from quest.data.sample import sample_folder
         from quest.data.store import open_clip
+        from quest.errors import RecordingError
 
         if self.clip.rstrip("/").endswith(".zarr"):
+            if (self.depth, self.camera, self.depth_scale_m) != (None, None, None):
+                raise RecordingError(
+                    f"take {self.clip}: it has depth and a camera of its own; leave those options away"
+                )
             return source_of_clip(open_clip(self.clip, view=self.view))
         path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
         return open_recording(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ class Track(Source):
     """Track a recording or a take; without queries the entities are discovered."""
 
     out: Path | None = None
-    """Folder for tracks.parquet and overlay.mp4; default: outputs/CLIP."""
+    """Folder for tracks.parquet and overlay.mp4; default: outputs/NAME, with the view of a take behind."""
     overlay: bool = True
     """Write the video."""
 
@@ -35,7 +36,7 @@ class Track(Source):
         clip = self.read()
         queries = self.queries(clip)
         tracker = self.tracker()
-        out = self.out or Path("outputs") / Path(self.clip).stem
+        out = self.out or Path("outputs") / self._name(clip)
         try:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -52,6 +53,12 @@ class Track(Source):
                 write_overlay(clip, tracks, out / "overlay.mp4")
             console.print(f"video:  {escape(str(out / 'overlay.mp4'))}")
         return 0
+
+    def _name(self, clip: Clip) -> str:
+        """What to call the folder of a clip: views of a take, and episodes of a dataset, have folders of their own."""
+        take = self.clip.rstrip("/\\")
+        name = f"{Path(take).stem}-view{self.view}" if take.endswith(".zarr") else clip.name
+        return re.sub(r'[/\\:*?"<>|\x00-\x1f]', "-", name).strip(". ") or "clip"
 
 
 def _summary(clip: Clip, tracks: Tracks) -> Table:

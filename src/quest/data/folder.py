@@ -12,6 +12,7 @@ from PIL import Image, UnidentifiedImageError
 
 from quest.data.camera_file import CameraFile, check_depth_scale, read_camera
 from quest.data.frame_source import FrameSource
+from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.registration import Rig
 from quest.data.video import SUFFIXES, play_video, probe_video
 from quest.errors import RecordingError
@@ -28,27 +29,36 @@ class _Colours:
         images: paths; empty for a video.
         video: its path; None for images.
         number: of frames; for a video what its header says.
-        size: width and height.
+        size: width and height, upright.
+        turned: whether the pixels of the video are not upright.
+        paired: whether depth images of the same pixels go with them.
     """
 
     images: tuple[Path, ...]
     video: Path | None
     number: int | None
     size: tuple[int, int]
+    turned: bool = False
+    paired: bool = False
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, float]]:
-        """Pictures and their times; those of images follow a nominal rate of 30 a second."""
+        """Upright pictures and their times; those of images follow a nominal rate of 30 a second."""
         if self.video is not None:
+            if self.turned and self.paired:
+                raise RecordingError(f"video {self.video}: {TURNED}")
             yield from play_video(self.video)
             return
         for t, path in enumerate(self.images):
-            image = _open_image(path)
+            pixels = _open_image(path)
+            if self.paired and is_turned(pixels):
+                raise RecordingError(f"image {path}: {TURNED}")
+            image = upright(pixels)
             if image.size != self.size:
                 raise RecordingError(
                     f"image {path}: {image.width} x {image.height}, but {self.images[0].name} is {self.size[0]} x "
                     f"{self.size[1]}; all frames must be of one size"
                 )
-            yield np.asarray(image.convert("RGB")), t / 30.0
+            yield colours_of(image, f"image {path}"), t / 30.0
 
 
 def open_folder(
@@ -82,6 +92,7 @@ def open_folder(
             _check_depth_number(folder, len(depths), len(colours.images))
         if not depths:
             _check_depth_number(folder, 0, colours.number or 0)
+        colours = replace(colours, paired=True)
     return FrameSource(
         source.stem if source.is_file() else source.resolve().name,
         setup.camera,
@@ -99,10 +110,18 @@ def read_setup(source: Path, camera: Path | Camera, depth_scale_m: float | int |
         RecordingError: the file is missing or makes no sense, or the scale is no positive number.
     """
     setup = CameraFile(camera) if isinstance(camera, Camera) else read_camera(Path(camera))
-    if depth_scale_m is None:
-        return setup
+    scale_m = read_scale(source, depth_scale_m)
+    return setup if scale_m is None else replace(setup, depth_scale_m=scale_m)
+
+
+def read_scale(source: Path, depth_scale_m: float | int | None) -> float | None:
+    """A depth scale that was given, if one was.
+
+    Raises:
+        RecordingError: it is no positive number.
+    """
     try:
-        return replace(setup, depth_scale_m=check_depth_scale(depth_scale_m))
+        return None if depth_scale_m is None else check_depth_scale(depth_scale_m)
     except ValueError as error:
         raise RecordingError(f"recording {source}: {error}") from error
 
@@ -116,14 +135,14 @@ def _find_colours(source: Path) -> _Colours:
             raise RecordingError(f"recording {source}: expected one video, got {found}; name the video itself")
     if videos:
         info = probe_video(videos[0])
-        return _Colours((), videos[0], info.frames or None, (info.width, info.height))
+        return _Colours((), videos[0], info.frames or None, (info.width, info.height), info.turns != 0)
     folder = source / "rgb" if (source / "rgb").is_dir() else source
     paths = _list_images(folder, IMAGE_SUFFIXES)
     if not paths:
         raise RecordingError(
             f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
         )
-    return _Colours(tuple(paths), None, len(paths), _open_image(paths[0]).size)
+    return _Colours(tuple(paths), None, len(paths), upright(_open_image(paths[0])).size)
 
 
 def _frames(

@@ -25,6 +25,7 @@ from PIL import Image, UnidentifiedImageError
 from quest.data.camera_file import CameraFile
 from quest.data.folder import read_setup
 from quest.data.frame_source import FrameSource, Notes, clean_depth
+from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.video import play_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Frame
@@ -120,6 +121,7 @@ def open_lerobot(
     episode: int = 0,
     camera_key: str | None = None,
     camera: Path | Camera | None = None,
+    depth_scale_m: float | None = None,
 ) -> FrameSource:
     """One camera of an episode.
 
@@ -128,9 +130,12 @@ def open_lerobot(
         episode: index of the episode.
         camera_key: feature of the colours, such as ``observation.images.front``; the first by default.
         camera: camera file or intrinsics; by default those that this project wrote into the dataset.
+        depth_scale_m: metres per unit of depth images; by default what the camera file says, else millimetres, but
+            metres in floats and where the dataset says so.
 
     Raises:
-        RecordingError: not a v3 dataset, no such episode or camera, no intrinsics, or files are torn.
+        RecordingError: not a v3 dataset, no such episode or camera, no intrinsics, files are torn, or a depth scale is
+            given for a depth video.
     """
     notes = Notes()
     found = _read_episode(root, episode)
@@ -139,6 +144,7 @@ def open_lerobot(
     if depth_key is None:
         notes.say(f"no depth feature beside {key}: colours only")
     setup = _setup(found, key, camera)
+    units_m = _units_m(found, depth_key, setup, depth_scale_m)
     rows = _Rows(found, key)
     if not rows.posed and setup.cam_from_world is None:
         notes.say("the dataset has no camera poses: the world is the camera")
@@ -151,10 +157,10 @@ def open_lerobot(
     return FrameSource(
         f"{root.resolve().name}-{episode:06d}-{key.rpartition('.')[2]}",
         setup.camera,
-        lambda: _frames(found, rows, setup, key, depth_key),
+        lambda: _frames(found, rows, setup, key, depth_key, units_m),
         length=rows.number,
         notes=notes,
-        units=(f"{root} {depth_key}", 1.0),
+        units=(f"{root} {depth_key}", units_m.integers),
     )
 
 
@@ -233,6 +239,26 @@ def _setup(episode: _Episode, key: str, camera: Path | Camera | None) -> CameraF
         raise RecordingError(f"dataset {episode.root}: {CAMERA_KEY} of {key} makes no sense ({error})") from error
 
 
+@dataclass(frozen=True)
+class _Units:
+    """Metres per unit of depth images in integers and in floats."""
+
+    integers: float = 1.0
+    floats: float = 1.0
+
+
+def _units_m(episode: _Episode, key: str | None, setup: CameraFile, depth_scale_m: float | None) -> _Units:
+    feature = {} if key is None else episode.feature(key)
+    if depth_scale_m is not None:
+        if feature.get("dtype") == "video":
+            raise RecordingError(
+                f"dataset {episode.root}: {key} is a video, whose metres info.json gives; leave --depth-scale-m out"
+            )
+        return _Units(depth_scale_m, depth_scale_m)
+    in_metres = feature.get("dtype") == "video" or (feature.get("info") or {}).get("depth_unit") == "m"
+    return _Units() if in_metres else _Units(setup.depth_scale_m)
+
+
 class _Rows:
     """The rows of one episode, without its pictures."""
 
@@ -259,10 +285,12 @@ class _Rows:
             self.pose = np.array(table[pose].to_pylist(), dtype=np.float64).reshape(-1, 4, 4)
 
 
-def _frames(episode: _Episode, rows: _Rows, setup: CameraFile, key: str, depth_key: str | None) -> Iterator[Frame]:
+def _frames(
+    episode: _Episode, rows: _Rows, setup: CameraFile, key: str, depth_key: str | None, units_m: _Units
+) -> Iterator[Frame]:
     rig = setup.rig
-    colours = _pictures(episode, rows, key)
-    depths = None if depth_key is None else _pictures(episode, rows, depth_key)
+    colours = _pictures(episode, rows, key, units_m, paired=depth_key is not None)
+    depths = None if depth_key is None else _pictures(episode, rows, depth_key, units_m)
     try:
         for t, picture in enumerate(colours):
             depth_m = None if depths is None else rig.depth(next(depths))
@@ -274,11 +302,13 @@ def _frames(episode: _Episode, rows: _Rows, setup: CameraFile, key: str, depth_k
         raise RecordingError(f"dataset {episode.root}: episode {episode.index}: {error}") from error
 
 
-def _pictures(episode: _Episode, rows: _Rows, key: str) -> Iterator[np.ndarray]:
-    """Colours of uint8, or depth in metres, one per row."""
+def _pictures(
+    episode: _Episode, rows: _Rows, key: str, units_m: _Units, *, paired: bool = False
+) -> Iterator[np.ndarray]:
+    """Colours of uint8, or depth in metres, one per row; ``paired`` are colours that depth goes with."""
     feature = episode.feature(key)
     if feature["dtype"] == "image":
-        yield from _stored_images(episode, key)
+        yield from _stored_images(episode, key, units_m, paired=paired)
         return
     info = (feature.get("info") or {}) | (feature.get("video_info") or {})
     path = episode.video_path(key)
@@ -303,38 +333,50 @@ def _pictures(episode: _Episode, rows: _Rows, key: str) -> Iterator[np.ndarray]:
     )
 
 
-def _stored_images(episode: _Episode, key: str) -> Iterator[np.ndarray]:
-    """Pictures in the rows themselves, a few rows in memory at a time."""
-    feature, path = episode.feature(key), episode.data_path
-    in_metres = (feature.get("info") or {}).get("depth_unit") == "m"
-    with pq.ParquetFile(path) as file:
-        for batch in file.iter_batches(batch_size=8, columns=["episode_index", key]):
-            for row in batch.to_pylist():
-                if row["episode_index"] != episode.index:
-                    continue
-                try:
-                    with Image.open(io.BytesIO(row[key]["bytes"])) as image:
-                        pixels = np.asarray(image if _is_depth(feature) else image.convert("RGB"))
-                except (UnidentifiedImageError, OSError, TypeError, KeyError) as error:
-                    raise RecordingError(
-                        f"dataset {episode.root}: a picture of {key} in {path.name} cannot be decoded ({error})"
-                    ) from error
-                if not _is_depth(feature):
-                    yield pixels
-                else:
-                    floating = np.issubdtype(pixels.dtype, np.floating)
-                    yield clean_depth(pixels.astype(np.float32) * np.float32(1.0 if in_metres or floating else 1e-3))
+def _stored_images(episode: _Episode, key: str, units_m: _Units, *, paired: bool) -> Iterator[np.ndarray]:
+    """Pictures in the rows themselves."""
+    depth, path = _is_depth(episode.feature(key)), episode.data_path
+    where = f"dataset {episode.root}: a picture of {key} in {path.name}"
+    for row in _read_rows(path, ["episode_index", key]):
+        if row["episode_index"] != episode.index:
+            continue
+        try:
+            with Image.open(io.BytesIO(row[key]["bytes"])) as image:
+                if paired and is_turned(image):
+                    raise RecordingError(f"{where}: {TURNED}")
+                pixels = np.asarray(image) if depth else colours_of(upright(image), where)
+        except (UnidentifiedImageError, OSError, TypeError, KeyError) as error:
+            raise RecordingError(f"{where} cannot be decoded ({error})") from error
+        if depth:
+            unit_m = units_m.floats if np.issubdtype(pixels.dtype, np.floating) else units_m.integers
+            yield clean_depth(pixels.astype(np.float32) * np.float32(unit_m))
+        else:
+            yield pixels
+
+
+def _read_rows(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
+    """Rows one by one, a few in memory at a time."""
+    try:
+        with pq.ParquetFile(path) as file:
+            for batch in file.iter_batches(batch_size=8, columns=columns):
+                yield from batch.to_pylist()
+    except (OSError, pa.ArrowException) as error:
+        raise _unreadable(path, error) from error
 
 
 def _columns(path: Path) -> list[str]:
     try:
         return list(pq.read_schema(path).names)
     except (OSError, pa.ArrowException) as error:
-        raise RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again") from error
+        raise _unreadable(path, error) from error
 
 
 def _read_table(path: Path, columns: list[str], *, filters: list[tuple[str, str, int]] | None = None) -> pa.Table:
     try:
         return pq.read_table(path, columns=columns, filters=filters)
     except (OSError, pa.ArrowException) as error:
-        raise RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again") from error
+        raise _unreadable(path, error) from error
+
+
+def _unreadable(path: Path, error: Exception) -> RecordingError:
+    return RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again")

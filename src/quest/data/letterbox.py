@@ -14,7 +14,9 @@ from quest.types import Camera
 
 @dataclass(frozen=True)
 class Letterbox:
-    """Uniform scaling and centred padding of a source image onto a square canvas.
+    """Scaling and centred padding of a source image onto a square canvas.
+
+    The image is scaled to whole pixels, so that its shorter side may be scaled a little more or less than the longer.
 
     Attributes:
         source: intrinsics of the source frames.
@@ -26,8 +28,14 @@ class Letterbox:
 
     @property
     def scale(self) -> float:
-        """Canvas pixels per source pixel."""
+        """Canvas pixels per source pixel along the longer side."""
         return self.size / max(self.source.width, self.source.height)
+
+    @property
+    def scale_xy(self) -> tuple[float, float]:
+        """Canvas pixels per source pixel along x and along y."""
+        width, height = self._resized
+        return width / self.source.width, height / self.source.height
 
     @property
     def _resized(self) -> tuple[int, int]:
@@ -44,7 +52,7 @@ class Letterbox:
         """Intrinsics of the canvas."""
         left, top = self.pad_px
         return scale_camera(
-            self.source, scale=self.scale, pad_left_px=left, pad_top_px=top, width=self.size, height=self.size
+            self.source, scale=self.scale_xy, pad_left_px=left, pad_top_px=top, width=self.size, height=self.size
         )
 
     def rgb(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "S S 3"]:
@@ -62,11 +70,11 @@ class Letterbox:
 
     def to_canvas(self, uv_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
         """Canvas pixels of source pixels."""
-        return uv_px * self.scale + np.asarray(self.pad_px, dtype=uv_px.dtype)
+        return uv_px * np.asarray(self.scale_xy, dtype=uv_px.dtype) + np.asarray(self.pad_px, dtype=uv_px.dtype)
 
     def to_source(self, uv_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
         """Source pixels of canvas pixels."""
-        return (uv_px - np.asarray(self.pad_px, dtype=uv_px.dtype)) / self.scale
+        return (uv_px - np.asarray(self.pad_px, dtype=uv_px.dtype)) / np.asarray(self.scale_xy, dtype=uv_px.dtype)
 
     def _place(self, image: np.ndarray, interpolation: int) -> np.ndarray:
         width, height = self._resized

@@ -57,6 +57,7 @@ class ObjectPrefix:
                 f"store {url}: expected a folder, file://PATH or {', '.join(SCHEMES[:4])}://BUCKET/PREFIX"
             )
         self._obstore = require("obstore")
+        self._committing: set[str] = set()
         if parts.scheme == "memory":
             self._store = _memories.setdefault(parts.netloc, require("obstore.store").MemoryStore())
             self._prefix = parts.path.strip("/")
@@ -130,15 +131,18 @@ class ObjectPrefix:
 
     @contextmanager
     def draft(self, name: str) -> Iterator[Draft]:
-        """A new take; what was not committed at the end is removed."""
+        """A new take; what was not committed at the end is removed, unless its header may have arrived all the same."""
         writer = f"written-{uuid.uuid4().hex[:12]}"
         with self.reaching(), _Upload(self._obstore, self._store) as upload:
             try:
                 yield _ObjectDraft(self, name, writer, upload)
             except BaseException:
                 upload.cancel()
-                self._remove(name, lambda path: path.startswith(writer))
+                if writer not in self._committing:
+                    self._remove(name, lambda path: path.startswith(writer))
                 raise
+            finally:
+                self._committing.discard(writer)
 
     def commit(self, name: str, writer: str, header: bytes) -> None:
         """Put a take's header and remove what other writers left.
@@ -148,10 +152,12 @@ class ObjectPrefix:
         """
         errors = require("obstore.exceptions")
         key = self._key(name, HEADER_FILE)
+        self._committing.add(writer)
         try:
             self._obstore.put(self._store, key, header, mode="create")
         except errors.AlreadyExistsError as error:
             if self.header(name) != header:  # else it is ours: the answer to the first attempt was lost on its way
+                self._committing.discard(writer)
                 raise TakeError(
                     f"take {name!r}: {self.describe(name)} was written by another process meanwhile"
                 ) from error

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Shaped, UInt8
 
 from quest.data.camera_file import CameraFile, check_depth_scale, write_camera
-from quest.data.folder import open_folder
+from quest.data.folder import open_folder, read_scale
 from quest.data.frame_source import PLAUSIBLE_DEPTH_M, FrameSource, Parts, check_units, clean_depth
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
@@ -50,34 +50,40 @@ def open_recording(
     Args:
         path: a recording folder, a folder of images, a video, a LeRobot v3 dataset, an MCAP file, or a ROS bag (the
             folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``).
-        depth: folder of 16-bit depth images, one per frame, for folders and videos; by default ``depth`` in the
+        depth: folder of 16-bit depth images, one per frame, of folders and videos alone; by default ``depth`` in the
             recording folder (or beside a video), where there is one. Without it there are colours only.
         camera: camera file, or the intrinsics themselves; by default ``camera.json`` in the recording folder (or beside
             a video), or what the bag says.
-        depth_scale_m: metres per unit of 16-bit depth images; by default what the camera file says, else 0.001.
+        depth_scale_m: metres per unit of depth images; by default what the camera file says, else 0.001, and in bags
+            millimetres in 16 bits and metres in floats.
         parts: what to read of datasets and bags; by default what there is.
 
     Raises:
-        RecordingError: something is missing, empty, torn, inconsistent, or in the wrong units.
+        RecordingError: something is missing, empty, torn, inconsistent, or in the wrong units, or an argument is not
+            for recordings of that kind.
         MissingExtraError: bags need the extra ``ros``.
     """
     source = Path(path)
     if not source.exists():
         raise RecordingError(f"recording {source}: no such file or folder; check the path")
     parts = Parts() if parts is None else parts
+    scale_m = read_scale(source, depth_scale_m)
     if source.is_dir() and (source / "meta" / "info.json").is_file():
         from quest.data.lerobot import open_lerobot
 
+        _refuse_folder(source, depth, "a LeRobot dataset has its depth in a feature of its own")
         return open_lerobot(
             source,
             episode=parts.episode,
             camera_key=parts.camera_key,
             camera=_as_path(camera),
+            depth_scale_m=scale_m,
         )
     if is_bag(source):
-        return _open_bag(source, _as_path(camera), depth_scale_m, parts)
+        _refuse_folder(source, depth, "a bag has its depth in a topic, which --topic-depth names")
+        return _open_bag(source, _as_path(camera), scale_m, parts)
     return open_folder(
-        source, depth=None if depth is None else Path(depth), camera=_as_path(camera), depth_scale_m=depth_scale_m
+        source, depth=None if depth is None else Path(depth), camera=_as_path(camera), depth_scale_m=scale_m
     )
 
 
@@ -100,11 +106,18 @@ def is_bag(path: Path) -> bool:
     return path.suffix.lower() in (".mcap", *_BAG_SUFFIXES)
 
 
+def _refuse_folder(source: Path, depth: str | Path | None, why: str) -> None:
+    if depth is not None:
+        raise RecordingError(
+            f"recording {source}: depth {depth} is for folders of images and videos, but {why}; leave --depth out"
+        )
+
+
 def _open_bag(source: Path, camera: Path | Camera | None, depth_scale_m: float | None, parts: Parts) -> FrameSource:
     from quest.data.folder import read_setup
     from quest.data.ros_frames import open_messages
 
-    if source.suffix.lower() == ".mcap":
+    if source.is_file() and source.suffix.lower() == ".mcap":
         from quest.data.mcap_file import McapMessages
 
         messages = McapMessages(source)

@@ -75,8 +75,8 @@ def open_messages(
     Args:
         messages: the bag.
         parts: which topics, frames and tolerance; what is not said is found.
-        setup: camera file that overrules what the bag says of the colour camera (and of the depth camera, if it has
-            one).
+        setup: camera file that overrules what the bag says of the colour camera, and of depth that is registered to
+            it, and of the depth camera, if it has one.
         depth_scale_m: metres per unit of depth; by default millimetres in 16 bits, metres in floats.
 
     Raises:
@@ -165,9 +165,10 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
     depth_size = depth_of(depth, f"{where}: first message of {chosen.depth}").shape
     rgb_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
     depth_frame = frame_name(depth.header.frame_id)
+    same_pixels = depth_frame == rgb_frame and depth_size == rgb_size
+    if same_pixels and (chosen.depth_info is None or (setup is not None and _same_camera(chosen))):
+        return Rig(camera, lens)
     if chosen.depth_info is None:
-        if depth_frame == rgb_frame and depth_size == rgb_size:
-            return Rig(camera, lens)
         raise RecordingError(
             f"{where}: no camera_info for {chosen.depth}; name its topic with --topic-depth-info, give depth_camera in "
             "--camera FILE, or leave the depth out with --topic-depth none"
@@ -183,10 +184,27 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
     return Rig(camera, lens, depth_camera, depth_lens, colour_from_depth)
 
 
+def _same_camera(chosen: Chosen) -> bool:
+    """Whether a bag says the same of the cameras of colours and depth: what overrules the one overrules the other."""
+    if chosen.info is None or chosen.depth_info is None or chosen.depth is None:
+        return False
+    (k, d, _), (depth_k, depth_d, _) = (_numbers(chosen.first[topic]) for topic in (chosen.info, chosen.depth_info))
+    straight = _is_rectified(chosen.rgb) == _is_rectified(chosen.depth) or not d.any()
+    return straight and np.array_equal(k, depth_k) and np.array_equal(d, depth_d)
+
+
+def _numbers(info: Any) -> tuple[np.ndarray, ...]:
+    """K, D and P of a CameraInfo, whose names are capital letters in ROS 1."""
+    return tuple(np.asarray(getattr(info, n, getattr(info, n.upper(), ())), dtype=np.float64) for n in "kdp")
+
+
+def _is_rectified(topic: str) -> bool:
+    return "rect" in base_of(topic).rpartition("/")[2]
+
+
 def _camera_of(info: Any, topic: str, size: tuple[int, ...], where: str) -> tuple[Camera, Distortion]:
     """Intrinsics and lens of a CameraInfo; of the rectified camera where the topic says that its images are."""
-    k, d, p = (np.asarray(getattr(info, name, getattr(info, name.upper(), ())), dtype=np.float64) for name in "kdp")
-    rectified = "rect" in base_of(topic).rpartition("/")[2]
+    (k, d, p), rectified = _numbers(info), _is_rectified(topic)
     matrix = p.reshape(3, 4)[:, :3] if rectified and p.size == 12 and p[0] > 0 else k.reshape(3, 3)
     if not matrix[0, 0] > 0:
         raise RecordingError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -50,17 +51,20 @@ class BagMessages:
     @contextmanager
     def _reader(self) -> Iterator[Any]:
         """An open reader; what goes wrong with the bag becomes an error that says so."""
-        highlevel, typesys = require("rosbags.highlevel"), require("rosbags.typesys")
-        serde, rosbag2 = require("rosbags.serde"), require("rosbags.rosbag2")
+        highlevel, typesys, serde = (require(f"rosbags.{name}") for name in ("highlevel", "typesys", "serde"))
+        rosbag1, rosbag2 = require("rosbags.rosbag1"), require("rosbags.rosbag2")
         torn = (
             highlevel.AnyReaderError,
             serde.SerdeError,
+            rosbag1.ReaderError,
             rosbag2.ReaderError,
             typesys.TypesysError,
             sqlite3.Error,
+            struct.error,
             AssertionError,
             EOFError,
-            KeyError,
+            LookupError,
+            RuntimeError,  # of lz4
             ValueError,
         )
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
@@ -70,9 +74,10 @@ class BagMessages:
         except RecordingError:
             raise
         except torn as error:
+            reindex = "rosbag reindex" if self.path.suffix.lower() == ".bag" else "ros2 bag reindex"
             raise RecordingError(
                 f"bag {self.path}: cannot be read ({type(error).__name__}: {error}); the bag is torn, copy it again, "
-                "or rebuild it with `ros2 bag reindex`"
+                f"or rebuild it with `{reindex}`"
             ) from error
         except OSError as error:
             raise RecordingError(f"bag {self.path}: cannot be read ({error}); check the files in it") from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -26,16 +27,18 @@ class VideoInfo:
     """What a video's header says.
 
     Attributes:
-        width: pixels.
-        height: pixels.
+        width: of the upright picture, pixels.
+        height: of the upright picture, pixels.
         frames: number of frames that it declares; 0 where it does not tell.
         frames_per_s: nominal frame rate.
+        turns: quarter turns, against the clock, that make its pictures upright.
     """
 
     width: int
     height: int
     frames: int
     frames_per_s: float
+    turns: int = 0
 
 
 def probe_video(path: Path) -> VideoInfo:
@@ -46,13 +49,19 @@ def probe_video(path: Path) -> VideoInfo:
     """
     with _open(path) as container:
         stream = container.streams.video[0]
-        return VideoInfo(stream.width, stream.height, stream.frames, float(stream.average_rate or 30))
+        try:
+            first = next(container.decode(stream), None)  # only frames tell how they are turned
+        except av.error.FFmpegError as error:
+            raise _undecodable(path, 0, error) from error
+        turns = 0 if first is None else _turns(first)
+        width, height = (stream.height, stream.width) if turns % 2 else (stream.width, stream.height)
+        return VideoInfo(width, height, stream.frames, float(stream.average_rate or 30), turns)
 
 
 def play_video(
     path: Path, *, pixel_format: str = "rgb24", start_s: float = 0.0, end_s: float | None = None
 ) -> Iterator[tuple[Shaped[np.ndarray, "H W *C"], float]]:
-    """Frames of a video one by one, with their time in seconds from the first frame of the file.
+    """Frames of a video one by one, upright, with their time in seconds from the first frame of the file.
 
     Args:
         path: the file.
@@ -63,26 +72,27 @@ def play_video(
     Raises:
         RecordingError: there is no such file, it cannot be decoded, has no frames, changes its size, or ends early.
     """
-    number, shape, before = 0, None, -np.inf
+    number, shape, before, longest_s = 0, None, -np.inf, 0.0
     with _open(path) as container:
         stream = container.streams.video[0]
         stream.thread_type = "AUTO"
         rate = float(stream.average_rate or 30)
         origin = float((stream.start_time or 0) * stream.time_base) if stream.time_base else 0.0
-        if start_s > 0 and stream.time_base:
-            container.seek(int((origin + start_s) / stream.time_base), stream=stream, backward=True)
         try:
+            if start_s > 0 and stream.time_base:
+                container.seek(int((origin + start_s) / stream.time_base), stream=stream, backward=True)
             for frame in container.decode(stream):
                 # Some containers keep no times, or times that run backwards: the nominal rate goes on instead.
                 time_s = frame.time - origin if frame.time is not None else before + 1 / rate
                 if time_s < before or time_s == -np.inf:
                     time_s = 0.0 if before == -np.inf else before + 1 / rate
+                longest_s = max(longest_s, _shown_s(frame), 0.0 if before == -np.inf else time_s - before)
                 before = time_s
                 if time_s < start_s:
                     continue
                 if end_s is not None and time_s >= end_s:
                     return
-                image = frame.to_ndarray(format=pixel_format)
+                image = np.ascontiguousarray(np.rot90(frame.to_ndarray(format=pixel_format), _turns(frame)))
                 if shape is not None and image.shape != shape:
                     raise RecordingError(
                         f"video {path}: the frame size changes within the video; split it or scale it to one size"
@@ -90,18 +100,50 @@ def play_video(
                 shape, number = image.shape, number + 1
                 yield image, time_s
         except av.error.FFmpegError as error:
-            where = f"after {number} frames" if number else "at all"
-            raise RecordingError(
-                f"video {path}: cannot be decoded {where} ({error.strerror}); "
-                "the file is torn or not a video, copy or record it again"
-            ) from error
+            raise _undecodable(path, number, error) from error
         if number == 0:
             raise RecordingError(f"video {path}: expected at least one frame, got none; record it again")
-        if start_s == 0 and end_s is None and number < stream.frames - 2:  # a frame or two may never be shown
-            raise RecordingError(
-                f"video {path}: ends after {number} of {stream.frames} frames; the file is torn, "
-                "copy or record it again"
-            )
+        if start_s == 0 and end_s is None:
+            _check_whole(path, container, number, last_s=origin + before, frame_s=max(longest_s, 1 / rate))
+
+
+def _turns(frame: av.VideoFrame) -> int:
+    """Quarter turns, against the clock, that make a frame upright; other angles are left alone, as in OpenCV."""
+    turns, rest = divmod(frame.rotation % 360, 90)
+    return 0 if rest else turns
+
+
+def _shown_s(frame: av.VideoFrame) -> float:
+    return float(frame.duration * frame.time_base) if frame.duration and frame.time_base else 0.0
+
+
+def _check_whole(path: Path, container: InputContainer, number: int, *, last_s: float, frame_s: float) -> None:
+    """Raise RecordingError if a video lacks more than the frame or two that may never be shown."""
+    declared = container.streams.video[0].frames
+    if number < declared - 2:
+        raise RecordingError(
+            f"video {path}: ends after {number} of {declared} frames; the file is torn, copy or record it again"
+        )
+    declared_s = None if declared else _declared_s(container)
+    if declared_s is not None and last_s + 3.5 * frame_s < declared_s:
+        raise RecordingError(
+            f"video {path}: ends after {last_s + frame_s:.2f} of {declared_s:.2f} s; the file is torn, "
+            "copy or record it again"
+        )
+
+
+def _declared_s(container: InputContainer) -> float | None:
+    """When the pictures of a Matroska or WebM file end, by its header; None if it does not tell.
+
+    Of other formats FFmpeg only estimates it. That of the whole file may be the end of a longer sound.
+    """
+    if "matroska" not in container.format.name or container.duration is None:
+        return None
+    whole_s = container.duration / av.time_base
+    tag = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", container.streams.video[0].metadata.get("DURATION", ""))
+    if tag is not None:
+        return min(whole_s, 3600 * int(tag[1]) + 60 * int(tag[2]) + float(tag[3]))
+    return whole_s if len(container.streams) == 1 else None
 
 
 def read_video(path: Path) -> tuple[UInt8[np.ndarray, "T H W 3"], Float[np.ndarray, " T"]]:
@@ -119,16 +161,22 @@ def _open(path: Path) -> Iterator[InputContainer]:
     if not path.is_file():
         raise RecordingError(f"video {path}: no such file; check the path")
     try:
-        container = av.open(str(path))
+        # Resolved, because FFmpeg takes what precedes a colon for a protocol.
+        container = av.open(str(path.resolve()), metadata_errors="replace")
     except av.error.FFmpegError as error:
-        raise RecordingError(
-            f"video {path}: cannot be decoded at all ({error.strerror}); "
-            "the file is torn or not a video, copy or record it again"
-        ) from error
+        raise _undecodable(path, 0, error) from error
     with container:
         if not container.streams.video:
             raise RecordingError(f"video {path}: the file has no video stream; give a video of RGB frames")
         yield container
+
+
+def _undecodable(path: Path, number: int, error: av.error.FFmpegError) -> RecordingError:
+    where = f"after {number} frames" if number else "at all"
+    return RecordingError(
+        f"video {path}: cannot be decoded {where} ({error.strerror}); "
+        "the file is torn or not a video, copy or record it again"
+    )
 
 
 def write_video(
@@ -200,7 +248,7 @@ def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec
     partial = path.with_name(f".{path.stem}.partial{path.suffix}")
     written, size = 0, None
     try:
-        with av.open(str(partial), "w") as container:
+        with av.open(str(partial.resolve()), "w") as container:
             rate = Fraction(float(frames_per_s)).limit_denominator(1001)
             stream = container.add_stream(codec.encoder, rate=rate, options=codec.options)
             assert isinstance(stream, VideoStream), codec.encoder

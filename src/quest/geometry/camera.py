@@ -49,23 +49,30 @@ def lift_depth(depth_m: Float[Tensor, "*B H W"], camera: Camera) -> Float[Tensor
 
 
 def scale_camera(
-    camera: Camera, *, scale: float, pad_left_px: float, pad_top_px: float, width: int, height: int
+    camera: Camera,
+    *,
+    scale: float | tuple[float, float],
+    pad_left_px: float,
+    pad_top_px: float,
+    width: int,
+    height: int,
 ) -> Camera:
     """Intrinsics after resizing an image by ``scale`` and placing it on a canvas.
 
     Args:
         camera: intrinsics of the source image.
-        scale: target pixels per source pixel.
+        scale: target pixels per source pixel, of both axes or of x and y.
         pad_left_px: columns left of the resized image on the canvas.
         pad_top_px: rows above the resized image on the canvas.
         width: canvas width, pixels.
         height: canvas height, pixels.
     """
+    x, y = scale if isinstance(scale, tuple) else (scale, scale)
     return Camera(
-        camera.fx * scale,
-        camera.fy * scale,
-        camera.cx * scale + pad_left_px,
-        camera.cy * scale + pad_top_px,
+        camera.fx * x,
+        camera.fy * y,
+        camera.cx * x + pad_left_px,
+        camera.cy * y + pad_top_px,
         width,
         height,
     )

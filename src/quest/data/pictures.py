@@ -1,0 +1,45 @@
+"""Colours of image files: upright, and eight bits a channel whatever the file has."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import ExifTags, Image, ImageOps
+
+from quest.errors import RecordingError
+
+TURNED = (
+    "EXIF or the video's header says that the colours are to be turned, and their depth is not turned with them; "
+    "write colours and depth the same way up and leave the orientation out, or leave the depth out"
+)
+
+
+def is_turned(image: Image.Image) -> bool:
+    """Whether EXIF says that the pixels are to be turned or mirrored."""
+    return image.getexif().get(ExifTags.Base.Orientation, 1) in range(2, 9)
+
+
+def upright(image: Image.Image) -> Image.Image:
+    """The image as EXIF says that it is to be seen."""
+    return ImageOps.exif_transpose(image)
+
+
+def colours_of(image: Image.Image, where: str) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours of an image, as its pixels lie; of 16-bit grey the higher byte.
+
+    Args:
+        image: the image.
+        where: what to call it in errors.
+
+    Raises:
+        RecordingError: the pixels are of 32 bits or floats, so that no one knows what is white.
+    """
+    if image.mode.startswith("I;16"):
+        grey = (np.asarray(image) >> 8).astype(np.uint8)
+        return np.repeat(grey[..., None], 3, axis=-1)
+    if image.mode in ("I", "F"):
+        raise RecordingError(
+            f"{where}: expected colours or grey of 8 or 16 bits, got mode {image.mode} (32 bits), whose white is not "
+            "known; write the colours as 8-bit PNG or JPEG"
+        )
+    return np.asarray(image.convert("RGB"))
