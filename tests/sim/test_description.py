@@ -22,6 +22,9 @@ from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Box, Link, write_cabi
 NAMELESS = replace(DRAWER, boxes=(DRAWER.boxes[0], replace(DRAWER.boxes[1], name="grip_a")))
 
 
+DOOR_GRIP = Box("grip", (0.04, 0.04, 0.2), (0.04, 0.55, 0))
+
+
 def described(folder: Path, *links: Link, **description: Any) -> Path:
     """An object folder with an ``entities.json``."""
     write_object(folder, *(links or (CARCASS, NAMELESS, DOOR)), category=None)
@@ -95,6 +98,13 @@ def test_description_names_size_front_and_visuals(tmp_path: Path) -> None:
     assert entities(thing) == [("drawer/handle", "handle"), ("door/rim", "rim")]  # the door keeps what it had
     assert thing.entities[0].parts
     assert load_object(described(tmp_path / "long", size_m=2.0)).scale == pytest.approx(2.0)
+
+
+def test_visuals_have_names_of_their_own_on_links_called_handle(tmp_path: Path) -> None:
+    door = replace(DOOR, name="door_with_handle", boxes=(replace(DOOR.boxes[0], name="panel"), DOOR_GRIP))
+    folder = described(tmp_path / "mine", CARCASS, door, entities=[{"visual": "grip", "label": "handle"}])
+    (found,) = [e for e in load_object(folder).entities if e.label == "handle"]
+    assert len(found.parts) == 1
 
 
 def test_lid_tells_where_the_front_is(tmp_path: Path) -> None:

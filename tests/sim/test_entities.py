@@ -127,6 +127,8 @@ def test_entity_behind_a_closed_door_is_inside(tmp_path: Path) -> None:
         ("handle-14", "handle"),
         ("door_handle", "handle"),
         ("Knob-3", "knob"),
+        ("DoorHandle", "handle"),
+        ("left_doorknob", "knob"),
         ("panhandler", None),
         ("door-1", None),
         ("", None),

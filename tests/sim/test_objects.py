@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from quest.errors import ObjectError
 from quest.sim.articulation import MAX_TURN_RAD
@@ -93,6 +94,17 @@ def test_origins_left_in_old_units_are_mended(tmp_path: Path) -> None:
     axes = cabinet.articulation.axes(cabinet.articulation.poses(cabinet.articulation.rest))
     assert np.abs(axes[:, :3]).max() < 1  # inside the object, not ten times as far away
     assert cabinet.articulation.joints[0].joint.upper == pytest.approx(0.1 * 0.35 * cabinet.scale)
+    # A user's URDF with meshes in other units looks just so, and means what it says.
+    own = load_object((folder / "mobility.urdf").rename(folder / "own.urdf"))
+    assert own.source == "own"
+    assert not any("scaled" in warning for warning in own.warnings)
+    assert own.articulation.joints[0].joint.upper == pytest.approx(0.35)
+
+
+def test_as_many_joints_as_masks_can_tell(tmp_path: Path) -> None:
+    drawers = tuple(replace(DRAWER, name=f"drawer{n}") for n in range(255))
+    with pytest.raises(ObjectError, match="at most 254"):
+        load_object(write_object(tmp_path / "archive", CARCASS, *drawers))
 
 
 @pytest.mark.parametrize("file", ["result_after_merging.json", "mobility_v2.json"])
@@ -128,6 +140,36 @@ def test_missing_and_empty_meshes_are_left_out_and_flagged(tmp_path: Path) -> No
     assert "2 meshes" in warning
     assert "drawer-2.obj, drawer-3.obj" in warning
     assert [e.name for e in cabinet.entities] == ["drawer/handle"]
+
+
+@pytest.mark.parametrize("name", ["door.glb", "door.3ds", "door.step", "door.dae"])
+def test_meshes_that_no_reader_reads_are_left_out_too(tmp_path: Path, name: str) -> None:
+    folder = write_cabinet(tmp_path / "cabinet")
+    (folder / "textured_objs" / name).write_bytes(b"<a/>")
+    urdf = folder / "mobility.urdf"
+    urdf.write_text(urdf.read_text().replace("body-0.obj", name))
+    (warning,) = load_object(folder).warnings
+    assert name in warning
+
+
+@pytest.mark.parametrize("unit", ["", '<unit name="centimeter" meter="0.01"/>'])
+def test_collada_files_tell_their_unit(tmp_path: Path, unit: str) -> None:
+    folder = write_object(tmp_path / "cabinet", CARCASS, DRAWER, DOOR, category=None)
+    mesh = folder / "textured_objs" / "body-0.dae"
+    trimesh.creation.box((0.02, 0.6, 5.0)).export(mesh)
+    mesh.write_text(mesh.read_text().replace("</asset>", f"{unit}</asset>", 1))
+    urdf = folder / "mobility.urdf"
+    urdf.write_text(urdf.read_text().replace("body-0.obj", "body-0.dae"))
+    back = load_object(urdf.rename(folder / "own.urdf")).articulation.parts[0]
+    assert np.ptp(back.surface.vertices[:, 2]) == pytest.approx(0.05 if unit else 5.0)
+
+
+def test_mirrored_meshes_still_look_outwards(tmp_path: Path) -> None:
+    folder = write_cabinet(tmp_path / "cabinet")
+    urdf = folder / "mobility.urdf"
+    urdf.write_text(urdf.read_text().replace('door-0.obj"/>', 'door-0.obj" scale="1 -1 1"/>'))
+    (door,) = [part for part in load_object(folder).articulation.parts if part.name.startswith("door_panel")]
+    assert door.surface.volume > 0
 
 
 def bad_folder(folder: Path, what: str) -> Path:

@@ -47,6 +47,13 @@ def test_names_of_objects() -> None:
             parse_object(text)
 
 
+def test_a_folder_that_is_here_is_an_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_cabinet(tmp_path / "mine")
+    monkeypatch.chdir(tmp_path)
+    assert parse_object("mine") == [("own", "mine")]
+    assert parse_object("other") == [("partnet", "other")]
+
+
 def test_procedural_objects_are_named_by_category_and_seed() -> None:
     named = procedural_objects(20, 100)
     assert [object_id.rpartition("-")[2] for _, object_id in named] == [str(seed) for seed in range(100, 120)]
@@ -108,6 +115,7 @@ def test_cameras_of_a_suite_move_where_the_arguments_say() -> None:
         ({}, "no objects"),
         ({"objects": ("partnet:1",), "level": (0,)}, "--level"),
         ({"objects": ("partnet:1",), "takes_per_object": 0}, "--takes-per-object"),
+        ({"objects": ("partnet:1",), "seed": -1}, "--seed"),
         ({"objects": ("partnet:1",), "every": 9}, "every"),
         ({"objects": ("partnet:1",), "views": 0}, "view"),
         ({"objects": ("partnet:1",), "elevation": (50.0, 20.0)}, "elevation"),

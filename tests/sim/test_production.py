@@ -17,6 +17,7 @@ import pytest
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, RendererError, TakeError
 from quest.sim.cameras import CameraStyle
+from quest.sim.objects import object_digest
 from quest.sim.plan import TakeSpec
 from quest.sim.production import (
     Event,
@@ -32,6 +33,7 @@ from quest.sim.sensor import SENSORS
 from quest.sim.settings import TakeSettings
 from quest.types import Take
 from tests.s3_server import s3_store
+from tests.sim.small_objects import write_cabinet
 from tests.sim.stub_studio import StubStudio, plan, produce_missing
 
 
@@ -80,8 +82,20 @@ def test_takes_made_with_other_settings_do_not_count() -> None:
     store.write(replace(take, info=replace(take.info, provenance=made)))
     assert missing_takes([spec], store) == []
     for other in (TakeSettings(), TakeSettings(views=1), replace(settings, sensor=SENSORS["stereo"])):
-        with pytest.raises(ConfigError, match="other settings, made by `quest generate --camera orbit`"):
+        with pytest.raises(ConfigError, match="of other settings, made by `quest generate --camera orbit`"):
             missing_takes([replace(spec, settings=other)], store)
+
+
+def test_takes_of_an_object_that_was_edited_since_do_not_count(tmp_path: Path) -> None:
+    folder, store = write_cabinet(tmp_path / "mine"), TakeStore("memory://edited")
+    spec = replace(plan(1)[0], source="own", object_id=str(folder))
+    take, _ = StubStudio().make(spec)
+    made = {"object": object_digest(folder)}
+    store.write(replace(take, info=replace(take.info, provenance=made)))
+    assert missing_takes([spec], store) == []
+    (folder / "entities.json").write_text("{}")
+    with pytest.raises(ConfigError, match="of another"):
+        missing_takes([spec], store)
 
 
 def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -1,14 +1,17 @@
 """What SAPIEN draws of a scene that can be computed by hand."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from quest.sim.annotate import project_points
 from quest.sim.articulation import apply
 from quest.sim.cameras import PosedCamera
-from quest.sim.objects import SimObject
+from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Picture, Renderer
 from quest.types import Camera
+from tests.sim.small_objects import write_cabinet
 
 pytestmark = pytest.mark.render
 
@@ -65,3 +68,23 @@ def test_bodies_move(renderer: Renderer, cabinet: SimObject) -> None:
         0.2, abs=1e-3
     )
     assert (opened.entity == 1).sum() > handle.sum()  # nearer is larger
+
+
+def test_mirrored_meshes_show_their_outside_in_their_own_colour(renderer: Renderer, tmp_path: Path) -> None:
+    """A door whose mesh is mirrored left to right is as far away as it was, and red if the URDF says so."""
+    folder = write_cabinet(tmp_path / "cabinet")
+    plain = picture(renderer, load_object(folder), (0, 0))
+    urdf = folder / "mobility.urdf"
+    text = urdf.read_text().replace('door-0.obj"/>', 'door-0.obj" scale="1 -1 1"/>')
+    text = text.replace('<visual name="door_panel-9">', '<visual name="door_panel-9"><origin xyz="0 0.6 0"/>')
+    red = '<material name="red"><color rgba="0.8 0.05 0.05 1"/></material></visual></link><joint name="joint_door"'
+    urdf.write_text(text.replace('</visual></link><joint name="joint_door"', red))
+    cabinet = load_object(folder)
+    stage = renderer.stage(cabinet, [POSED], lambda scene, _: scene.set_ambient_light([1.0, 1.0, 1.0]))
+    stage.pose(cabinet.articulation.poses(np.zeros(2)))
+    (mirrored,) = stage.pictures()
+    door = plain.body == 3
+    assert (mirrored.body[door] == 3).mean() > 0.98
+    assert np.median(np.abs(mirrored.depth_m - plain.depth_m)[door]) < 1e-3
+    reds = mirrored.rgb[door].astype(float).mean(axis=0)
+    assert reds[0] > 2 * max(reds[1:])

@@ -105,8 +105,8 @@ class Generate:
 
         suites = self._suites()
         levels = self.level or (suites[0].level if suites else 1,)
-        if self.takes_per_object < 1 or min(levels) < 1:
-            raise ConfigError("generate: expected --takes-per-object and --level of at least 1")
+        if self.takes_per_object < 1 or min(levels) < 1 or self.seed < 0:
+            raise ConfigError("generate: expected --takes-per-object, --level of at least 1, --seed of at least 0")
         store = TakeStore(self.out)
         takes = plan_takes(
             self._chosen(suites[0].category if suites else None),

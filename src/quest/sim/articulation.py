@@ -26,10 +26,12 @@ class Part:
 
     Attributes:
         name: name that tells what it is (``handle-14``, ``drawer_front-31``); empty if unknown.
+        visual: name that the URDF gives the visual itself; empty if none.
         body: index of the body that it belongs to.
         body_from_part: pose in the body, metres.
         mesh: mesh file, or None for a primitive.
         scale: factors from the mesh file's units to metres, per axis.
+        uv_scale: the same before the object was stretched: for texture coordinates, which takes of one object share.
         shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
         size_m: edge lengths; or radius and length; or radius.
         rgba: colour given by the URDF, or None.
@@ -37,10 +39,12 @@ class Part:
     """
 
     name: str
+    visual: str
     body: int
     body_from_part: Float[np.ndarray, "4 4"]
     mesh: Path | None
     scale: tuple[float, float, float]
+    uv_scale: tuple[float, float, float]
     shape: str
     size_m: tuple[float, ...]
     rgba: tuple[float, float, float, float] | None

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import ObjectError
-from quest.sim.articulation import Articulation, apply
+from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.entities import PlacedEntity
 from quest.types import LABELS
 
@@ -172,6 +172,10 @@ def place(
     return tuple(_placed(entry, articulation, body_of_link, scale) for entry in description.entities)
 
 
+def _file_name(part: Part) -> str:
+    return part.mesh.stem if part.mesh else ""
+
+
 def _placed(
     entry: DescribedEntity,
     articulation: Articulation,
@@ -190,10 +194,10 @@ def _placed(
             i
             for i, part in enumerate(articulation.parts)
             if (body is None or part.body == body)
-            and any(fnmatchcase(name, entry.visual) for name in (part.name, part.mesh.stem if part.mesh else ""))
+            and any(fnmatchcase(name, entry.visual) for name in (part.name, part.visual, _file_name(part)))
         )
         if not parts:
-            names = sorted({p.name or (p.mesh.stem if p.mesh else p.shape) for p in articulation.parts})
+            names = sorted({p.visual or p.name or _file_name(p) or p.shape for p in articulation.parts})
             raise ObjectError(
                 f"{entry.where}: no visual is called {entry.visual!r}; expected a name or pattern out of "
                 f"{', '.join(names[:12])}{' ...' if len(names) > 12 else ''}"

@@ -24,11 +24,11 @@ from jaxtyping import Float
 
 from quest.sim import surfaces
 from quest.sim.appearance import CAMERA_AZIMUTH_DEG, Appearance, Distractor, ObjectLook, Region
+from quest.sim.entities import NAMED
 from quest.sim.surfaces import TILE_M, Surface, make_material
 
 _ROLE = re.compile(r"^(.*?)-?\d*$")
 _PANE = re.compile(r"(?:glass|window)(?:-|$)")
-_HANDLE = re.compile(r"(?:^|[^a-z])(handle|knob)", re.IGNORECASE)
 
 
 def apply_appearance(
@@ -205,7 +205,7 @@ def choose_surface(look: ObjectLook, name: str, link: int) -> Surface:
         name: name of the part's visual, such as ``drawer_front-3``.
         link: index of the link.
     """
-    if _HANDLE.search(name):
+    if NAMED.search(name):
         return look.handle
     if _PANE.match(name):
         return surfaces.sample_glass_surface(np.random.default_rng(look.seed))

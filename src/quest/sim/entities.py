@@ -39,7 +39,9 @@ _LIFTED_BY_HANDLE = frozenset({"Kettle", "Scissors"})
 _KNOB_ON_TOP = frozenset({"Kettle"})
 """Categories whose sliding part is a lid; what one holds is not named in PartNet-Mobility."""
 
-_NAMED = re.compile(r"(?:^|[^a-z])(handle|knob)", re.IGNORECASE)
+NAMED = re.compile("handle(?!r)|knob", re.IGNORECASE)
+"""Found in the names of parts that one takes hold of: ``handle-3``, ``DoorHandle``, ``left_doorknob``."""
+
 _SAMPLES = 600
 _THIN_SAMPLES = 20_000
 """Of a base whose rim is a thin face of something large."""
@@ -101,8 +103,8 @@ class SimEntity:
 
 def part_label(name: str) -> str | None:
     """``handle`` or ``knob`` if a part's name says so, else None."""
-    match = _NAMED.search(name)
-    return match.group(1).lower() if match else None
+    match = NAMED.search(name)
+    return match.group().lower() if match else None
 
 
 def find_entities(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
+from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
@@ -23,7 +25,11 @@ from quest.types import Joint
 OBJECTS_VARIABLE = "QUEST_OBJECTS"
 """Environment variable that names the folder of PartNet-Mobility folders."""
 
-_PLAUSIBLE_M = (0.02, 5.0)
+_PLAUSIBLE_M = (0.02, 3.0)
+"""Longest side; what is larger has parts beyond the 6.55 m to which takes keep depth."""
+_MOST_JOINTS = 254
+"""Masks of links have one byte."""
+_PART_NAMES = ("mobility_v2.json", "result_after_merging.json")
 _CATEGORY_OF_BASE = {
     "furniture_body": "StorageFurniture",
     "refrigerator_body": "Refrigerator",
@@ -146,7 +152,7 @@ def load_object(path: Path) -> SimObject:
     urdf_path = find_urdf(Path(path))
     folder = urdf_path.parent
     warnings: list[str] = []
-    urdf = with_scaled_origins(read_urdf(urdf_path), warnings)
+    urdf = read_urdf(urdf_path)
     meta = _read_json(folder / "meta.json", warnings)
     meta = meta if isinstance(meta, dict) else {}
     described = folder / DESCRIPTION_NAME
@@ -157,6 +163,7 @@ def load_object(path: Path) -> SimObject:
         source = "own"
     description = read_description(described) if described.is_file() else Description()
     if source == "partnet-mobility":
+        urdf = with_scaled_origins(urdf, warnings)
         description = CORRECTIONS.get(folder.name, description)
     articulation, body_of_link = _articulation(urdf, urdf_path, warnings)
     articulation = closed(articulation)
@@ -178,6 +185,23 @@ def load_object(path: Path) -> SimObject:
     )  # fmt: skip
 
 
+def object_digest(path: Path) -> str:
+    """Short hash of all that an object is read from: its URDF, the files beside it that are read, and the meshes.
+
+    Raises:
+        ObjectError: the URDF is missing or broken.
+    """
+    urdf_path = find_urdf(path)
+    beside = [urdf_path.parent / name for name in (DESCRIPTION_NAME, "meta.json", *_PART_NAMES)]
+    visuals = [visual for of_link in read_urdf(urdf_path).links.values() for visual in of_link]
+    meshes = sorted({visual.mesh for visual in visuals if visual.mesh is not None})
+    digest = hashlib.sha256()
+    for file in (urdf_path, *beside, *meshes):
+        data = file.read_bytes() if file.is_file() else b""
+        digest.update(f"{file.name}\0{len(data)}\n".encode() + data)
+    return digest.hexdigest()[:12]
+
+
 def _scale(
     articulation: Articulation, source: str, category: str, description: Description, warnings: list[str]
 ) -> float:
@@ -192,7 +216,10 @@ def _scale(
         return real_scale(articulation, category)
     longest = float(np.ptp(articulation.world_points(articulation.rest), axis=0).max())
     if not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
-        warnings.append(f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME}")
+        warnings.append(
+            f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME} if they are not; "
+            "beyond 6.55 m takes have no depth"
+        )
     return 1.0
 
 
@@ -223,6 +250,8 @@ def _articulation(
     moving = [j for j in urdf.joints if j.kind != "fixed" and j.upper > j.lower]
     if not moving:
         raise ObjectError(f"{urdf_path}: expected a joint that moves, found none; use another object")
+    if len(moving) > _MOST_JOINTS:
+        raise ObjectError(f"{urdf_path}: expected at most {_MOST_JOINTS} joints that move, got {len(moving)}")
     children = {j.child for j in urdf.joints}
     body = {name: 0 for name in urdf.links if name not in children}
     body_from_link = {name: np.eye(4) for name in body}
@@ -287,7 +316,7 @@ def _names_of_meshes(folder: Path, warnings: list[str]) -> dict[str, str]:
                 names[str(mesh)] = name
             visit(node.get("children") or node.get("parts"), name)
 
-    for file in ("mobility_v2.json", "result_after_merging.json"):
+    for file in _PART_NAMES:
         visit(_read_json(folder / file, warnings), "")
     return names
 
@@ -305,13 +334,24 @@ def _surface(visual: UrdfVisual) -> trimesh.Trimesh | None:
         return None
     try:
         mesh = trimesh.load(visual.mesh, process=False, force="mesh", skip_materials=True)
-    except (ValueError, IndexError, KeyError, OSError):
+        unit_m = _collada_unit_m(visual.mesh)
+    except Exception:  # its many readers raise whatever a damaged file or a missing package makes them
         return None
     if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0 or not np.isfinite(mesh.vertices).all():
         return None
-    used = trimesh.Trimesh(np.asarray(mesh.vertices) * np.array(visual.scale), mesh.faces, process=False)
+    used = trimesh.Trimesh(np.asarray(mesh.vertices) * unit_m * np.array(visual.scale), mesh.faces, process=False)
+    if np.prod(visual.scale) < 0:
+        used.invert()  # mirrored: the faces look inwards
     used.remove_unreferenced_vertices()
     return used
+
+
+def _collada_unit_m(path: Path) -> float:
+    """Metres per unit that a COLLADA file tells, which SAPIEN heeds and trimesh does not; 1 for other files."""
+    if path.suffix.lower() != ".dae":
+        return 1.0
+    unit = next((e for e in ElementTree.parse(path).iter() if e.tag.rpartition("}")[2] == "unit"), None)
+    return 1.0 if unit is None else float(unit.get("meter", 1.0))
 
 
 def _part(
@@ -319,4 +359,16 @@ def _part(
 ) -> Part:
     body_from_part = body_from_link @ visual.link_from_visual
     in_body = surface.copy().apply_transform(body_from_part)
-    return Part(name, body, body_from_part, visual.mesh, visual.scale, visual.shape, visual.size, visual.rgba, in_body)
+    return Part(
+        name=name,
+        visual=visual.name,
+        body=body,
+        body_from_part=body_from_part,
+        mesh=visual.mesh,
+        scale=visual.scale,
+        uv_scale=visual.scale,
+        shape=visual.shape,
+        size_m=visual.size,
+        rgba=visual.rgba,
+        surface=in_body,
+    )

@@ -75,12 +75,14 @@ def plan_takes(
 def parse_object(text: str) -> list[tuple[str, str]]:
     """Sources and ids of ``partnet:44817,23724``, ``procedural:chest-12``, ids alone (PartNet-Mobility), or a path.
 
-    A path, with a slash in it or ending in ``.urdf``, is a user's own object.
+    A path, with a slash in it or ending in ``.urdf``, is a user's own object; so is the name of a folder here that
+    holds a URDF.
 
     Raises:
         ObjectError: the source is unknown, no id is given, or there is no object at the path.
     """
-    if "/" in text or "\\" in text or text.endswith(".urdf"):
+    here = ":" not in text and Path(text).is_dir() and any(Path(text).glob("*.urdf"))
+    if here or "/" in text or "\\" in text or text.endswith(".urdf"):
         object_id_of(Path(text))  # told at once
         return [("own", text)]
     source, colon, ids = text.partition(":")

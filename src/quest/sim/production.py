@@ -18,7 +18,7 @@ from quest.data.provenance import code_commit, package_versions
 from quest.data.take_format import hash_take
 from quest.errors import ConfigError, ObjectError, TakeError
 from quest.sim.generate import generate_take
-from quest.sim.objects import find_objects
+from quest.sim.objects import find_objects, object_digest
 from quest.sim.plan import ObjectShelf, TakeSpec
 from quest.sim.renderer import Renderer
 from quest.types import Take
@@ -181,6 +181,8 @@ def make_take(
         RendererError: the renderer broke.
     """
     sim_object = shelf.load(spec.source, spec.object_id)
+    if spec.source == "own":
+        provenance = {**(provenance or {}), "object": object_digest(Path(spec.object_id))}
     take = generate_take(
         sim_object,
         spec.level,
@@ -198,7 +200,8 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
 
     Raises:
         ConfigError: two different takes have the same name, as those of objects whose folders have; or the store has
-            one that was made with other settings.
+            one that was made with other settings, or of a user's own object that has changed since.
+        ObjectError: the URDF of a user's own object is gone.
     """
     wanted: dict[str, TakeSpec] = {}
     for spec in specs:
@@ -209,12 +212,17 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
             )
     there = store.headers(wanted)
     for name, header in there.items():
-        about, digest = header.info.provenance, wanted[name].settings.digest
-        if about.get("settings", digest) != digest:  # older takes do not say
-            raise ConfigError(
-                f"take {name}: {store.url} has it with other settings, made by `{about.get('command', 'unknown')}`; "
-                "use another store, another --seed, or delete it there"
-            )
+        spec, about = wanted[name], header.info.provenance
+        made = {"settings": spec.settings.digest}
+        if spec.source == "own":
+            made["object"] = object_digest(Path(spec.object_id))
+        for what, digest in made.items():
+            if about.get(what, digest) != digest:  # older takes do not say
+                differs = "other settings" if what == "settings" else f"another {spec.object_id}"
+                raise ConfigError(
+                    f"take {name}: {store.url} has it of {differs}, made by `{about.get('command', 'unknown')}`; "
+                    "use another store, another --seed, or delete it there"
+                )
     return [spec for name, spec in wanted.items() if name not in there]
 
 

@@ -99,7 +99,8 @@ class Stage:
         for body, entity, parts in _groups(sim_object):
             component = sapien.render.RenderBodyComponent()
             for part in parts:
-                component.attach(_shape(sapien, part))
+                for shape in _shapes(sapien, part):
+                    component.attach(shape)
             actor = sapien.Entity()
             actor.add_component(component)
             self._scene.add_entity(actor)
@@ -185,7 +186,7 @@ def _groups(sim_object: SimObject) -> list[tuple[int, int, list[Part]]]:
     return [(body, entity, members) for (body, entity), members in groups.items()]
 
 
-def _shape(sapien: Any, part: Part) -> Any:
+def _shapes(sapien: Any, part: Part) -> list[Any]:
     # SAPIEN shares meshes between scenes, and once drawn they no longer take texture coordinates: they get them here.
     render = sapien.render
     if part.mesh is not None:
@@ -194,8 +195,10 @@ def _shape(sapien: Any, part: Part) -> Any:
             shape.set_local_pose(sapien.Pose(part.body_from_part))
             shape.set_name(part.name)
             for piece in shape.parts:
-                ensure_uv(piece, np.array(part.scale))
-            return shape
+                ensure_uv(piece, np.array(part.uv_scale))
+                if part.rgba is not None and piece.material.base_color_texture is None:
+                    piece.material.set_base_color(part.rgba)
+            return [shape] if np.prod(part.scale) > 0 else [_mirrored(sapien, piece, part) for piece in shape.parts]
         except RuntimeError:
             pass  # a file that trimesh reads and assimp refuses; its geometry is known
     corners = np.asarray(part.surface.triangles, dtype=np.float32).reshape(-1, 3)
@@ -208,4 +211,18 @@ def _shape(sapien: Any, part: Part) -> Any:
     shape.set_name(part.name)
     for piece in shape.parts:
         ensure_uv(piece, np.ones(3))
+    return [shape]
+
+
+def _mirrored(sapien: Any, piece: Any, part: Part) -> Any:
+    """A piece of a mesh with a negative scale, whose triangles are turned round: what looks away is not drawn."""
+    scale = np.array(part.scale, dtype=np.float32)
+    normals = piece.get_vertex_normal() / scale
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
+    triangles = np.ascontiguousarray(piece.get_triangles()[:, ::-1])
+    shape = sapien.render.RenderShapeTriangleMesh(
+        piece.get_vertices() * scale, triangles, normals, piece.get_vertex_uv(), piece.material
+    )
+    shape.set_local_pose(sapien.Pose(part.body_from_part))
+    shape.set_name(part.name)
     return shape

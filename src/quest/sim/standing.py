@@ -90,12 +90,13 @@ def scaled(articulation: Articulation, scale: float) -> Articulation:
 
     parts = []
     for p in articulation.parts:
-        sx, sy, sz = p.scale
+        sx, sy, sz = (s * scale for s in p.scale)
         parts.append(
             replace(
                 p,
                 body_from_part=pose(p.body_from_part),
-                scale=(sx * scale, sy * scale, sz * scale),
+                scale=(sx, sy, sz),
+                uv_scale=(sx, sy, sz),
                 size_m=tuple(s * scale for s in p.size_m),
                 surface=p.surface.copy().apply_scale(scale),
             )

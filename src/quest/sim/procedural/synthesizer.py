@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import MissingExtraError
+from quest.extras import install_command
 from quest.sim.procedural.handles import HandleStyle, handle_part, sample_style
 from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import box, polygon_flat
@@ -36,7 +37,7 @@ def build_kitchen(category: str, rng: np.random.Generator) -> ObjectModel:
         from scene_synthesizer import procedural_assets
     except ImportError as error:
         raise MissingExtraError(
-            f"procedural {category}: scene-synthesizer is missing; install the extra: pip install 'quest-tracker[sim]'"
+            f"procedural {category}: scene-synthesizer is missing; install the extra: {install_command('sim')}"
         ) from error
     model_cat, describe = KITCHEN[category]
     with tempfile.TemporaryDirectory(prefix="quest-") as folder:
