@@ -8,7 +8,7 @@ from typing import Literal
 
 from quest.evaluation.lineup import FLOW_NOISES
 from quest.model.config import PRESETS, NetworkConfig
-from quest.train.settings import LossWeights, WindowConfig
+from quest.train.settings import LOSSES, LossWeights, WindowConfig
 
 TableName = Literal["parts", "window", "slots", "losses", "design", "data"]
 PresetName = Literal["default", "paper"]
@@ -19,7 +19,7 @@ LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 
 LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
     "default": ("aff", "heat", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map", "joint"),
-    "paper": ("aff", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map"),
+    "paper": ("aff", "vel", "acc", "conf", "bound", "feat", "geo", "map"),
 }
 """Losses that are not zero by construction."""
 
@@ -70,19 +70,19 @@ _NETWORKS = {**PRESETS, "default": replace(PRESETS["default"], map_layers=0)}
 
 def full(preset: PresetName) -> Variant:
     """A preset; the default one has a flow head, which changes nothing else."""
-    return Variant(preset, _NETWORKS[preset], flow=preset == "default")
+    return Variant(preset, _NETWORKS[preset], losses=LOSSES[preset], flow=preset == "default")
 
 
 def changed(preset: PresetName, name: str, **fields: object) -> Variant:
     """A preset with other fields of the network."""
     network = replace(_NETWORKS[preset], **fields)  # type: ignore[arg-type]
-    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network)
+    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network, LOSSES[preset])
 
 
 def without(preset: PresetName, name: str, *losses: str) -> Variant:
     """A preset trained without some losses."""
     return Variant(
-        f"{preset}-no-{name}", _NETWORKS[preset], losses=replace(LossWeights(), **dict.fromkeys(losses, 0.0))
+        f"{preset}-no-{name}", _NETWORKS[preset], losses=replace(LOSSES[preset], **dict.fromkeys(losses, 0.0))
     )
 
 
@@ -177,6 +177,8 @@ def _design(preset: PresetName) -> list[Line]:
 
 def _data(preset: PresetName) -> list[Line]:
     """Objects free for any use against all; the steps are the same."""
+    if preset != "default":
+        return []
     own = f"{preset}: all training objects"
     free = replace(full(preset), name=f"{preset}-procedural", flow=False, sources=("procedural",))
     return [Line(own, full(preset)), Line(f"{preset}: procedural objects only", free, "quest", own)]

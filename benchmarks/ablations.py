@@ -371,6 +371,11 @@ class TestTakes:
             (store, {name: chosen[name] for name in store.names() if name in chosen}) for store in stores
         ]
         kept = tuple(part for part in parts if part[1])
+        # The cache of features knows takes by their names.
+        teaching = {name for path in (*asked.train, *asked.validation) for name in TakeStore(path).names()}
+        twice = sorted(teaching & {name for _, takes in kept for name in takes})
+        if twice:
+            raise ConfigError(f"take {twice[0]}: a store of --test has it and another one too; leave one of them away")
         digest = combined_hash((name, store.data_hash(name)) for store, takes in kept for name in takes)
         return cls(kept, units_of(stores), digest)
 

@@ -165,6 +165,11 @@ class Release:
     def _weights(self) -> Path:
         return self.work / f"{self.name}.safetensors"
 
+    @property
+    def _partnet(self) -> str:
+        """Whether PartNet-Mobility objects choose; they teach and choose, or neither."""
+        return "--partnet" if self.partnet else "--no-partnet"
+
     def _recipe(self) -> tuple[TrainingTakes, ...]:
         return (*(PARTNET if self.partnet else ()), *PROCEDURAL)
 
@@ -199,10 +204,11 @@ class Release:
                    *takes.arguments.split())  # fmt: skip
         self._generate_whole("validation")
         choice = ("--out", self._takes_of("wide_validation"), "--split", "validation", *MAP_CHOICE.split())
-        _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
+        if self.partnet:
+            _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
         _quest("generate", *choice, "--no-partnet", "--seeds", "105000..105023", "--mix", "broad")
         suites = ("--out", self._takes_of("suites_validation"), "--split", "validation")
-        _quest("generate", *suites, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
+        _quest("generate", *suites, self._partnet, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
         _quest("generate", *suites, "--suite", "lockers", "--seeds", "103000..103003")
 
     def _train(self) -> None:
@@ -268,9 +274,13 @@ class Release:
         return takes
 
     def _generate_whole(self, part: str) -> None:
-        """Takes to choose or to judge by, with every frame; objects without enough joints are skipped."""
+        """Takes to choose or to judge by, with every frame; objects without enough joints are skipped.
+
+        Whatever taught, PartNet-Mobility objects are among those that judge.
+        """
+        which = "--partnet" if part == "test" else self._partnet
         for level, count in ((1, self.evaluation_procedural), (4, self.evaluation_procedural_level_4)):
-            _quest("generate", "--out", self._takes_of(part), "--split", part, "--procedural", count,
+            _quest("generate", "--out", self._takes_of(part), "--split", part, which, "--procedural", count,
                    "--level", level)  # fmt: skip
 
 

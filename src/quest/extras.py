@@ -1,13 +1,15 @@
 """Optional parts: which extra of the distribution brings which module, and one clear message where it is missing.
 
 The base install tracks a recorded clip. What only simulation or training need comes with an
-extra, such as ``pip install "quest-tracker[sim]"``.
+extra, such as ``pip install ".[sim]"`` in the project's folder.
 """
 
 from __future__ import annotations
 
 import importlib
 import importlib.util
+import shlex
+from pathlib import Path
 from types import ModuleType
 
 from quest.errors import MissingExtraError
@@ -32,8 +34,12 @@ EXTRA_OF = {
 
 
 def install_command(extra: str) -> str:
-    """Command that installs an extra."""
-    return f'pip install "{DISTRIBUTION}[{extra}]"'
+    """Command that installs an extra: from the checkout that the package runs from, if it does."""
+    root = Path(__file__).resolve().parents[2]
+    if not (root / "constraints.txt").is_file():
+        return f'pip install "{DISTRIBUTION}[{extra}]"'
+    what = shlex.quote(f"{root}[{extra}]")
+    return f"pip install --constraint {shlex.quote(str(root / 'constraints.txt'))} --editable {what}"
 
 
 def is_installed(module: str) -> bool:

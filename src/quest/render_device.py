@@ -51,8 +51,8 @@ LAVAPIPE_MIN_HEADER = 302
 """Vulkan header revision of Mesa 24.3, the first whose lavapipe has the external handles that SAPIEN asks for."""
 
 REMEDY = (
-    "install a software renderer with `make render-deps` (Debian and Ubuntu: `apt-get install chromium libvulkan1`; "
-    "elsewhere: Chromium or Google Chrome from your package manager), or install the NVIDIA driver with its graphics "
+    "install a software renderer with `make render-deps` (Debian: `apt-get install chromium libvulkan1`; "
+    "elsewhere: Chromium that is no snap, or Google Chrome), or install the NVIDIA driver with its graphics "
     "libraries, or name a driver yourself with VK_ICD_FILENAMES=/path/to/icd.json"
 )
 

@@ -56,6 +56,7 @@ class Doctor:
         checks: list[Callable[[], Iterator[Finding]]] = [
             _python,
             _torch,
+            _pictures,
             _video,
             _weights,
             _renderer,
@@ -112,6 +113,16 @@ def _torch() -> Iterator[Finding]:
         yield Finding("mps", "ok", "Apple GPU")
     elif not torch.cuda.is_available():
         yield Finding("gpu", "optional", "none that torch can use; everything runs on the CPU")
+
+
+def _pictures() -> Iterator[Finding]:
+    try:
+        import cv2
+    except ImportError as error:
+        remedy = "on Debian and Ubuntu: apt-get install libgl1 libglib2.0-0 libxcb1"
+        yield Finding("pictures", "broken", f"OpenCV cannot be imported: {error}", remedy)
+        return
+    yield Finding("pictures", "ok", f"OpenCV {cv2.__version__}")
 
 
 def _video() -> Iterator[Finding]:

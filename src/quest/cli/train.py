@@ -19,7 +19,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from quest.train.settings import LossWeights, TrainingConfig, WindowConfig
+from quest.train.settings import LossChanges, TrainingConfig, WindowConfig
 
 if TYPE_CHECKING:
     import torch
@@ -83,8 +83,8 @@ class Train:
     """How to train."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     """How windows are drawn."""
-    losses: LossWeights = field(default_factory=LossWeights)
-    """Weight of every loss."""
+    losses: LossChanges = field(default_factory=LossChanges)
+    """Which losses count more or less than in the preset."""
 
     def run(self) -> int:
         """Prepare, train, write the file."""
@@ -169,7 +169,7 @@ class Train:
         from quest.train.stage import StageOne
 
         if self.stage == 1:
-            return StageOne(network, self.losses)
+            return StageOne(network, self.losses.apply(network.config.preset))
         return StageMap(network) if self.stage == "map" else StageTwo(network)
 
     def _write(self, best: Path, start: _Start, takes: int) -> Path:

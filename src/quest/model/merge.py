@@ -20,6 +20,8 @@ def merge(
 ) -> LoadedNetwork:
     """Weights with the affordance map and the flow head of others.
 
+    The licences of all parts are joined, and the version is left open.
+
     Neither takes part in following what a query is bound to, so settings and the monitor's calibration stay good, but
     for the threshold of discovery (``quest weights tune --discovery-only``). The mean of the maps of one training's
     checkpoints, or of trainings that began with the same map, is often better than each.
@@ -53,7 +55,10 @@ def merge(
     network.load_state_dict(state)
     parts = [f"map of {', '.join(m.name for m in maps)}"] if maps else []
     parts += [f"flow head of {flow.name}"] if flow is not None else []
-    return replace(base, network=network.eval(), about="; ".join([base.about, *parts]))
+    licences = dict.fromkeys(part.licence for part in (base, *maps, flow) if part is not None and part.licence)
+    return replace(
+        base, network=network.eval(), about="; ".join([base.about, *parts]), licence="; ".join(licences), version=""
+    )
 
 
 def _mean(tensors: list[Tensor]) -> Tensor:

@@ -155,7 +155,10 @@ class _Learner:
             rng.bit_generator.state = json.loads(start.rng)
             generators = load_generators(out / "last")
         network.train()
-        self.fabric.barrier()  # nobody writes before everybody has read
+        # Nobody writes before everybody has read.
+        steps = torch.as_tensor(self.fabric.all_gather(torch.tensor(start.step, device=self.fabric.device)))
+        if int(steps.min()) != int(steps.max()):
+            raise ConfigError(f"training: not every process finds the checkpoint in {out}; all machines must share it")
         restore_generators(self.fabric, generators)
         return start
 
@@ -260,7 +263,7 @@ def _writer(fabric: Fabric, out: Path, progress: Progress) -> SummaryWriter | No
         return None
     from torch.utils.tensorboard import SummaryWriter
 
-    return SummaryWriter(str(out / "curves"), purge_step=progress.step)
+    return SummaryWriter(str(out / "curves"), purge_step=progress.step + 1)
 
 
 def _log(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from quest.errors import ConfigError
@@ -93,7 +93,7 @@ class WindowConfig:
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weight of every loss; 0 turns it off.
+    """Weight of every loss; 0 turns it off. The defaults are those of the preset ``default``.
 
     Attributes:
         aff: Huber loss of coordinates on visible entities.
@@ -120,3 +120,32 @@ class LossWeights:
     geo: float = 0.2
     map: float = 1.0
     joint: float = 0.1
+
+
+LOSSES: dict[str, LossWeights] = {
+    "default": LossWeights(),
+    "paper": LossWeights(aff=1.0, heat=0.0, point=0.0, joint=0.0),
+}
+"""Weights by preset. Those of ``paper`` are as published: coordinates 1, first and second differences 1 and 0.5; the
+publication leaves the others open."""
+
+
+@dataclass(frozen=True)
+class LossChanges:
+    """Weights of losses that are to differ from the preset's; 0 turns one off (docs/training.md has them)."""
+
+    aff: float | None = None
+    heat: float | None = None
+    point: float | None = None
+    vel: float | None = None
+    acc: float | None = None
+    conf: float | None = None
+    bound: float | None = None
+    feat: float | None = None
+    geo: float | None = None
+    map: float | None = None
+    joint: float | None = None
+
+    def apply(self, preset: str) -> LossWeights:
+        """The preset's weights with the changes."""
+        return replace(LOSSES[preset], **{name: value for name, value in asdict(self).items() if value is not None})
