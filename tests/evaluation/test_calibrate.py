@@ -68,7 +68,7 @@ def test_the_text_stays_small():
     """As many members and hidden units as the default settings can choose."""
     largest = make_calibrator(hidden=max(FitConfig().hidden), members=FitConfig().folds)
     maxima = np.sort(np.random.default_rng(0).normal(size=500) ** 2)
-    assert len(Calibration(largest, Cusum(0.0), maxima, 60, "").to_json()) < 100_000
+    assert len(Calibration(largest, Cusum(0.0), maxima, 60, "", 0).to_json()) < 100_000
 
 
 def test_same_streams_same_monitor(streams: list[StreamRecord], fitted: Fitted):

@@ -101,6 +101,8 @@ def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
     assert tracks.joints is None or set(tracks.joints.kind) <= {"unknown", "static"}
     peaks, blind = (tracker.candidates(c.camera, c.frame(0)) for c in (clip, replace(clip, depth_m=None)))
     torch.testing.assert_close(peaks.logit, blind.logit)
+    assert torch.isfinite(peaks.point_m).all(dim=1).any()
+    assert torch.isnan(blind.point_m).all()
 
 
 def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:

@@ -153,6 +153,17 @@ def test_one_object_has_no_interval() -> None:
     assert median_value(np.full(3, np.nan), np.zeros(3, dtype=int), draws) is None
 
 
+def test_intervals_need_terms_of_two_objects() -> None:
+    draws, owner = draw_objects(6, resamples=50, generator=np.random.default_rng(0)), np.arange(6)
+    for counted in (1, 2):
+        count = (owner < counted).astype(float)
+        mean = mean_value(Sums(0.3 * count, count), owner, draws)
+        median = median_value(np.where(count > 0, 0.3, np.nan), owner, draws)
+        assert mean is not None
+        assert median is not None
+        assert (mean.low is None) == (median.low is None) == (counted == 1)
+
+
 def test_results_and_records_come_back_equal(tmp_path: Path, records: tuple[EntityRecord, ...]) -> None:
     subject = dataclasses.replace(records[0].subject, protocol="semantic")
     semantic = tuple(

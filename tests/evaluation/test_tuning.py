@@ -87,6 +87,10 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
     bias, precision, recall = discovery_bias(make_tracker(), [(store, {NAME: "validation"})])
     assert (precision, recall) == pytest.approx((2 / 3, 1.0))
     assert bias == pytest.approx(1.0)
+    wrong = replace(peaks, point_m=point_m[[0, 0, 0]] + 9)
+    monkeypatch.setattr(Tracker, "candidates", lambda *_: wrong)
+    tracker = make_tracker()
+    assert discovery_bias(tracker, [(store, {NAME: "validation"})]) == (tracker.config.slot_bias, 0.0, 0.0)
 
 
 def test_after_the_map_alone_only_discovery_is_tuned(store: TakeStore):

@@ -38,4 +38,4 @@ def watching(name: str, *, gain: float = -2.0, maxima: np.ndarray | None = None,
         bias=np.zeros(1),
     )
     maxima = np.linspace(0.0, 10.0, 1000) if maxima is None else maxima
-    return Calibration(calibrator, Cusum(0.0), maxima, block_frames, "made up")
+    return Calibration(calibrator, Cusum(0.0), maxima, block_frames, "made up", 0)

@@ -13,6 +13,7 @@ from quest.monitor import SIGNALS, Calibration
 from quest.monitor import memory as memories
 from quest.monitor.calibration import rounded
 from quest.monitor.calibrator import LOGIT_LIMIT, probability
+from quest.monitor.conformal import spend
 from quest.monitor.statistic import Cusum
 from tests.monitor.calibrations import make_calibrator
 
@@ -20,7 +21,7 @@ MAXIMA = np.sort(np.random.default_rng(0).random(20))
 
 
 def made(hidden: int = 3) -> Calibration:
-    return Calibration(make_calibrator(hidden=hidden), Cusum(-1.0, 0.85), MAXIMA, 60, "a test")
+    return Calibration(make_calibrator(hidden=hidden), Cusum(-1.0, 0.85), MAXIMA, 60, "a test", 0)
 
 
 @pytest.mark.parametrize(
@@ -32,6 +33,18 @@ def test_alarms_that_cannot_come_are_told(streams: int, never: str | None):
     assert (told is None) == (never is None)
     assert never is None or (told is not None and never in told)
     assert (few.least_alpha <= 0.05) == (streams >= 24)
+
+
+def test_later_blocks_have_thresholds_that_nothing_exceeds():
+    """A frame adds at most 8 + 3 to a sum that forgets everything, and these maxima have a long tail."""
+    tailed = replace(made(), statistic=Cusum(-3.0, 0.0), maxima=np.sort(np.random.default_rng(0).exponential(2, 200)))
+    told = tailed.shortfall(0.05)
+    assert told is not None
+    block = int(told.split("after ")[1].split()[0]) // 60
+    assert 1 <= block < 1000
+    last, next_one = (tailed.threshold(spend(0.05, block=b, restart=0)).value for b in (block, block + 1))
+    assert last < 11.0 <= next_one
+    assert replace(tailed, statistic=Cusum(-3.0, 1.0)).shortfall(0.05) is None
 
 
 def test_squashing_and_back():

@@ -10,6 +10,7 @@ import pytest
 from quest.errors import ConfigError, InputError
 from quest.evaluation.detectors import our_monitor, play
 from quest.monitor import SIGNALS, Alarm, Calibration, Monitor, Signals, Verdict
+from quest.monitor import memory as memories
 from quest.monitor.conformal import spend
 from quest.monitor.statistic import Cusum
 from tests.monitor.calibrations import make_calibrator, watching
@@ -110,9 +111,22 @@ def test_too_few_streams_raise_no_alarm():
     assert not any(v.raised for v in run(monitor, [-5.0] * 50))
 
 
+def test_an_endless_stream_keeps_few_thresholds():
+    monitor = watched(watching("anchor_cosine", block_frames=1, maxima=np.linspace(0.0, 20.0, 1000)), 0)
+    run(monitor, [0.5] * 2100)
+    assert len(monitor._thresholds) <= 1001
+
+
+def test_age_is_told_no_further_than_calibration_streams_go():
+    calibrator, memory = make_calibrator(), memories.start(1)
+    for t in range(200):
+        memory, found = calibrator.step(memory, np.zeros((1, len(SIGNALS))))
+        assert found[0, -1] == pytest.approx(0.25 * np.log1p(min(t + 1, 60)))
+
+
 def test_queries_come_and_go():
     """Whatever the others do, a query's verdicts are those it would have alone."""
-    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 15, "")
+    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 15, "", 0)
     record = make_stream(3, frames=40, queries=3)
     together, alone = watched(calibration, 0, 2), watched(calibration, 2)
     for t in range(40):
@@ -153,7 +167,7 @@ def test_no_queries():
 
 
 def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
-    calibration = Calibration(make_calibrator(), Cusum(-1.5), np.linspace(0, 5, 100), 15, "")
+    calibration = Calibration(make_calibrator(), Cusum(-1.5), np.linspace(0, 5, 100), 15, "", 0)
     record = make_stream(5, frames=60, queries=3)
     monitor = watched(calibration, 0, 1, 2)
     restored = None
@@ -179,7 +193,7 @@ def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
 
 
 def test_replaying_records_gives_what_the_monitor_gives():
-    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 25, "")
+    calibration = Calibration(make_calibrator(), Cusum(0.0), np.linspace(0, 50, 100), 25, "", 0)
     records = [make_stream(1, frames=60), make_stream(2, frames=30, queries=2), make_stream(3, frames=60)]
     records[2] = replace(records[2], asked=np.array([0, 7, 0, 40]))
     played = play(our_monitor(calibration), records)

@@ -45,7 +45,7 @@ def make_calibration(*, alarming: bool) -> Calibration:
         outer=np.zeros((1, 0)),
         bias=np.array([3.0 if alarming else -3.0]),
     )
-    return Calibration(calibrator, Cusum(0.0), np.linspace(0.0, 5.0, 200), 60, "made up")
+    return Calibration(calibrator, Cusum(0.0), np.linspace(0.0, 5.0, 200), 60, "made up", 0)
 
 
 def without_depth(clip: Clip, frames: slice) -> Clip:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -54,9 +54,16 @@ COVERED = Sight(behind=lambda p: np.full(len(p), -1.0))
 
 
 def hide(
-    ground: Ground, before: np.ndarray, *, point=(np.nan,) * 3, seen=0.0, frame: Sight = BLIND, buried: bool = False
+    ground: Ground,
+    before: np.ndarray,
+    *,
+    point=(np.nan,) * 3,
+    seen=0.0,
+    frame: Sight = BLIND,
+    buried: bool = False,
+    elapsed: float = 1.0,
 ):
-    return ground.hide(before, np.array(point), seen, frame, buried=buried)
+    return ground.hide(before, np.array(point), seen, frame, buried=buried, elapsed=elapsed)
 
 
 def test_what_is_fixed_stands_where_it_was_first_seen_whatever_is_taken_for_it_later():
@@ -142,6 +149,56 @@ def test_being_seen_again_ends_hiding():
     ground.see(on_door(0.3), door_row(on_door(0.3)))
     place = hide(ground, on_door(0.3))
     assert np.linalg.norm(place - on_door(0.3)) < 0.1
+
+
+@pytest.mark.parametrize("per_frame", [1.0, 3.0])
+def test_what_is_buried_moves_on_as_fast_at_any_frame_rate(per_frame: float):
+    """Half a radian a second, hidden for half a second."""
+    ground, place = Ground(CONFIG), on_door(0.0)
+    for angle in np.arange(0.0, 1.0, 0.5 * per_frame / 30):
+        place = on_door(angle)
+        ground.see(place, door_row(place), elapsed=per_frame)
+    begun = np.arctan2(place[1], place[0])
+    for _ in range(round(15 / per_frame)):
+        place = hide(ground, place, frame=COVERED, buried=True, elapsed=per_frame)
+    assert np.arctan2(place[1], place[0]) - begun == pytest.approx(0.14, abs=0.06)
+
+
+def test_one_sight_after_a_long_time_hidden_is_no_leap():
+    ground, place = opened(), on_door(1.2)
+    for _ in range(60):
+        place = hide(ground, place, frame=COVERED, buried=True)
+    ground.see(on_door(2.0), door_row(on_door(2.0)))
+    place = on_door(2.0)
+    for _ in range(10):
+        place = hide(ground, place, frame=COVERED, buried=True)
+    assert np.arctan2(place[1], place[0]) < 2.25
+
+
+@pytest.mark.parametrize("slides", [False, True])
+def test_what_never_moved_stays_while_it_is_buried(slides: bool):
+    """Its joint is only believed, so that neither side of it is the closed one."""
+    ground, place = Ground(CONFIG), on_door(0.0)
+    row = replace(door_row(place), revolute_logit=-3.0 if slides else 3.0)
+    for _ in range(20):
+        ground.see(place, row)
+    for _ in range(60):
+        place = hide(ground, place, frame=COVERED, buried=True)
+    assert np.linalg.norm(place - on_door(0.0)) < 0.03
+
+
+def test_what_was_put_elsewhere_is_held_there():
+    """As by another query of its link, or by a search; it was not seen in between."""
+    ground = opened()
+    hide(ground, on_door(0.4))
+    place = hide(ground, on_door(0.9))
+    assert np.linalg.norm(place - on_door(0.9)) < 0.05
+
+
+def test_what_turns_far_is_still_on_its_joint():
+    ground, far = opened(2.9), on_door(2.9)
+    assert ground.favour(far[None])[0] > -0.1
+    assert np.linalg.norm(hide(ground, far) - far) < 0.05
 
 
 def test_a_query_that_may_be_seen_after_all_is_near_that_place():

@@ -301,6 +301,17 @@ def test_what_is_found_again_ends_the_alarm(clip: Clip):
     assert after[-1].state != (State.LOST,)
 
 
+def test_without_depth_alarms_end_too(clip: Clip):
+    blind = replace(clip, depth_m=None)
+    stream = watched(alarming=True).stream(clip.camera, POINTS[:1], alpha=0.1)
+    feed(stream, blind, range(3))
+    assert stream._monitor is not None
+    stream._monitor.calibration = make_calibration(alarming=False)
+    after = feed(stream, blind, range(3, 8))
+    assert after[0].alarm[0] is not None
+    assert after[-1].alarm == (None,)
+
+
 @pytest.mark.parametrize("alarming", [False, True])
 @pytest.mark.parametrize(("after", "bfloat16"), [(1, False), (3, True), (5, False)])
 def test_a_saved_stream_goes_on_to_the_bit(after: int, bfloat16: bool, alarming: bool, clip: Clip):

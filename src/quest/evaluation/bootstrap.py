@@ -21,7 +21,7 @@ class Value:
 
     Attributes:
         mean: the metric (a median where its name says so).
-        low: lower end of the 95 % interval; None with fewer than two objects.
+        low: lower end of the 95 % interval; None with terms of fewer than two objects.
         high: upper end of the interval.
         count: how many terms (frames, records or slots) it is over.
     """
@@ -51,7 +51,7 @@ def mean_value(sums: Sums, object_of: Int[np.ndarray, " N"], draws: Int[np.ndarr
     total = draws @ np.bincount(object_of, weights=sums.total, minlength=size)
     count = draws @ np.bincount(object_of, weights=sums.count, minlength=size)
     with_terms = count > 0  # a resample may hold only objects to which the metric does not apply
-    low, high = _percentiles(total[with_terms] / count[with_terms], objects=size)
+    low, high = _percentiles(total[with_terms] / count[with_terms], objects=objects_with_terms(sums, object_of))
     return Value(sums.mean(), low, high, int(sums.count.sum()))
 
 
@@ -70,8 +70,13 @@ def median_value(
         below = np.cumsum(drawn[owner])
         if below[-1] > 0:
             medians.append(ordered[np.searchsorted(below, 0.5 * below[-1])])
-    low, high = _percentiles(np.array(medians), objects=draws.shape[1])
+    low, high = _percentiles(np.array(medians), objects=len(np.unique(owner)))
     return Value(float(np.median(value)), low, high, len(value))
+
+
+def objects_with_terms(sums: Sums, object_of: Int[np.ndarray, " N"]) -> int:
+    """How many objects have anything that a metric counts."""
+    return len(np.unique(object_of[sums.count > 0]))
 
 
 def _percentiles(samples: np.ndarray, *, objects: int) -> tuple[float | None, float | None]:

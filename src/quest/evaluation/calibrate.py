@@ -27,6 +27,7 @@ from quest.monitor import memory as memories
 from quest.monitor.calibration import rounded
 from quest.monitor.calibrator import LOGIT_LIMIT, Calibrator, probability
 from quest.monitor.statistic import Cusum
+from quest.track.settings import REVISION
 
 STATISTICS = tuple(Cusum(drift, keep) for keep, drift in product((0.0, 0.5, 0.85, 1.0), (-3.0, -1.0, 0.0, 1.0, 2.0)))
 """What is tried; without keeping anything the statistic is the log odds of the frame itself."""
@@ -154,7 +155,7 @@ def fit_calibration(
         f"from {len(maxima)} loss-free streams of as many other objects, {block_frames} frames each"
     )
     return Fitted(
-        calibration=Calibration(calibrator, statistic, maxima, block_frames, about),
+        calibration=Calibration(calibrator, statistic, maxima, block_frames, about, REVISION),
         objects=len(objects),
         streams=len(fit),
         frames=len(frames.lost),

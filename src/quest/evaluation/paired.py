@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from quest.errors import InputError
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value
+from quest.evaluation.bootstrap import Value, draw_objects, mean_value, objects_with_terms
 from quest.evaluation.metrics import Sums
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.take_suite import TakeSuite
@@ -216,7 +216,7 @@ def _row(key: tuple, pairs: list[Pair], *, resamples: int, seed: int) -> PairedR
         astray=share([p.on.follows != p.on.entity for p in pairs]),
         worst_object=worst,
         worst_difference=difference,
-        verdict=judge(compared.difference, objects=len(names)),
+        verdict=judge(compared.difference, objects=objects_with_terms(_sums(gaps, well_seen), owner)),
     )
 
 

@@ -111,7 +111,8 @@ def tune(
 def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float]:
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
-    A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D.
+    A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D. Where none is, no
+    threshold is best, and the bias stays what it is.
     """
     logits: list[float] = []
     hits: list[bool] = []
@@ -125,6 +126,8 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
             logits += peaks.logit.tolist()
             hits += hit
             present += count
+    if not any(hits):
+        return tracker.config.slot_bias, 0.0, 0.0
     order = np.argsort(-np.array(logits))
     right = np.cumsum(np.array(hits)[order])
     taken = np.arange(1, len(order) + 1)

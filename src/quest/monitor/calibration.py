@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import json
 from dataclasses import dataclass, fields
 from typing import Any
@@ -11,16 +12,18 @@ from jaxtyping import Float64
 
 from quest.errors import ConfigError, WeightsError
 from quest.monitor import memory as memories
-from quest.monitor.calibrator import Calibrator
+from quest.monitor.calibrator import LOGIT_LIMIT, Calibrator
 from quest.monitor.conformal import Threshold, least_alpha, spend, threshold
 from quest.monitor.signals import SIGNALS
 from quest.monitor.statistic import Cusum
 
-FORMAT = 1
+FORMAT = 2
 """Version of the text."""
 
 _DIGITS = 4
 """Significant digits of the calibrator's numbers."""
+
+_MANY_BLOCKS = 100_000
 
 _DECIMALS = 4
 """Decimals of the maxima."""
@@ -36,6 +39,7 @@ class Calibration:
         maxima: of the statistic in each loss-free calibration stream, over queries and frames; ascending.
         block_frames: length of the calibration streams, frames.
         about: what it was calibrated on, a line for people.
+        revision: of the tracker whose signals these are (``quest.track.settings.REVISION``).
     """
 
     calibrator: Calibrator
@@ -43,6 +47,7 @@ class Calibration:
     maxima: Float64[np.ndarray, " n"]
     block_frames: int
     about: str
+    revision: int
 
     def __post_init__(self) -> None:
         if not len(self.maxima) or not np.isfinite(self.maxima).all() or (np.diff(self.maxima) < 0).any():
@@ -64,16 +69,26 @@ class Calibration:
         return least_alpha(len(self.maxima))
 
     def shortfall(self, alpha: float) -> str | None:
-        """Which alarms there will never be at an alpha, because too few streams were calibrated on; None if all can be.
+        """Which alarms there will never be at an alpha, as the calibration is too small for it; None if all can be.
+
+        The later a block of a stream, the higher its threshold, and the statistic has a largest value.
 
         Raises:
             ConfigError: alpha is not in (0, 1).
         """
-        first, later = (np.isfinite(self.threshold(spend(alpha, block=b, restart=0)).value) for b in (1, 2))
-        if later:
+        most = self.statistic.most(LOGIT_LIMIT)
+
+        def silent(block: int) -> bool:
+            return self.threshold(spend(alpha, block=block, restart=0)).value >= most
+
+        block = bisect.bisect_left(range(1, _MANY_BLOCKS), True, key=silent)
+        if block == _MANY_BLOCKS - 1:
             return None
-        rest = f"after {self.block_frames} frames" if first else "at all"
-        return f"no alarm {rest} at alpha {alpha:g}: calibrated on {len(self.maxima)} loss-free streams only"
+        rest = f"after {block * self.block_frames} frames of a stream" if block else "at all"
+        return (
+            f"no alarm {rest} at alpha {alpha:g}: calibrated on {len(self.maxima)} loss-free streams of "
+            f"{self.block_frames} frames; more and longer ones promise more"
+        )
 
     def to_json(self) -> str:
         """One line of text, stored with the weights.
@@ -90,6 +105,7 @@ class Calibration:
             "maxima": (np.ceil(np.round(self.maxima * 10**_DECIMALS, 6)) / 10**_DECIMALS).tolist(),
             "block_frames": self.block_frames,
             "about": self.about,
+            "revision": self.revision,
         }
         return json.dumps(raw, separators=(",", ":"), allow_nan=False)
 
@@ -114,6 +130,7 @@ class Calibration:
                 maxima=np.array(raw["maxima"], np.float64),
                 block_frames=int(raw["block_frames"]),
                 about=str(raw["about"]),
+                revision=int(raw["revision"]),
             )
         except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
             raise WeightsError(

@@ -26,9 +26,13 @@ RETURN_FRAMES: Final = 20.0
 OFF_LEVEL: Final = 1.0
 """A signal is off when it is farther than this from its level and from what is usual of all queries, squashed units."""
 
+MOST_AGE: Final = 60.0
+"""Frames up to which a query's age is told: calibration streams may be as short, and nothing is learned beyond."""
+
 COUNT, LEVEL, FAST, MID, SLOW, HIGH, LOW, OFF, AGE = range(9)
 """Rows: frames known (at most until the running means have settled), normal level, three running means, highest and
-lowest value with a slow return, frames in a row that it is off, frames since the query was bound."""
+lowest value with a slow return, frames in a row that it is off, frames since the query was bound (at most
+:data:`MOST_AGE`)."""
 ROWS: Final = 9
 
 _MEANS: Final = (FAST, MID, SLOW)
@@ -59,7 +63,7 @@ def remember(
     known = ~np.isnan(squashed)
     value = np.where(known, squashed, 0.0)
     after = memory.copy()
-    after[:, AGE] += 1.0
+    after[:, AGE] = np.minimum(memory[:, AGE] + 1.0, MOST_AGE)
     count = memory[:, COUNT] + known
     after[:, COUNT] = count
     first = count == 1.0

@@ -17,6 +17,8 @@ from quest.monitor.conformal import Threshold, spend
 from quest.monitor.reason import reason
 from quest.monitor.signals import Signals
 
+_KNOWN_THRESHOLDS = 1000
+
 _ARRAYS = ("keys", "memory", "statistic", "restart", "origin", "clock", "texts")
 
 
@@ -219,6 +221,8 @@ class Monitor:
         return self._row[key]
 
     def _threshold(self, block: int, restart: int) -> Threshold:
+        if len(self._thresholds) > _KNOWN_THRESHOLDS:  # a stream has no end
+            self._thresholds.clear()
         if (block, restart) not in self._thresholds:
             part = spend(self.alpha, block=block, restart=restart)
             self._thresholds[block, restart] = self.calibration.threshold(part)

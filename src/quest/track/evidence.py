@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -12,6 +13,19 @@ from torch import Tensor
 from quest.model.config import NetworkConfig
 from quest.model.decoder import sample_grid
 from quest.model.observation import FrameBatch
+
+
+@runtime_checkable
+class Evidence(Protocol):
+    """What a frame says of places in the reference frame."""
+
+    def ratio(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """Log of how much likelier than a cell by chance each place is to show the query; NaN outside the image."""
+        ...
+
+    def room(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
+        """How far what is seen lies behind each place, reference units; NaN where nothing is known."""
+        ...
 
 
 class FrameEvidence:

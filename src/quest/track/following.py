@@ -120,9 +120,9 @@ class Following:
             self.held = True
 
     def trust(self, place: Float[np.ndarray, "3"]) -> None:
-        """The search has found the entity."""
+        """The search has found the entity; without depth its place is not known and stays what it was."""
         self.doubted, self.good, self.since_safe = False, 0, 0
-        self.place, self.held = place, False
+        self.place, self.held = place if np.isfinite(place).all() else self.place, False
 
     def state(self) -> dict[str, np.ndarray]:
         """All but names, as numeric arrays."""

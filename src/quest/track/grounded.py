@@ -8,18 +8,19 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, joint_from_prior
 from quest.model.joint_head import JointBelief
+from quest.track.evidence import Evidence
 from quest.track.settings import TrackerConfig
 
 _SAMPLES = 97
 _SLIDE_REACH = 1.2
 _TURN_REACH_RAD = 2.4
+_TURN_MARGIN_RAD = 0.5
 _TOLERANCE = 0.06
 _LINK_DEPTH = 0.25
 _LOG_FREE_SPACE = -4.0
@@ -30,19 +31,6 @@ _MOST_CLOSED = 6.0
 _STANDING = 8
 """Sights that tell where something fixed stands; nothing moves in the first frames of a stream."""
 _OFF_FIXED = -3.0
-
-
-@runtime_checkable
-class Evidence(Protocol):
-    """What a frame says of places in the reference frame."""
-
-    def ratio(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
-        """Log of how much likelier than a cell by chance each place is to show the query; NaN outside the image."""
-        ...
-
-    def room(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
-        """How far what is seen lies behind each place, reference units; NaN where nothing is known."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -151,24 +139,32 @@ class Ground:
         self._expectation = _Expectation()
         self._estimator = JointEstimator(config.point_sigma)
         self._curves: tuple[Curve, ...] = ()
-        self._recent: deque[np.ndarray] = deque(maxlen=_RECENT)
+        self._recent: deque[tuple[float, np.ndarray]] = deque(maxlen=_RECENT)
+        self._clock = 0.0
         self._along: np.ndarray | None = None
-        self._hidden = 0
+        self._hidden = 0.0
 
     @property
     def joint(self) -> Joint | None:
         """The joint that the track so far shows; None before the first point."""
         return self._estimator.joint
 
-    def see(self, point: Float[np.ndarray, "3"], row: BeliefRow) -> None:
-        """Learn from a frame in which the query is seen and trusted."""
+    def see(self, point: Float[np.ndarray, "3"], row: BeliefRow, *, elapsed: float = 1.0) -> None:
+        """Learn from a frame in which the query is seen and trusted.
+
+        Args:
+            point: where it is.
+            row: what the network believes of its joint.
+            elapsed: frames since the one before.
+        """
+        self._clock += elapsed
         if not (self.fixed and self._expectation.rows >= _STANDING):
             self._expectation.add(row, point)
             self._estimator.prior = prior = self._expectation.prior()
             self._estimator.add(point)
             self._curves = self._make_curves(prior)
-        self._recent.append(point)
-        self._along, self._hidden = None, 0
+        self._recent.append((self._clock, point))
+        self._along, self._hidden = None, 0.0
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
@@ -260,6 +256,7 @@ class Ground:
                 as it moved; else it is its own link that hides it, and the network knows roughly where.
             elapsed: frames since it was there.
         """
+        self._clock += elapsed
         if not self._curves:
             return before
         curve, prior = self._best_curve, self._predicted(before, elapsed, moving=buried)
@@ -275,7 +272,7 @@ class Ground:
             gap = np.linalg.norm(curve.point - point, axis=1) / np.hypot(curve.spread, 2 * self._config.point_sigma)
             likelihood += seen * np.exp(-0.5 * gap.min() ** 2) * _normalised(-0.5 * np.square(gap))
         posterior = prior * (likelihood + 1e-9)
-        self._along, self._hidden = posterior / posterior.sum(), self._hidden + 1
+        self._along, self._hidden = posterior / posterior.sum(), self._held_for(before) + elapsed
         return curve.joint.at(np.array([self._along @ curve.q]))[0]
 
     def copy(self) -> Ground:
@@ -286,7 +283,9 @@ class Ground:
         """Everything that its answers depend on, as numeric arrays."""
         found = {f"expectation.{key}": value for key, value in self._expectation.state().items()}
         found |= {f"estimator.{key}": value for key, value in self._estimator.state().items()}
-        found |= {"recent": np.array(self._recent).reshape(-1, 3), "hidden": np.array(self._hidden)}
+        found["recent"] = np.array([point for _, point in self._recent]).reshape(-1, 3)
+        found["recent_clock"] = np.array([clock for clock, _ in self._recent])
+        found |= {"clock": np.array(self._clock), "hidden": np.array(self._hidden)}
         found["fixed"] = np.array(self.fixed)
         return found if self._along is None else {**found, "along": self._along}
 
@@ -303,8 +302,9 @@ class Ground:
         if ground._expectation.rows:
             ground._estimator.prior = prior = ground._expectation.prior()
             ground._curves = ground._make_curves(prior)
-        ground._recent.extend(state["recent"])
-        ground._along, ground._hidden = state.get("along"), int(state["hidden"])
+        ground._clock = float(state["clock"])
+        ground._recent.extend(zip(state["recent_clock"].tolist(), state["recent"], strict=True))
+        ground._along, ground._hidden = state.get("along"), float(state["hidden"])
         return ground
 
     @property
@@ -323,26 +323,37 @@ class Ground:
             before: where the query was last.
             elapsed: frames since then.
             moving: whether what moved moves on, slower and slower, and does not close further than it was seen closed.
+                What was never seen to move does neither: the sign of a joint that is only believed means nothing.
         """
         curve = self._best_curve
         sigma = self._config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1) * elapsed
-        if self._along is None:
+        hidden = self._held_for(before)
+        if hidden and self._along is not None:
+            start = self._along
+        else:
             at = float(curve.joint.locate(before[None])[0])
             start = _normalised(-0.5 * np.square((curve.q - at) / sigma))
-        else:
-            start = self._along
-        step = self._speed(curve.joint) * _SLOWING**self._hidden * elapsed if moving else 0.0
+        moving = moving and self.joint is not None and self.joint.kind is not JointKind.STATIC
+        step = self._speed(curve.joint) * _SLOWING**hidden * elapsed if moving else 0.0
         moved = start @ _rows_normalised(-0.5 * np.square((curve.q[:, None] + step - curve.q[None]) / sigma))
         if moving:
             moved = moved * np.exp(-np.clip((curve.joint.lower - curve.q) / sigma - 1, 0.0, _MOST_CLOSED))
         return moved / moved.sum()
 
     def _speed(self, joint: Joint) -> float:
-        """How far along its joint a query moved per frame when it was last seen."""
+        """How far along its joint a query moved per frame, over its last few sights."""
         if joint.kind is JointKind.STATIC or len(self._recent) < 2:
             return 0.0
-        q = joint.locate(np.stack(self._recent))
-        return float((q[-1] - q[0]) / (len(q) - 1))
+        q = joint.locate(np.stack([point for _, point in self._recent]))
+        return float((q[-1] - q[0]) / (self._recent[-1][0] - self._recent[0][0]))
+
+    def _held_for(self, before: Float[np.ndarray, "3"]) -> float:
+        """Frames in a row for which a query was held; 0 where it is not where that left it, but was put elsewhere."""
+        if self._along is None:
+            return 0.0
+        curve = self._best_curve
+        left = curve.joint.at(np.array([self._along @ curve.q]))[0]
+        return self._hidden if np.allclose(before, left, atol=1e-6) else 0.0
 
     def _make_curves(self, prior: JointPrior) -> tuple[Curve, ...]:
         joint = self._estimator.joint
@@ -358,7 +369,9 @@ class Ground:
 
 def _curve(joint: Joint, log_weight: float) -> Curve:
     if joint.kind is JointKind.REVOLUTE:
-        q = np.linspace(-_TURN_REACH_RAD, _TURN_REACH_RAD, _SAMPLES)
+        low = min(-_TURN_REACH_RAD, joint.lower - _TURN_MARGIN_RAD)
+        high = max(_TURN_REACH_RAD, joint.upper + _TURN_MARGIN_RAD)
+        q = np.linspace(max(low, -np.pi), min(high, np.pi), _SAMPLES)
     else:
         q = np.linspace(min(joint.lower, 0.0) - _SLIDE_REACH, max(joint.upper, 0.0) + _SLIDE_REACH, _SAMPLES)
     return Curve(log_weight, joint, q, joint.at(q), joint.spread(q))

@@ -115,7 +115,7 @@ class Placer:
         if not self._config.ground:
             return own
         if self._right[i] >= LOST_BELOW:
-            query.ground.see(own, joint)
+            query.ground.see(own, joint, elapsed=self._elapsed)
         return query.ground.settle(own)
 
     def _hold(self, i: int, own: np.ndarray, seen: float) -> np.ndarray:

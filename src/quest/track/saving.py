@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-4"
+FORMAT = "quest-stream-5"
 _KEY = "quest-stream"
 
 

@@ -339,7 +339,8 @@ class Stream:
                 if not placed.held[k] and verdict.lost_p[k] > _DOUBTED_ABOVE:
                     query.doubt()
                 continue
-            query.good = query.good + 1 if right and np.isfinite(placed.judged[k]).all() else 0
+            known = np.isfinite(placed.judged[k]).all() or not self._has_depth
+            query.good = query.good + 1 if right and known else 0
             if query.good >= self._config.found_frames:
                 query.trust(placed.judged[k])
                 self._monitor.clear(query.query)

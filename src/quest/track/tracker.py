@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from quest.errors import ConfigError, InputError
+from quest.errors import ConfigError, InputError, WeightsError
 from quest.grounding import JointKind
 from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import QuestNetwork
@@ -20,7 +20,7 @@ from quest.model.weights import load_network
 from quest.monitor import Calibration, Monitor
 from quest.track.intake import Intake
 from quest.track.saving import SavedStream
-from quest.track.settings import TrackerConfig
+from quest.track.settings import REVISION, TrackerConfig
 from quest.track.state import StreamState
 from quest.track.stream import Stream
 from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
@@ -187,12 +187,18 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: b
         ConfigError: no such device.
     """
     loaded = load_network(name)
+    calibration = Calibration.from_json(loaded.monitor) if loaded.monitor and monitor else None
+    if calibration is not None and calibration.revision != REVISION:
+        raise WeightsError(
+            f"weights {name}: their monitor knows the signals of another tracker (revision {calibration.revision}, "
+            f"this is {REVISION}) and would promise nothing; run `quest weights calibrate`, or load without it"
+        )
     return Tracker(
         loaded.network,
         TrackerConfig.from_json(loaded.settings),
         device=pick_device(device),
         weights_hash=loaded.sha256,
-        calibration=Calibration.from_json(loaded.monitor) if loaded.monitor and monitor else None,
+        calibration=calibration,
     )
 
 
