@@ -8,6 +8,7 @@ from quest.monitor import SIGNALS, Calibration
 from quest.monitor import memory as memories
 from quest.monitor.calibrator import Calibrator
 from quest.monitor.statistic import Cusum
+from quest.track.settings import REVISION
 
 
 def make_calibrator(*, hidden: int = 3, members: int = 2, seed: int = 0) -> Calibrator:
@@ -38,4 +39,4 @@ def watching(name: str, *, gain: float = -2.0, maxima: np.ndarray | None = None,
         bias=np.zeros(1),
     )
     maxima = np.linspace(0.0, 10.0, 1000) if maxima is None else maxima
-    return Calibration(calibrator, Cusum(0.0), maxima, block_frames, "made up", 0)
+    return Calibration(calibrator, Cusum(0.0), maxima, block_frames, "made up", REVISION)

@@ -57,7 +57,8 @@ def test_what_is_in_a_take(take: Take) -> None:
     assert info.name == "cabinet-L2-s000003"
     assert [e.label for e in info.entities] == ["handle", "rim", "hinge"]
     assert sorted(info.moved_joints) == [0, 1]
-    assert info.provenance == {"commit": "none"}
+    assert info.provenance["commit"] == "none"
+    assert set(info.provenance) == {"commit", "settings"}
     assert take.moved[take.tracked].all()
     assert len(take) == 2 * 24 / 3
     np.testing.assert_allclose(np.diff(take.stamp_s), 3 / FRAMES_PER_S)

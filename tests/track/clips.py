@@ -13,6 +13,7 @@ from quest.monitor import memory as memories
 from quest.monitor.calibrator import Calibrator
 from quest.monitor.statistic import Cusum
 from quest.track import Tracker, TrackerConfig
+from quest.track.settings import REVISION
 from quest.types import Clip
 from tests.synthetic import make_take
 from tests.tiny import DEFAULT, make_network
@@ -45,7 +46,7 @@ def make_calibration(*, alarming: bool) -> Calibration:
         outer=np.zeros((1, 0)),
         bias=np.array([3.0 if alarming else -3.0]),
     )
-    return Calibration(calibrator, Cusum(0.0), np.linspace(0.0, 5.0, 200), 60, "made up", 0)
+    return Calibration(calibrator, Cusum(0.0), np.linspace(0.0, 5.0, 200), 60, "made up", REVISION)
 
 
 def without_depth(clip: Clip, frames: slice) -> Clip:

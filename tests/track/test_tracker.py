@@ -16,10 +16,11 @@ from quest.model.decoder import HeatmapHead
 from quest.model.observation import Observation
 from quest.model.weights import save_network
 from quest.track import StreamState, Tracker, load
+from quest.track.settings import REVISION
 from quest.track.tracker import NO_DEPTH_FLAG, NOTHING_FOUND_FLAG, PARTLY_NO_DEPTH_FLAG, collect, pick_device
 from quest.types import LABELS, Clip, Query, State, Tracks
 from tests.tiny import BAD_INPUT, DEFAULT, PAPER
-from tests.track.clips import EAGER, make_clip, make_tracker, moved_world, without_depth
+from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
@@ -345,6 +346,17 @@ def test_from_a_file(tmp_path: Path, clip: Clip):
     save_network(path, tracker.network, settings='{"colour": 1}', about="")
     with pytest.raises(WeightsError, match="settings"):
         load(path, device="cpu")
+
+
+def test_a_monitor_of_another_tracker_is_refused(tmp_path: Path):
+    path, calibration = tmp_path / "net.safetensors", make_calibration(alarming=False)
+    older = replace(calibration, revision=REVISION - 1)
+    save_network(path, make_tracker().network, settings="{}", about="", monitor=older.to_json())
+    with pytest.raises(WeightsError, match="weights calibrate"):
+        load(path)
+    assert load(path, monitor=False).calibration is None
+    save_network(path, make_tracker().network, settings="{}", about="", monitor=calibration.to_json())
+    assert load(path).calibration is not None
 
 
 @pytest.mark.parametrize("name", ["abacus", "cuda:99"])
