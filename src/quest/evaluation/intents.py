@@ -161,7 +161,7 @@ def judge_intents(
         tracks = tracker.track(cut_clip(clip, slice(begin, None)), queries)
         gap, right = _score(take, tracks.point_world, pair, begin)
         (open_first, open_kept), (lift_first, lift_kept) = (
-            _kept(take, tracks.point_world[:, i], entity, begin) for i, entity in enumerate(pair)
+            _kept(take, tracks.point_world[:, i], int(entity), begin) for i, entity in enumerate(pair)
         )
         answers.append(
             IntentAnswer(

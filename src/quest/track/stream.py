@@ -34,7 +34,7 @@ from quest.track.state import StreamState
 from quest.types import Camera, Query, State
 
 _LOST_ABOVE = 0.5
-_DOUBTED_ABOVE = 0.8
+_DOUBTED_ABOVE = 0.95
 """Probability of a loss above which a query goes back to where it was right. Below it the answer of the newest frame is
 nearer in the mean, wrong as it may be: what is lost has often only drifted, and what is taken back is left behind."""
 
