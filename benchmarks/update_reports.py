@@ -203,6 +203,19 @@ TABLES = (
         },
     ),
     Table(
+        "endurance/endurance.json",
+        "One stream for a long time: memory since frame 10,000, processor time per frame early and late",
+        "",
+        {
+            "frames": "frames_done",
+            "memory at the end +%": "memory_growth_percent.end",
+            "at most +%": "memory_growth_percent.peak",
+            "early, ms": "cpu_change.early_ms",
+            "late, ms": "cpu_change.late_ms",
+            "change %": "cpu_change.percent",
+        },
+    ),
+    Table(
         "data/verify.json",
         "Takes of all suites, verified",
         "worst",
