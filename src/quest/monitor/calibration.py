@@ -23,10 +23,11 @@ FORMAT = 2
 _DIGITS = 4
 """Significant digits of the calibrator's numbers."""
 
-_MANY_BLOCKS = 100_000
-
 _DECIMALS = 4
 """Decimals of the maxima."""
+
+_MANY_BLOCKS = 100_000
+"""An alarm that can come in so many blocks can come at any time."""
 
 
 @dataclass(frozen=True)

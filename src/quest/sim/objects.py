@@ -215,7 +215,7 @@ def _scale(
             warnings.append("category unknown (no meta.json): assumed to be 0.8 m long")
         return real_scale(articulation, category)
     longest = float(np.ptp(articulation.world_points(articulation.rest), axis=0).max())
-    if not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
+    if source == "own" and not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
         warnings.append(
             f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME} if they are not; "
             "beyond 6.55 m takes have no depth"
