@@ -107,6 +107,13 @@ def test_a_smaller_alpha_needs_more_evidence(take: str, weights: dict[str, str],
     assert first[0] < first[1]
 
 
+def test_alpha_in_so_many_frames(take: str, weights: dict[str, str], capsys):
+    """The calibration's blocks have 60 frames: 180 are in three of them, which share alpha alike."""
+    for frames, part in (([], 0.8 * 0.05), (["--alpha-frames", "180"], 0.05 / 3)):
+        assert main(["monitor", take, "--weights", weights["alarming"], *POINTS, *frames, "--jsonl", "-"]) == 3
+        assert objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"]["alpha"] == pytest.approx(part)
+
+
 def test_discovery(take: str, weights: dict[str, str], capsys):
     assert main(["monitor", take, "--weights", weights["calm"]]) == 0
     assert "now following" in capsys.readouterr().out
@@ -153,6 +160,7 @@ def test_interrupted(take: str, weights: dict[str, str], monkeypatch, capsys):
     ("arguments", "named"),
     [
         (["--alpha", "0"], "--alpha"),
+        (["--alpha-frames", "0"], "--alpha-frames"),
         (["--point", "7,3,3"], "0 to 6"),
         (["--point", "0,here"], "FRAME,X,Y"),
         (["--jsonl", "{folder}"], "cannot be written"),

@@ -39,9 +39,9 @@ from quest.evaluation.drift import (
 from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
-from quest.monitor.conformal import spend
+from quest.monitor import Budget
 from quest.monitor.statistic import Cusum, Latest
-from tests.monitor.calibrations import watching
+from tests.monitor.calibrations import share, watching
 from tests.monitor.streams import make_stream, make_streams
 
 
@@ -177,7 +177,7 @@ def detectors() -> tuple[Detector, ...]:
 def test_rows(detectors: tuple[Detector, ...]):
     records = make_streams(60, first=1000, part="test")
     records += [replace(r, source="partnet-mobility") for r in make_streams(30, first=2000, part="test")]
-    rows = drift_rows(detectors, records, alphas=(0.05, 0.3), resamples=20, seed=0)
+    rows = drift_rows(detectors, records, budgets=(Budget(0.05), Budget(0.3)), resamples=20, seed=0)
     assert [(r.source, r.detector) for r in rows] == list(
         itertools.product(("partnet-mobility", "procedural"), ("monitor", "cusum", "page-hinkley", "threshold"))
     )
@@ -210,13 +210,13 @@ def test_rows(detectors: tuple[Detector, ...]):
 
 def test_false_alarms_keep_the_promise():
     """No detector alarms on more new loss-free streams than one block may spend of alpha, nor on far fewer."""
-    share = spend(0.2, block=1, restart=0)
+    most = share(0.2, block=1, restart=0)
     streams = make_streams(1500, losses=0.0, queries=2, frames=40)
     lossy = make_streams(60, first=5000, queries=2, frames=40, losses=1.0)
     rows = drift_rows(
         rivals(streams[:1200] + lossy, block_frames=40),
         [replace(r, part="test") for r in streams[1200:]],
-        alphas=(0.2,),
+        budgets=(Budget(0.2),),
         resamples=2,
         seed=0,
     )
@@ -224,13 +224,49 @@ def test_false_alarms_keep_the_promise():
         assert row.alarms[0].trials == 300
         assert row.alarms[0].low is not None
         assert row.alarms[0].high is not None
-        assert row.alarms[0].low <= share
-        assert row.alarms[0].high >= share / 2
+        assert row.alarms[0].low <= most
+        assert row.alarms[0].high >= most / 2
         assert row.alarms[0].missed is row.auroc is None
 
 
+def test_false_alarms_in_so_many_frames_keep_the_promise():
+    """Alpha is for 40 frames, streams have 120: any part of a stream alarms as rarely as the first."""
+    streams = make_streams(1500, losses=0.0, queries=2, frames=120)
+    lossy = make_streams(60, first=5000, queries=2, frames=120, losses=1.0)
+    rows = drift_rows(
+        rivals([*streams[:1200], *lossy], block_frames=40),
+        [replace(r, part="test") for r in streams[1200:]],
+        budgets=[Budget(0.2, 40)],
+        resamples=2,
+        seed=0,
+    )
+    for row in rows:
+        (alarm,) = row.alarms
+        assert (alarm.alpha_frames, alarm.trials, alarm.all_trials) == (40, 300, 900)
+        assert alarm.low is not None
+        assert alarm.high is not None
+        assert alarm.low <= 0.2
+        assert alarm.high >= 0.1
+
+
+def test_parts_after_a_loss_are_no_trials():
+    record = make_streams(1, losses=0.0, frames=100)[0]
+    lost = record.lost.copy()
+    lost[50:60, 0] = True
+    rows = drift_rows(
+        rivals(make_streams(120, frames=100), block_frames=40),
+        [replace(record, lost=lost, part="test")],
+        budgets=[Budget(0.2, 40), Budget(0.2)],
+        resamples=2,
+        seed=0,
+    )
+    assert [a.all_trials for a in rows[0].alarms] == [1, 0]
+
+
 def test_file_and_table(detectors: tuple[Detector, ...], tmp_path: Path):
-    rows = drift_rows(detectors, make_streams(20, first=1000, part="test"), alphas=(0.001, 0.1), resamples=5, seed=0)
+    rows = drift_rows(
+        detectors, make_streams(20, first=1000, part="test"), budgets=(Budget(0.001), Budget(0.1)), resamples=5, seed=0
+    )
     run = Run("quest eval-monitor", "abc", "hash", "w", None, 5, 0, "machine", {}, "now", 1.0)
     path = tmp_path / "deep" / "drift.json"
     write_drift(rows, run, "about", path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from quest.monitor import SIGNALS, Calibration
+from quest.monitor import SIGNALS, Budget, Calibration
 from quest.monitor import memory as memories
 from quest.monitor.calibrator import Calibrator
 from quest.monitor.statistic import Cusum
@@ -23,6 +23,11 @@ def make_calibrator(*, hidden: int = 3, members: int = 2, seed: int = 0) -> Cali
         outer=rng.normal(size=(members, hidden)),
         bias=rng.normal(size=members),
     )
+
+
+def share(alpha: float, *, block: int, restart: int) -> float:
+    """What a block may spend where alpha is for a whole stream."""
+    return Budget(alpha).part(block=block, restart=restart, block_frames=60)
 
 
 def watching(name: str, *, gain: float = -2.0, maxima: np.ndarray | None = None, block_frames: int = 20) -> Calibration:

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from quest.errors import WeightsError
-from quest.monitor import SIGNALS, Calibration
+from quest.monitor import SIGNALS, Budget, Calibration
 from quest.monitor import memory as memories
 from quest.monitor.calibration import rounded
 from quest.monitor.calibrator import LOGIT_LIMIT, probability
-from quest.monitor.conformal import spend
 from quest.monitor.statistic import Cusum
-from tests.monitor.calibrations import make_calibrator
+from tests.monitor.calibrations import make_calibrator, share
 
 MAXIMA = np.sort(np.random.default_rng(0).random(20))
 
@@ -29,22 +28,24 @@ def made(hidden: int = 3) -> Calibration:
 )
 def test_alarms_that_cannot_come_are_told(streams: int, never: str | None):
     few = replace(made(), maxima=np.sort(np.random.default_rng(0).random(streams)))
-    told = few.shortfall(0.05)
+    told = few.shortfall(Budget(0.05))
     assert (told is None) == (never is None)
     assert never is None or (told is not None and never in told)
+    assert few.shortfall(Budget(0.05, 60)) is None or streams < 20
     assert (few.least_alpha <= 0.05) == (streams >= 24)
 
 
 def test_later_blocks_have_thresholds_that_nothing_exceeds():
     """A frame adds at most 8 + 3 to a sum that forgets everything, and these maxima have a long tail."""
     tailed = replace(made(), statistic=Cusum(-3.0, 0.0), maxima=np.sort(np.random.default_rng(0).exponential(2, 200)))
-    told = tailed.shortfall(0.05)
+    told = tailed.shortfall(Budget(0.05))
     assert told is not None
     block = int(told.split("after ")[1].split()[0]) // 60
     assert 1 <= block < 1000
-    last, next_one = (tailed.threshold(spend(0.05, block=b, restart=0)).value for b in (block, block + 1))
+    last, next_one = (tailed.threshold(share(0.05, block=b, restart=0)).value for b in (block, block + 1))
     assert last < 11.0 <= next_one
-    assert replace(tailed, statistic=Cusum(-3.0, 1.0)).shortfall(0.05) is None
+    assert replace(tailed, statistic=Cusum(-3.0, 1.0)).shortfall(Budget(0.05)) is None
+    assert tailed.shortfall(Budget(0.05, 60)) is None
 
 
 def test_squashing_and_back():

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quest.errors import ConfigError
-from quest.monitor.conformal import spend, threshold
+from quest.monitor.conformal import Budget, threshold
+from tests.monitor.calibrations import share
 
 
 @pytest.mark.parametrize(
@@ -68,13 +69,30 @@ def test_no_probability(alpha: float):
         threshold(np.zeros(0), 0.1)
 
 
+@given(st.integers(1, 400), st.integers(1, 100), st.integers(0, 50))
+def test_so_many_frames_share_alpha(frames: int, block_frames: int, n: int):
+    """The blocks that the n-th so many frames are in spend at most alpha, and those that fit exactly all of it."""
+    budget = Budget(0.1, frames)
+    blocks = range(n * frames // block_frames, ((n + 1) * frames - 1) // block_frames + 1)
+    parts = [budget.part(block=b + 1, restart=3, block_frames=block_frames) for b in blocks]
+    assert sum(parts) <= 0.1 * (1 + 1e-9)
+    if frames % block_frames == 0:
+        assert sum(parts) == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("alpha", "frames"), [(0.0, None), (1.0, None), (math.nan, 60), (0.1, 0), (0.1, -60)])
+def test_no_budget(alpha: float, frames: int | None):
+    with pytest.raises(ConfigError, match="alpha"):
+        Budget(alpha, frames)
+
+
 def test_what_is_spent_adds_up():
-    blocks = [spend(0.1, block=b, restart=0) for b in range(1, 10_001)]
+    blocks = [share(0.1, block=b, restart=0) for b in range(1, 10_001)]
     assert sum(blocks) == pytest.approx(0.1, rel=1e-3)
     assert sum(blocks) < 0.1
-    restarts = [spend(0.1, block=b, restart=j) for j in range(1, 60) for b in range(1, 2000)]
+    restarts = [share(0.1, block=b, restart=j) for j in range(1, 60) for b in range(1, 2000)]
     assert sum(restarts) == pytest.approx(0.1, rel=1e-2)
-    assert spend(0.01, block=10**6, restart=10**6) > 0.0
+    assert share(0.01, block=10**6, restart=10**6) > 0.0
     assert (
-        threshold(np.sort(np.random.default_rng(0).random(300)), spend(0.01, block=9, restart=10**6)).value < math.inf
+        threshold(np.sort(np.random.default_rng(0).random(300)), share(0.01, block=9, restart=10**6)).value < math.inf
     )

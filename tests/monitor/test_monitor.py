@@ -11,9 +11,8 @@ from quest.errors import ConfigError, InputError
 from quest.evaluation.detectors import our_monitor, play
 from quest.monitor import SIGNALS, Alarm, Calibration, Monitor, Signals, Verdict
 from quest.monitor import memory as memories
-from quest.monitor.conformal import spend
 from quest.monitor.statistic import Cusum
-from tests.monitor.calibrations import make_calibrator, watching
+from tests.monitor.calibrations import make_calibrator, share, watching
 from tests.monitor.streams import make_stream
 from tests.tiny import BAD_INPUT
 
@@ -45,7 +44,7 @@ def test_an_alarm_is_raised_once_and_stays_open():
     assert (alarm.name, alarm.query, alarm.frame) == ("handle 0", 0, raised[0])
     assert alarm.stamp_s == pytest.approx(0.1 * raised[0])
     assert alarm.statistic > alarm.threshold
-    assert alarm.alpha == spend(0.1, block=1, restart=0)
+    assert alarm.alpha == share(0.1, block=1, restart=0)
     assert alarm.reason == "looks unlike its anchor (cosine -1.00) for 4 frames"
     assert all(v.open == (None,) for v in verdicts[: raised[0]])
     assert all(v.open == (alarm,) for v in verdicts[raised[0] :])
@@ -68,7 +67,7 @@ def test_clearing_ends_the_alarm_and_spends_less_each_time():
         alarms += [a for v in run(monitor, [-1.0] * 15, first=15 * j) for a in v.raised]
         monitor.clear(0)
         assert monitor.alarm(0) is None
-    assert [a.alpha for a in alarms] == [spend(0.1, block=1, restart=j) for j in range(3)]
+    assert [a.alpha for a in alarms] == [share(0.1, block=1, restart=j) for j in range(3)]
     assert alarms[0].threshold < alarms[1].threshold < alarms[2].threshold
     assert [a.extrapolated for a in alarms] == [False] * 3
 
@@ -82,7 +81,10 @@ def test_restarts_are_counted_over_the_stream():
         found = sorted(a.alpha for a in verdict.open if a is not None)
         monitor.clear(0)
         monitor.clear(1)
-    assert found == [spend(0.1, block=1, restart=2), spend(0.1, block=1, restart=1)]
+    assert found == [
+        share(0.1, block=1, restart=2),
+        share(0.1, block=1, restart=1),
+    ]
 
 
 def test_clearing_without_an_alarm_spends_nothing():
@@ -91,7 +93,7 @@ def test_clearing_without_an_alarm_spends_nothing():
     monitor.clear(0)
     verdicts = run(monitor, [0.0] * 2 + [-1.0] * 9)
     assert verdicts[0].statistic == 0.0
-    assert next(a for v in verdicts for a in v.raised).alpha == spend(0.1, block=1, restart=0)
+    assert next(a for v in verdicts for a in v.raised).alpha == share(0.1, block=1, restart=0)
 
 
 def test_every_block_starts_from_nothing_and_spends_less():
@@ -103,7 +105,21 @@ def test_every_block_starts_from_nothing_and_spends_less():
     assert (np.diff(statistic, axis=1) > 0).all()
     late = watched(calibration, 0)
     raised = [a for v in run(late, [1.0] * 12 + [-4.0] * 6) for a in v.raised]
-    assert [a.alpha for a in raised] == [spend(0.1, block=3, restart=0)]
+    assert [a.alpha for a in raised] == [share(0.1, block=3, restart=0)]
+
+
+def test_alpha_in_so_many_frames_is_spent_again_and_again():
+    """No block is less watched than the first, nor is what was cleared."""
+    calibration = watching("anchor_cosine")
+    monitor = Monitor(calibration, alpha=0.1, alpha_frames=2 * calibration.block_frames)
+    monitor.watch(0, "door")
+    alarms = []
+    for t in range(5 * calibration.block_frames):
+        alarms += monitor.step([0], signals(-1.0), frame=t, stamp_s=0.0).raised
+        if monitor.alarm(0) is not None:
+            monitor.clear(0)
+    assert len(alarms) > 5
+    assert {a.alpha for a in alarms} == {0.05}
 
 
 def test_too_few_streams_raise_no_alarm():

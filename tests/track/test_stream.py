@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from quest.errors import InputError
-from quest.monitor import SIGNALS, Alarm
+from quest.errors import ConfigError, InputError
+from quest.monitor import SIGNALS, Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
 from quest.track.saving import SavedStream
 from quest.types import Clip, Query, State
@@ -270,19 +270,28 @@ def test_a_watched_stream_is_not_restored_unwatched(clip: Clip):
     with pytest.raises(InputError, match="calibration"):
         make_tracker().restore(data)
     unwatched = tracker.save(tracker.stream(clip.camera, POINTS, alpha=None))
-    assert make_tracker().restore(unwatched).alpha is None
+    assert make_tracker().restore(unwatched).budget is None
+
+
+def test_a_saved_stream_keeps_what_alpha_is_for(clip: Clip):
+    tracker = watched()
+    for budget in (Budget(0.1), Budget(0.2, 90)):
+        stream = tracker.stream(clip.camera, POINTS, alpha=budget.alpha, alpha_frames=budget.frames)
+        assert tracker.restore(tracker.save(stream)).budget == budget
+    with pytest.raises(ConfigError, match="alpha_frames"):
+        tracker.stream(clip.camera, POINTS, alpha_frames=0)
 
 
 def test_numbers_of_numpy_are_saved():
     """Cameras and queries are often made of them."""
-    saved = SavedStream({"fx": np.float32(1.5)}, None, {"frame": np.int64(3)}, {"place": np.zeros(3)})
+    saved = SavedStream({"fx": np.float32(1.5)}, None, None, {"frame": np.int64(3)}, {"place": np.zeros(3)})
     again = SavedStream.from_bytes(saved.to_bytes())
     assert (again.maker, again.words) == ({"fx": 1.5}, {"frame": 3})
 
 
 def test_without_alpha_there_are_no_alarms(clip: Clip):
     stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=None)
-    assert stream.alpha is None
+    assert stream.budget is None
     states = feed(stream, clip, range(8))
     assert all(s.alarm == (None, None) for s in states)
 

@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 
 from quest.grounding import Joint, JointKind
+from quest.monitor import Budget
 from quest.types import Query
 from quest.viz.live import LiveView, joint_words, query_words
 from tests.track.test_events import ALARM, make_state
@@ -17,8 +18,10 @@ RAIL = Joint(
     JointKind.PRISMATIC, np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3), -0.001, 0.31, np.eye(4), 0.002, 9
 )  # fmt: skip
 
+EACH_90 = Budget(0.05, 90)
 
-def make_view(*, terminal: bool, width: int = 120, alpha: float | None = 0.05) -> tuple[LiveView, io.StringIO]:
+
+def make_view(*, terminal: bool, width: int = 120, budget: Budget | None = EACH_90) -> tuple[LiveView, io.StringIO]:
     file = io.StringIO()
     console = Console(
         file=file,
@@ -28,7 +31,7 @@ def make_view(*, terminal: bool, width: int = 120, alpha: float | None = 0.05) -
         color_system=None,
         legacy_windows=False,
     )
-    return LiveView(console, name="clip [red]", frames=9, alpha=alpha), file
+    return LiveView(console, name="clip [red]", frames=9, budget=budget), file
 
 
 def text_of(view: LiveView, width: int) -> str:
@@ -71,7 +74,14 @@ def test_picture():
         view.show(5, state, waiting=[Query.semantic("knob")], behind_s=1.25)
     text = text_of(view, 120)
     for part in (
-        *("clip [red]", "frame 5 (0 to 8)", "alpha 0.05", "1.2 s behind", "degraded: no depth", "not followed: knob"),
+        *(
+            "clip [red]",
+            "frame 5 (0 to 8)",
+            "alpha 0.05 in 90 frames",
+            "1.2 s behind",
+            "degraded: no depth",
+            "not followed: knob",
+        ),
         *("left", "handle", "tracking", "1.0 1.0", "0.00 0.50 0.00", "revolute 90 deg (0 to 57)", "0.80", "3 frames"),
         *("alarm: left, open for 3 frames: looks unlike its anchor", "now following left, right"),
     ):
@@ -86,7 +96,7 @@ def test_narrow_terminals_leave_out_the_label():
 
 
 def test_without_alarms():
-    view, _ = make_view(terminal=True, alpha=None)
+    view, _ = make_view(terminal=True, budget=None)
     view.show(0, make_state(lost_p=np.full(2, np.nan, np.float32)))
     assert "without calibration" in text_of(view, 120)
     assert "no alarms" in view.summary().plain

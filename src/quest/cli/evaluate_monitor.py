@@ -33,6 +33,7 @@ class EvalMonitor:
         split: parts of the object split.
         level: levels to evaluate; all by default.
         alpha: shares of loss-free streams that may alarm.
+        alpha_frames: --alpha is for every so many frames of a stream instead.
         shard: part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one judges.
         resamples: of the bootstrap over objects.
         seed: of the bootstrap.
@@ -46,6 +47,7 @@ class EvalMonitor:
     split: tuple[Literal["validation", "test", "unlisted"], ...] = ("test",)
     level: tuple[int, ...] = ()
     alpha: tuple[float, ...] = (0.01, 0.05, 0.1)
+    alpha_frames: int | None = None
     shard: str = "0/1"
     resamples: int = 200
     seed: int = 0
@@ -67,10 +69,12 @@ class EvalMonitor:
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
         from quest.evaluation.selection import Shard, select_takes
         from quest.evaluation.stream_record import read_records, record_streams, tracker_id
+        from quest.monitor import Budget
         from quest.track import load
 
-        if self.resamples < 1 or not self.alpha or not all(0 < a < 1 for a in self.alpha):
-            raise ConfigError(f"eval-monitor: expected resamples >= 1 and 0 < alpha < 1, got {self}")
+        budgets = [Budget(alpha, self.alpha_frames) for alpha in self.alpha]
+        if self.resamples < 1 or not budgets:
+            raise ConfigError(f"eval-monitor: expected resamples >= 1 and at least one alpha, got {self}")
         start_s = time.monotonic()
         console = Console(stderr=True, highlight=False)
         tracker = load(self.weights)
@@ -96,7 +100,7 @@ class EvalMonitor:
             our_monitor(tracker.calibration),
             *rivals(known, block_frames=tracker.calibration.block_frames),
         )
-        rows = drift_rows(detectors, recorded.records, alphas=self.alpha, resamples=self.resamples, seed=self.seed)
+        rows = drift_rows(detectors, recorded.records, budgets=budgets, resamples=self.resamples, seed=self.seed)
         Console(width=TABLE_WIDTH).print(drift_table(rows))
         if self.out is not None:
             write_drift(rows, self._run(tracker, takes, start_s), tracker.calibration.about, self.out)

@@ -36,6 +36,8 @@ class Monitor(Source):
 
     alpha: float = 0.05
     """Share of streams without any loss that may raise an alarm."""
+    alpha_frames: int | None = None
+    """--alpha is for every so many frames instead, such as 1800, so that alarms come as readily late as early."""
     jsonl: Path | None = None
     """Write one JSON object per frame to this file; - is standard output, and then the view goes to standard error."""
     realtime: bool = False
@@ -45,7 +47,7 @@ class Monitor(Source):
         """Step through the recording as it is read, show, write.
 
         Raises:
-            ConfigError: alpha is no probability.
+            ConfigError: alpha is no probability, or there are no frames.
             InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
         """
         from quest.data.frame_source import source_of_clip
@@ -55,6 +57,8 @@ class Monitor(Source):
 
         if not 0.0 < self.alpha < 1.0:
             raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
+        if self.alpha_frames is not None and self.alpha_frames < 1:
+            raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 1800")
         console = self._console()
         source = self.open()
         if source.length is None:
@@ -63,16 +67,16 @@ class Monitor(Source):
         assert length is not None, "a clip in memory has a length"
         queries = self.queries(source)
         tracker = self.tracker()
-        stream = tracker.stream(source.camera, queries, alpha=self.alpha)
+        stream = tracker.stream(source.camera, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
         console.print(f"watching {escape(source.name)}: {length} frames, {escape(self.weights)} on {tracker.device}")
-        if stream.alpha is None:
+        if stream.budget is None:
             console.print(
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
                 "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
             )
-        elif tracker.calibration is not None and (shortfall := tracker.calibration.shortfall(stream.alpha)):
+        elif tracker.calibration is not None and (shortfall := tracker.calibration.shortfall(stream.budget)):
             console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {shortfall}; `quest weights calibrate`")
-        view = LiveView(console, name=source.name, frames=length, alpha=stream.alpha)
+        view = LiveView(console, name=source.name, frames=length, budget=stream.budget)
         state = None
         try:
             with contextlib.nullcontext() if self.jsonl is None else StateLines(self.jsonl) as lines, view:

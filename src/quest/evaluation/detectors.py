@@ -20,7 +20,7 @@ from quest.evaluation.replay import replay_features, replay_logits, replay_stati
 from quest.evaluation.stream_record import StreamRecord
 from quest.monitor import Calibration
 from quest.monitor.calibrator import probability
-from quest.monitor.conformal import Threshold, spend, threshold
+from quest.monitor.conformal import Budget, Threshold, threshold
 from quest.monitor.statistic import Cusum, Latest, PageHinkley, Statistic
 
 AnyStatistic = TypeVar("AnyStatistic", bound=Statistic)
@@ -54,16 +54,18 @@ class Detector:
     calibration: Calibration | None = None
     probabilistic: bool = False
 
-    def limits(self, frames: int, alpha: float) -> list[Threshold]:
+    def limits(self, frames: int, budget: Budget) -> list[Threshold]:
         """The threshold in each frame of a stream.
 
         Args:
             frames: length of the stream.
-            alpha: share of loss-free streams that may alarm.
+            budget: of false alarms.
         """
-        blocks = [
-            threshold(self.maxima, spend(alpha, block=b + 1, restart=0)) for b in range(-(-frames // self.block_frames))
+        parts = [
+            budget.part(block=b + 1, restart=0, block_frames=self.block_frames)
+            for b in range(-(-frames // self.block_frames))
         ]
+        blocks = [threshold(self.maxima, part) for part in parts]
         return [blocks[t // self.block_frames] for t in range(frames)]
 
 
@@ -151,6 +153,11 @@ def one_per_object(records: Sequence[StreamRecord]) -> list[int]:
         if other is None or _lot(record) < _lot(records[other]):
             chosen[record.object_id] = i
     return sorted(chosen.values())
+
+
+def one_part(record: StreamRecord, parts: int) -> int:
+    """One of so many parts of a stream, drawn without looking at what happens in it."""
+    return _number(f"part {record.take} {record.view}") % parts
 
 
 def loss_free_maxima(

@@ -14,7 +14,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 
 from quest.evaluation.bootstrap import LEVEL, Value, draw_objects
-from quest.evaluation.detectors import Detector, Played, one_per_object, play
+from quest.evaluation.detectors import Detector, Played, one_part, one_per_object, play
 from quest.evaluation.drift import (
     augrc,
     calibration_error,
@@ -27,6 +27,7 @@ from quest.evaluation.drift import (
 from quest.evaluation.report import write_report
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
+from quest.monitor import Budget
 
 FORMAT = 1
 """Version of the result file."""
@@ -41,13 +42,15 @@ class AlarmRow:
 
     Attributes:
         alpha: share of loss-free streams that may alarm.
+        alpha_frames: frames of a stream that alpha is for; None for a whole stream.
         threshold: in the first block; None where the calibration streams are too few for any.
         extrapolated: whether it is read off a fitted tail.
-        trials: loss-free streams, one per object.
+        trials: loss-free streams, one per object. Where alpha is for so many frames, one such part of a stream per
+            object, with no loss in it or before.
         false_alarms: how many of them raised an alarm.
         low: lower end of the exact 95 % interval of their share; None without streams.
         high: upper end.
-        all_trials: all loss-free streams, those of one object dependent on each other.
+        all_trials: all loss-free streams or parts, those of one object dependent on each other.
         all_false_alarms: how many of them raised an alarm.
         missed: share of judged losses that are missed.
         early: share of judged losses whose query had alarmed before.
@@ -57,6 +60,7 @@ class AlarmRow:
     """
 
     alpha: float
+    alpha_frames: int | None
     threshold: float | None
     extrapolated: bool
     trials: int
@@ -110,7 +114,7 @@ def drift_rows(
     detectors: Sequence[Detector],
     records: Sequence[StreamRecord],
     *,
-    alphas: Sequence[float],
+    budgets: Sequence[Budget],
     resamples: int,
     seed: int,
 ) -> tuple[DriftRow, ...]:
@@ -119,7 +123,7 @@ def drift_rows(
     Args:
         detectors: all calibrated.
         records: streams to judge on; none of them took part in any calibration.
-        alphas: shares of loss-free streams that may alarm.
+        budgets: of false alarms.
         resamples: of the bootstrap over objects.
         seed: of the bootstrap.
     """
@@ -130,12 +134,12 @@ def drift_rows(
         objects = sorted({r.object_id for r in group})
         draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
         owner = np.array([objects.index(r.object_id) for r in group])
-        rows += [_row(detector, group, owner, draws.astype(np.float64), alphas) for detector in detectors]
+        rows += [_row(detector, group, owner, draws.astype(np.float64), budgets) for detector in detectors]
     return tuple(rows)
 
 
 def _row(
-    detector: Detector, records: list[StreamRecord], owner: np.ndarray, draws: np.ndarray, alphas: Sequence[float]
+    detector: Detector, records: list[StreamRecord], owner: np.ndarray, draws: np.ndarray, budgets: Sequence[Budget]
 ) -> DriftRow:
     played = play(detector, records)
     watched = [r.watched for r in records]
@@ -164,7 +168,7 @@ def _row(
         auroc=weights.value(area, len(lost)),
         augrc=weights.value(risk, len(lost)),
         ece=weights.value(lambda w: calibration_error(score, lost, w), len(lost)) if detector.probabilistic else None,
-        alarms=tuple(_alarm_row(detector, played, records, owner, draws, alpha) for alpha in alphas),
+        alarms=tuple(_alarm_row(detector, played, records, owner, draws, budget) for budget in budgets),
     )
 
 
@@ -200,16 +204,22 @@ def _alarm_row(
     records: list[StreamRecord],
     owner: np.ndarray,
     draws: np.ndarray,
-    alpha: float,
+    budget: Budget,
 ) -> AlarmRow:
-    limits = [detector.limits(len(r), alpha) for r in records]
+    limits = [detector.limits(len(r), budget) for r in records]
     above = [
         path > np.array([limit.value for limit in own])[:, None] for path, own in zip(played.path, limits, strict=True)
     ]
-    free = [i for i, r in enumerate(records) if r.loss_free]
-    alarmed = {i: bool(above[i].any()) for i in free}
-    drawn = [i for i in one_per_object(records) if i in alarmed]
-    false = sum(alarmed[i] for i in drawn)
+    parts = [parts_of(len(r), budget.frames) for r in records]
+    alarmed = {
+        (i, n): bool(above[i][first:last].any())
+        for i, r in enumerate(records)
+        for n, (first, last) in enumerate(parts[i])
+        if not (r.lost & r.watched)[:last].any()
+    }
+    one_each = [(i, one_part(records[i], len(parts[i]))) for i in one_per_object(records)]
+    drawn = [place for place in one_each if place in alarmed]
+    false = sum(alarmed[place] for place in drawn)
     low, high = clopper_pearson(false, len(drawn)) if drawn else (None, None)
     judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if not loss.too_late]
     delay = np.array([delay_of(loss, above[i][:, loss.query]) for i, loss in judged])
@@ -222,20 +232,27 @@ def _alarm_row(
 
     first = limits[0][0]
     return AlarmRow(
-        alpha=alpha,
+        alpha=budget.alpha,
+        alpha_frames=budget.frames,
         threshold=_finite(first.value),
         extrapolated=first.extrapolated,
         trials=len(drawn),
         false_alarms=false,
         low=low,
         high=high,
-        all_trials=len(free),
+        all_trials=len(alarmed),
         all_false_alarms=sum(alarmed.values()),
         missed=mean(missed),
         early=mean(early),
         delay_median=weights.value(lambda w: quantile(delay, 0.5, w), len(judged)),
         delay_p90=weights.value(lambda w: quantile(delay, 0.9, w), len(judged)),
     )
+
+
+def parts_of(frames: int, each: int | None) -> list[tuple[int, int]]:
+    """First frame, and frame after the last, of the parts of a stream that alpha is for; the whole where None."""
+    each = frames if each is None else each
+    return [(first, min(first + each, frames)) for first in range(0, frames, each)]
 
 
 def _finite(value: float | None) -> float | None:
@@ -287,8 +304,9 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
                 table.add_row(*(scores if i == 0 else ("",) * 4), *_alarm_cells(alarm))
         tables.append(table)
     legend = (
-        "below or beside each number its 95 % interval: exact for false alarms (one loss-free stream per object), "
-        "bootstrap over objects for the others. ~: threshold from a fitted tail. delay in frames; >: not reached"
+        "below or beside each number its 95 % interval: exact for false alarms (one loss-free stream per object, or "
+        "part of it where alpha is for so many frames), bootstrap over objects for the others. "
+        "~: threshold from a fitted tail. delay in frames; >: not reached"
     )
     return Group(*tables, legend)
 
@@ -299,7 +317,8 @@ def _alarm_cells(alarm: AlarmRow) -> tuple[str, ...]:
         share = f"{100 * alarm.false_alarms / alarm.trials:.1f} ({100 * alarm.low:.1f}–{100 * alarm.high:.1f})"
     none = "-" if alarm.missed is None else ">"
     return (
-        f"{'~' if alarm.extrapolated else ''}{100 * alarm.alpha:g}",
+        f"{'~' if alarm.extrapolated else ''}{100 * alarm.alpha:g}"
+        + ("" if alarm.alpha_frames is None else f" in {alarm.alpha_frames}"),
         share,
         str(alarm.trials),
         _show(alarm.missed, factor=100, decimals=1),

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from quest.errors import ConfigError, WeightsError
 from quest.monitor import memory as memories
 from quest.monitor.calibrator import LOGIT_LIMIT, Calibrator
-from quest.monitor.conformal import Threshold, least_alpha, spend, threshold
+from quest.monitor.conformal import Budget, Threshold, least_alpha, threshold
 from quest.monitor.signals import SIGNALS
 from quest.monitor.statistic import Cusum
 
@@ -69,25 +69,23 @@ class Calibration:
         """Smallest alpha of a stream whose first block has a threshold that is promised, not extrapolated."""
         return least_alpha(len(self.maxima))
 
-    def shortfall(self, alpha: float) -> str | None:
-        """Which alarms there will never be at an alpha, as the calibration is too small for it; None if all can be.
+    def shortfall(self, budget: Budget) -> str | None:
+        """Which alarms there will never be, as the calibration is too small for it; None if all can be.
 
-        The later a block of a stream, the higher its threshold, and the statistic has a largest value.
-
-        Raises:
-            ConfigError: alpha is not in (0, 1).
+        Where alpha is for a whole stream, thresholds rise from block to block, and the statistic has a largest value.
         """
         most = self.statistic.most(LOGIT_LIMIT)
 
         def silent(block: int) -> bool:
-            return self.threshold(spend(alpha, block=block, restart=0)).value >= most
+            part = budget.part(block=block, restart=0, block_frames=self.block_frames)
+            return self.threshold(part).value >= most
 
         block = bisect.bisect_left(range(1, _MANY_BLOCKS), True, key=silent)
         if block == _MANY_BLOCKS - 1:
             return None
         rest = f"after {block * self.block_frames} frames of a stream" if block else "at all"
         return (
-            f"no alarm {rest} at alpha {alpha:g}: calibrated on {len(self.maxima)} loss-free streams of "
+            f"no alarm {rest} at {budget}: calibrated on {len(self.maxima)} loss-free streams of "
             f"{self.block_frames} frames; more and longer ones promise more"
         )
 

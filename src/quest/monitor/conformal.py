@@ -66,19 +66,47 @@ def threshold(maxima: Float64[np.ndarray, " n"], alpha: float) -> Threshold:
     return Threshold(_tail_quantile(maxima, alpha), alpha, extrapolated=True)
 
 
-def spend(alpha: float, *, block: int, restart: int) -> float:
-    """The part of alpha that one block of a query's watch may spend.
+@dataclass(frozen=True)
+class Budget:
+    """How often alarms may be false: with a probability of at most alpha, in a whole stream or in every so many frames.
 
-    Blocks have the length of the calibration streams. The first one gets four fifths; over all blocks the parts add up
-    to ``alpha / 2**restart``.
+    Attributes:
+        alpha: in (0, 1).
+        frames: that alpha is for, again and again without an end; None for the whole stream, however long it becomes.
 
-    Args:
-        alpha: of the whole stream.
-        block: 1, 2, ..., counted from the start of the stream or the restart.
-        restart: 0 before any alarm was cleared; the j-th restart of the stream has j.
+    Raises:
+        ConfigError: alpha is no probability, or there are no frames.
     """
-    share = _FIRST_BLOCK if block == 1 else (1 - _FIRST_BLOCK) / ((block - 1) * block)
-    return math.ldexp(alpha * share, -min(restart, _MOST_HALVINGS))
+
+    alpha: float
+    frames: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.alpha < 1.0:
+            raise ConfigError(f"monitor: expected 0 < alpha < 1, got {self.alpha}")
+        if self.frames is not None and self.frames < 1:
+            raise ConfigError(f"monitor: expected alpha_frames >= 1, got {self.frames}")
+
+    def __str__(self) -> str:
+        return f"alpha {self.alpha:g}" + ("" if self.frames is None else f" in {self.frames} frames")
+
+    def part(self, *, block: int, restart: int, block_frames: int) -> float:
+        """The part of alpha that one block of a query's watch may spend.
+
+        For a whole stream the first block gets four fifths, and over all blocks the parts add up to
+        ``alpha / 2**restart``. For so many frames, all blocks get the same: alpha, divided by the most blocks that so
+        many frames, counted from the start of the stream, can be in.
+
+        Args:
+            block: 1, 2, ..., counted from the start of the stream or the restart.
+            restart: 0 before any alarm was cleared; the j-th restart of the stream has j.
+            block_frames: length of a block, that of the calibration streams.
+        """
+        if self.frames is not None:
+            late = block_frames - math.gcd(self.frames, block_frames)  # how far in a block they can begin
+            return self.alpha / -(-(late + self.frames) // block_frames)
+        share = _FIRST_BLOCK if block == 1 else (1 - _FIRST_BLOCK) / ((block - 1) * block)
+        return math.ldexp(self.alpha * share, -min(restart, _MOST_HALVINGS))
 
 
 def least_alpha(streams: int) -> float:

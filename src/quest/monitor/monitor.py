@@ -8,12 +8,12 @@ from dataclasses import asdict
 
 import numpy as np
 
-from quest.errors import ConfigError, InputError
+from quest.errors import InputError
 from quest.monitor import memory as memories
 from quest.monitor.alarm import Alarm, Verdict
 from quest.monitor.calibration import Calibration
 from quest.monitor.calibrator import probability
-from quest.monitor.conformal import Threshold, spend
+from quest.monitor.conformal import Budget, Threshold
 from quest.monitor.reason import reason
 from quest.monitor.signals import Signals
 
@@ -32,16 +32,15 @@ class Monitor:
     Args:
         calibration: what is stored with the weights.
         alpha: in (0, 1).
+        alpha_frames: alpha is for every so many frames, in a stream without an end; None for the whole stream.
 
     Raises:
-        ConfigError: alpha is no probability.
+        ConfigError: alpha is no probability, or there are no frames.
     """
 
-    def __init__(self, calibration: Calibration, *, alpha: float) -> None:
-        if not 0.0 < alpha < 1.0:
-            raise ConfigError(f"monitor: expected 0 < alpha < 1, got {alpha}")
+    def __init__(self, calibration: Calibration, *, alpha: float, alpha_frames: int | None = None) -> None:
         self.calibration = calibration
-        self.alpha = alpha
+        self.budget = Budget(alpha, alpha_frames)
         self._thresholds: dict[tuple[int, int], Threshold] = {}
         self._row: dict[int, int] = {}
         self._name: dict[int, str] = {}
@@ -101,7 +100,7 @@ class Monitor:
     def clear(self, key: int) -> None:
         """The identity is right again: the alarm ends, and the statistic starts anew.
 
-        What follows the j-th time in this stream spends alpha / 2^j.
+        What follows the j-th time spends alpha / 2^j, where alpha is for the whole stream.
 
         Raises:
             InputError: the query is not being watched.
@@ -224,7 +223,7 @@ class Monitor:
         if len(self._thresholds) > _KNOWN_THRESHOLDS:  # a stream has no end
             self._thresholds.clear()
         if (block, restart) not in self._thresholds:
-            part = spend(self.alpha, block=block, restart=restart)
+            part = self.budget.part(block=block, restart=restart, block_frames=self.calibration.block_frames)
             self._thresholds[block, restart] = self.calibration.threshold(part)
         return self._thresholds[block, restart]
 

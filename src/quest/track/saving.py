@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-5"
+FORMAT = "quest-stream-6"
 _KEY = "quest-stream"
 
 
@@ -23,18 +23,20 @@ class SavedStream:
     Attributes:
         maker: weights, settings and camera that it belongs to.
         alpha: of its alarms; None without.
+        alpha_frames: that alpha is for; None for the whole stream.
         words: its state that JSON can hold.
         arrays: the rest of its state.
     """
 
     maker: dict[str, Any]
     alpha: float | None
+    alpha_frames: int | None
     words: dict[str, Any]
     arrays: dict[str, np.ndarray]
 
     def to_bytes(self) -> bytes:
         """A safetensors file; the same state gives the same bytes."""
-        header = {"format": FORMAT, "maker": self.maker, "alpha": self.alpha, "words": self.words}
+        header = {"format": FORMAT} | {f.name: getattr(self, f.name) for f in fields(self) if f.name != "arrays"}
         arrays = {key: np.asarray(value, order="C") for key, value in self.arrays.items()}
         # One entry: the order of several is not fixed.
         return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True, default=_plain)})
@@ -56,7 +58,7 @@ class SavedStream:
             ) from error
         if header.get("format") != FORMAT:
             raise InputError(f"saved stream: expected format {FORMAT!r}, got {header.get('format')!r}")
-        return cls(header["maker"], header["alpha"], header["words"], arrays)
+        return cls(header["maker"], header["alpha"], header["alpha_frames"], header["words"], arrays)
 
 
 def _plain(value: Any) -> Any:

@@ -18,7 +18,7 @@ from quest.grounding import Joint, LinkGroups
 from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
-from quest.monitor import SIGNALS, Alarm, Monitor, Signals, Verdict
+from quest.monitor import SIGNALS, Alarm, Budget, Monitor, Signals, Verdict
 from quest.track.binding import Binding, Waiting
 from quest.track.following import Answer, Following, part
 from quest.track.grounded import joint_rows
@@ -89,9 +89,9 @@ class Stream:
         return self._intake.letterbox.source
 
     @property
-    def alpha(self) -> float | None:
-        """The share of streams without any loss that may raise an alarm; None where nothing is watched."""
-        return None if self._monitor is None else self._monitor.alpha
+    def budget(self) -> Budget | None:
+        """How often alarms may be false; None where nothing is watched."""
+        return None if self._monitor is None else self._monitor.budget
 
     @property
     def frame(self) -> int:

@@ -75,7 +75,12 @@ class Tracker:
         return other
 
     def stream(
-        self, camera: Camera, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA
+        self,
+        camera: Camera,
+        queries: Sequence[Query] | None = None,
+        *,
+        alpha: float | None = DEFAULT_ALPHA,
+        alpha_frames: int | None = None,
     ) -> Stream:
         """Start tracking frames that come one by one.
 
@@ -84,14 +89,16 @@ class Tracker:
             queries: what to follow; None discovers entities in the first frame.
             alpha: probability of any alarm in a stream in which no identity is lost (``docs/monitor.md`` says what is
                 promised); None for no alarms and no recovery. Weights without a calibration raise no alarms.
+            alpha_frames: alpha is for every so many frames instead, such as 1800 for a minute at 30 frames a second:
+                alarms then come as readily late in a stream as early.
 
         Raises:
             InputError: a point query lies outside the image.
-            ConfigError: alpha is no probability.
+            ConfigError: alpha is no probability, or there are no frames.
         """
         monitor = None
         if alpha is not None and self.calibration is not None:
-            monitor = Monitor(self.calibration, alpha=alpha)
+            monitor = Monitor(self.calibration, alpha=alpha, alpha_frames=alpha_frames)
         return Stream(
             self.network, self.config, camera, queries, device=self.device, autocast=self._autocast, monitor=monitor
         )
@@ -116,7 +123,8 @@ class Tracker:
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
         arrays, words = stream.state()
-        return SavedStream(self._maker(stream.camera, stream.alpha), stream.alpha, words, arrays).to_bytes()
+        alpha, frames = (None, None) if stream.budget is None else (stream.budget.alpha, stream.budget.frames)
+        return SavedStream(self._maker(stream.camera, alpha), alpha, frames, words, arrays).to_bytes()
 
     def restore(self, data: bytes) -> Stream:
         """Go on with a stream that :meth:`save` gave, as if nothing had happened in between.
@@ -130,12 +138,17 @@ class Tracker:
             raise InputError(
                 "saved stream: it belongs to other weights, settings or calibration; load those that it was made with"
             )
-        stream = self.stream(camera, (), alpha=saved.alpha)
+        stream = self.stream(camera, (), alpha=saved.alpha, alpha_frames=saved.alpha_frames)
         stream.restore(saved.arrays, saved.words)
         return stream
 
     def track(
-        self, clip: Clip, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA
+        self,
+        clip: Clip,
+        queries: Sequence[Query] | None = None,
+        *,
+        alpha: float | None = DEFAULT_ALPHA,
+        alpha_frames: int | None = None,
     ) -> Tracks:
         """Track a whole clip: the stream's step in a loop.
 
@@ -143,17 +156,18 @@ class Tracker:
             clip: the frames.
             queries: what to follow; None discovers entities in the first frame.
             alpha: as in :meth:`stream`.
+            alpha_frames: as in :meth:`stream`; ``len(clip)`` shares alpha among all parts of the clip alike.
 
         Raises:
             InputError: a point query lies outside the clip.
-            ConfigError: alpha is no probability.
+            ConfigError: alpha is no probability, or there are no frames.
         """
         for query in queries or ():
             if query.frame >= len(clip):
                 raise InputError(
                     f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames"
                 )
-        stream = self.stream(clip.camera, queries, alpha=alpha)
+        stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
         states = []
         for t in range(len(clip)):
             frame = clip.frame(t)

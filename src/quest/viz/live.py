@@ -16,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from quest.grounding import Joint, JointKind
+from quest.monitor import Budget
 from quest.track import StreamState
 from quest.track.events import Event, Events, Happening
 from quest.types import Query, State
@@ -54,14 +55,14 @@ class LiveView:
         console: where to show it.
         name: what is being watched.
         frames: how many frames there will be.
-        alpha: of the alarms; None where nothing raises any.
+        budget: of false alarms; None where nothing raises any.
     """
 
-    def __init__(self, console: Console, *, name: str, frames: int, alpha: float | None) -> None:
+    def __init__(self, console: Console, *, name: str, frames: int, budget: Budget | None) -> None:
         self._console = console
         self._name = name
         self._frames = frames
-        self._alpha = alpha
+        self._budget = budget
         self._live = (
             Live(console=console, auto_refresh=False, redirect_stdout=False) if console.is_interactive else None
         )
@@ -139,7 +140,7 @@ class LiveView:
         text = Text(
             f"{self._name}: {frames} of {_frames(self._frames)} in {seconds:.1f} s ({frames / seconds:.1f} per s)"
         )
-        if self._alpha is None:
+        if self._budget is None:
             text.append("; no alarms, because the weights carry no calibration", style="yellow")
         else:
             raised, cleared = self._events.raised, self._events.cleared
@@ -158,10 +159,10 @@ class LiveView:
             text.append(f"   {(len(self._ends_s) - 1) / took_s:.1f} frames/s", style="not bold")
         if self._behind_s > REFRESH_S:
             text.append(f"   {self._behind_s:.1f} s behind", style="not bold yellow")
-        if self._alpha is None:
+        if self._budget is None:
             text.append("   no alarms: weights without calibration", style="not bold yellow")
         else:
-            text.append(f"   alpha {self._alpha:g}", style="not bold")
+            text.append(f"   {self._budget}", style="not bold")
         return text
 
 
