@@ -46,6 +46,7 @@ from quest.evaluation.tuning import discovery_bias
 from quest.model.network import QuestNetwork
 from quest.model.weights import load_network, save_network
 from quest.track import Tracker, TrackerConfig, load
+from quest.track.settings import REVISION
 from quest.track.tracker import pick_device
 from quest.train.checkpoint import load_checkpoint
 from quest.train.dataset import Dataset, load_initial_encoder, open_dataset
@@ -56,6 +57,9 @@ from quest.train.settings import TrainingConfig
 from quest.train.stage import Objective, StageOne
 
 ROOT = Path(__file__).parents[1]
+
+_TRACKER = f"tracker revision {REVISION}"
+"""Answers of an older tracker are no answers of this one."""
 
 
 @dataclass(frozen=True)
@@ -280,7 +284,7 @@ class Ablations:
             )
             records = tuple(record for each in found for record in each.records)
             discoveries = tuple(discovery for each in found for discovery in each.discoveries)
-            asked = Results(run, (), discoveries, notes=tuple(self.protocols))
+            asked = Results(run, (), discoveries, notes=(*self.protocols, _TRACKER))
             write_results(asked, self._answers_file(item, seed, name), records=records)
             console.print(f"  {name}: {len(records)} answers")
 
@@ -301,7 +305,7 @@ class Ablations:
         results = read_results(file)
         run, asked = results.run, set(results.notes)
         same = run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
-        return same and asked >= set(self.protocols)
+        return same and asked >= {*self.protocols, _TRACKER}
 
     # Tables
 

@@ -76,7 +76,7 @@ class Endurance:
         about = provenance() | {
             "weights": self.weights,
             "weights_hash": tracker.weights_hash,
-            "alpha": stream.alpha,
+            "alpha": None if stream.budget is None else stream.budget.alpha,
             "frames": self.frames,
             "encoded": encoded,
         }
