@@ -56,6 +56,14 @@ def _intents(file: str, title: str) -> Table:
     return Table(f"intents/{file}.json", title, "rows", OBJECTS | counts | shares | right)
 
 
+def _alarms(file: str, title: str) -> Table:
+    about = {"detector": "detector", "alpha": "each.alpha", "in frames": "each.alpha_frames"}
+    false = {"loss-free streams": "each.trials", "false alarms": "each.false_alarms"}
+    false |= {"95 % from": "%each.low", "to": "%each.high"}
+    found = {"missed %": "%each.missed", "delay median": "each.delay_median", "p90": "each.delay_p90"}
+    return Table(f"monitor/{file}.json", title, "rows", OBJECTS | about | false | found, each="alarms")
+
+
 def _tracking(file: str, title: str) -> Table:
     """What `quest eval` says of moved entities."""
     about = {"suite": "suite", "level": "level", "tracker": "tracker", "objects/takes/tracks": "objects/takes/tracks"}
@@ -111,24 +119,9 @@ TABLES = (
             "ECE": "ece",
         },
     ),
-    Table(
-        "monitor/test.json",
-        "Alarms per stream, at equal false alarms",
-        "rows",
-        OBJECTS
-        | {
-            "detector": "detector",
-            "alpha": "each.alpha",
-            "loss-free streams": "each.trials",
-            "false alarms": "each.false_alarms",
-            "95 % from": "%each.low",
-            "to": "%each.high",
-            "missed %": "%each.missed",
-            "delay median": "each.delay_median",
-            "p90": "each.delay_p90",
-        },
-        each="alarms",
-    ),
+    _alarms("test", "Alarms per stream, at equal false alarms"),
+    _alarms("long", "Streams of 240 frames, alpha for the whole stream"),
+    _alarms("long_blocks", "The same streams, alpha for every 60 frames"),
     Table(
         "grounding/standard_grounding.json",
         "Grounding on against off, ordinary takes",
@@ -184,6 +177,7 @@ TABLES = (
             "p90": "axis_p90_deg",
         },
     ),
+    _tracking("levels/test.json", "Levels 1 to 4 of the same objects"),
     _tracking("robust/test.json", "Noise on the colours, and a camera position never trained on"),
     _intents("intents", "Open and lift: two places of one label on one thing, both asked for"),
     _intents("ajar", "The same, begun where both are seen 16 pixels apart"),
@@ -327,7 +321,9 @@ def _shown(value: Any, factor: float) -> str:
         low, high = (_shown(value.get(key), factor) for key in ("low", "high"))
         return f"{middle} ({low}–{high})" if low and high else middle
     if isinstance(value, float):
-        return f"{factor * value:.0f}" if factor == 100 or abs(value) >= 1000 else f"{value:.3g}"
+        if factor == 100:
+            return f"{factor * value:.{int(0 < abs(value) < 0.1)}f}"
+        return f"{value:.0f}" if abs(value) >= 1000 else f"{value:.3g}"
     return str(value)
 
 

@@ -36,7 +36,7 @@ from quest.evaluation.drift import (
     losses,
     quantile,
 )
-from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
+from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, parts_of, write_drift
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
 from quest.monitor import Budget
@@ -247,6 +247,15 @@ def test_false_alarms_in_so_many_frames_keep_the_promise():
         assert alarm.high is not None
         assert alarm.low <= 0.2
         assert alarm.high >= 0.1
+
+
+@pytest.mark.parametrize(
+    ("frames", "each", "parts"),
+    [(60, None, [(0, 60)]), (130, 60, [(0, 60), (60, 120)]), (120, 60, [(0, 60), (60, 120)]), (50, 60, [(0, 50)])],
+)
+def test_parts_are_whole(frames: int, each: int | None, parts: list[tuple[int, int]]):
+    """What is left at the end alarms less often, and would make false alarms look rarer."""
+    assert parts_of(frames, each) == parts
 
 
 def test_parts_after_a_loss_are_no_trials():

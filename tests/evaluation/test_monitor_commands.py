@@ -104,10 +104,12 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
     assert raw["calibration"] == Calibration.from_json(after.monitor).about
     assert [alarm["alpha"] for alarm in raw["rows"][0]["alarms"]] == [0.01, 0.05, 0.1]
 
-    assert judged(folder, alpha=(0.1,), alpha_frames=20) == 0
-    assert "10 in 20" in capsys.readouterr().out
+    assert judged(folder, alpha=(0.1,), alpha_frames=40) == 0
+    assert "10 in 40" in capsys.readouterr().out
     (alarm,) = json.loads((folder / "drift.json").read_text())["rows"][0]["alarms"]
-    assert (alarm["alpha"], alarm["alpha_frames"]) == (0.1, 20)
+    assert (alarm["alpha"], alarm["alpha_frames"]) == (0.1, 40)
+    with pytest.raises(ConfigError, match="40 frames"):
+        judged(folder, alpha_frames=60)
 
 
 def test_objects_of_the_calibration_are_not_judged(folder: Path):

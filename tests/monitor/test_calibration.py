@@ -46,6 +46,15 @@ def test_later_blocks_have_thresholds_that_nothing_exceeds():
     assert last < 11.0 <= next_one
     assert replace(tailed, statistic=Cusum(-3.0, 1.0)).shortfall(Budget(0.05)) is None
     assert tailed.shortfall(Budget(0.05, 60)) is None
+    assert tailed.shortfall(Budget(0.05), frames=60 * block) is None
+    assert tailed.shortfall(Budget(0.05), frames=60 * block + 1) == told
+    # What forgets nothing starts anew in each block all the same: five frames add up to 55.
+    short = replace(tailed, statistic=Cusum(-3.0, 1.0), maxima=5 * tailed.maxima, block_frames=5)
+    told = short.shortfall(Budget(0.05))
+    assert told is not None
+    block = int(told.split("after ")[1].split()[0]) // 5
+    last, next_one = (short.threshold(share(0.05, block=b, restart=0)).value for b in (block, block + 1))
+    assert last < 55.0 <= next_one
 
 
 def test_squashing_and_back():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from quest.errors import ConfigError
 from quest.monitor.conformal import Budget, threshold
 from tests.monitor.calibrations import share
+from tests.tiny import BAD_INPUT
 
 
 @pytest.mark.parametrize(
@@ -69,21 +71,28 @@ def test_no_probability(alpha: float):
         threshold(np.zeros(0), 0.1)
 
 
-@given(st.integers(1, 400), st.integers(1, 100), st.integers(0, 50))
+@given(st.integers(1, 400), st.integers(1, 100), st.integers(0, 5))
 def test_so_many_frames_share_alpha(frames: int, block_frames: int, n: int):
-    """The blocks that the n-th so many frames are in spend at most alpha, and those that fit exactly all of it."""
+    """The blocks of the n-th so many frames spend all of alpha, none of them longer than calibration streams."""
     budget = Budget(0.1, frames)
-    blocks = range(n * frames // block_frames, ((n + 1) * frames - 1) // block_frames + 1)
-    parts = [budget.part(block=b + 1, restart=3, block_frames=block_frames) for b in blocks]
-    assert sum(parts) <= 0.1 * (1 + 1e-9)
-    if frames % block_frames == 0:
-        assert sum(parts) == pytest.approx(0.1)
+    since = budget.since(np.arange(n * frames, (n + 1) * frames))
+    begun = np.flatnonzero(since % block_frames == 0)
+    assert begun[0] == 0
+    assert np.diff(np.append(begun, frames)).max() <= block_frames
+    parts = [budget.part(block=int(since[t] // block_frames) + 1, restart=3, block_frames=block_frames) for t in begun]
+    assert sum(parts) == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("alpha", "frames"), [(0.0, None), (1.0, None), (math.nan, 60), (0.1, 0), (0.1, -60)])
 def test_no_budget(alpha: float, frames: int | None):
     with pytest.raises(ConfigError, match="alpha"):
         Budget(alpha, frames)
+
+
+@pytest.mark.parametrize("frames", [1800.0, math.nan, math.inf])
+def test_frames_are_whole(frames: Any):
+    with pytest.raises((ConfigError, *BAD_INPUT), match="frames"):
+        Budget(0.1, frames)
 
 
 def test_what_is_spent_adds_up():

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from jaxtyping import TypeCheckError
 
 from quest.errors import ConfigError, InputError
 from quest.evaluation.detectors import our_monitor, play
@@ -122,6 +125,19 @@ def test_alpha_in_so_many_frames_is_spent_again_and_again():
     assert {a.alpha for a in alarms} == {0.05}
 
 
+@pytest.mark.parametrize("alpha_frames", [None, 40])
+def test_blocks_after_a_cleared_alarm(alpha_frames: int | None):
+    """They count from there, but are those of the stream where alpha is for so many frames."""
+    monitor = Monitor(watching("anchor_cosine", block_frames=20), alpha=0.1, alpha_frames=alpha_frames)
+    monitor.watch(0, "door")
+    run(monitor, [-1.0] * 12)
+    assert monitor.alarm(0) is not None
+    monitor.clear(0)
+    statistic = [float(v.statistic[0]) for v in run(monitor, [-0.1] * 28, first=12)]
+    fell = [t for t in range(13, 40) if statistic[t - 12] < statistic[t - 13]]
+    assert fell == ([32] if alpha_frames is None else [20])
+
+
 def test_too_few_streams_raise_no_alarm():
     monitor = watched(watching("anchor_cosine", maxima=np.linspace(0.0, 1.0, 5)), 0, alpha=0.01)
     assert not any(v.raised for v in run(monitor, [-5.0] * 50))
@@ -168,6 +184,14 @@ def test_a_query_that_is_not_answered_rests():
     assert monitor.state()["statistic"][1, 0] == pytest.approx(float(last.statistic[0]))
 
 
+def test_who_rests_while_a_block_begins_begins_from_nothing_too():
+    monitor = watched(watching("anchor_cosine", maxima=np.linspace(0.0, 1000.0, 1000)), 0, 1)
+    for t in range(24):
+        keys = [0, 1] if t != 20 else [0]
+        last = monitor.step(keys, signals(*[-0.3] * len(keys)), frame=t, stamp_s=0.0)
+    assert last.statistic[1] == pytest.approx(last.statistic[0] * 3 / 4)
+
+
 def test_unknown_signals_are_no_alarm():
     monitor = watched(watching("anchor_cosine"), 0)
     for v in run(monitor, [np.nan] * 30):
@@ -206,6 +230,20 @@ def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
     assert any(verdict.open)
     for name, array in monitor.state().items():
         np.testing.assert_array_equal(restored.state()[name], array)
+
+
+def test_alarms_of_numbers_of_numpy_are_saved():
+    calibration = watching("anchor_cosine")
+    numbers: Any = np.float32, np.int64
+    real, whole = numbers
+    with contextlib.suppress(TypeCheckError):  # where types are checked such numbers are refused
+        monitor, again = (Monitor(calibration, alpha=real(0.1), alpha_frames=whole(40)) for _ in range(2))
+        monitor.watch(0, "door")
+        for t in range(15):
+            monitor.step([0], signals(-1.0), frame=whole(t), stamp_s=real(t))
+        again.restore(monitor.state())
+        assert monitor.alarm(0) is not None
+        assert again.alarm(0) == monitor.alarm(0)
 
 
 def test_replaying_records_gives_what_the_monitor_gives():

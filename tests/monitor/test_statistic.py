@@ -33,6 +33,11 @@ def test_cusum(drift: float, keep: float):
             assert found[t, k] == pytest.approx(s)
 
 
+@pytest.mark.parametrize(("drift", "keep"), [(-1.0, 1.0), (-1.0, 0.6), (0.5, 0.0), (9.0, 1.0)])
+def test_the_most_that_a_sum_can_be(drift: float, keep: float):
+    assert course(Cusum(drift, keep), np.full((7, 1), 8.0))[-1, 0] == pytest.approx(Cusum(drift, keep).most(8.0, 7))
+
+
 def test_page_hinkley_as_river_has_it():
     evidence = np.array(COURSE)[:, None]
     np.testing.assert_allclose(course(PageHinkley(0.1), evidence)[: len(RIVER), 0], RIVER, atol=2e-6)

@@ -85,6 +85,11 @@ def test_queries_come_and_go():
     assert event.text.endswith("left, right")
 
 
+def test_a_clock_that_went_back_is_told_once():
+    late = [make_state(flags=(f"late: {t / 30:.3f} s older than the frame before; ignored",)) for t in range(3, 0, -1)]
+    assert kinds(Events(), *late) == [["bound", "degraded"], [], []]
+
+
 def test_a_degradation_is_told_once():
     dark = make_state(flags=("no depth",))
     assert kinds(Events(), dark, dark, make_state(), dark) == [["bound", "degraded"], [], [], ["degraded"]]

@@ -143,6 +143,24 @@ def test_behind_something_nothing_is_learnt_from_what_is_before_it():
     assert 1.2 < np.arctan2(place[1], place[0]) < 1.9
 
 
+def test_frames_without_depth_make_nothing_faster():
+    """A door that goes on opening while depth is missing for ten frames."""
+    steady, gap = Ground(CONFIG), Ground(CONFIG)
+    for t, angle in enumerate(np.linspace(0, 1.2, 40)):
+        steady.see(on_door(angle), door_row(on_door(angle)))
+        if 26 <= t < 36:
+            gap.wait(1.0)
+        else:
+            gap.see(on_door(angle), door_row(on_door(angle)))
+    reached = []
+    for ground in (steady, gap):
+        place = on_door(1.2)
+        for _ in range(10):
+            place = hide(ground, place, frame=COVERED, buried=True)
+        reached.append(np.arctan2(place[1], place[0]))
+    assert reached[0] == pytest.approx(reached[1], abs=0.02)
+
+
 def test_being_seen_again_ends_hiding():
     ground = opened()
     hide(ground, on_door(1.2))

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from jaxtyping import TypeCheckError
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
 from quest.monitor import SIGNALS, Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
+from quest.track.events import Events
 from quest.track.saving import SavedStream
 from quest.types import Clip, Query, State
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
@@ -106,6 +110,16 @@ def test_missing_depth_and_poses_are_flagged(clip: Clip):
     assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
 
 
+def test_time_passes_without_depth(clip: Clip):
+    tracker = make_tracker(config=replace(EAGER, hold_below=0.0))
+    stream = tracker.stream(clip.camera, POINTS[:1])
+    dark = without_depth(clip, slice(3, 6))
+    feed(stream, dark, range(3))
+    before = stream._following[0].ground._clock
+    feed(stream, dark, range(3, 6))
+    assert stream._following[0].ground._clock == before + 3
+
+
 def test_poses_that_begin_late_move_nothing(clip: Clip):
     """Until a pose comes the camera is taken to stand still, so its first pose is where it has been."""
     still, late = (make_tracker().stream(clip.camera, POINTS) for _ in range(2))
@@ -131,6 +145,14 @@ def test_poses_are_rigid_up_to_rounding(clip: Clip):
         assert stream.frame == t
         state = stream.step(clip.frame(t).rgb, frame.depth_m, t / 30, rounded)
     assert all(joint is not None for joint in state.joint)
+
+
+def test_a_pose_of_lists_is_refused_or_taken_whole(clip: Clip):
+    """Never taken in half: the frame would come again as a double one."""
+    stream, frame = make_tracker().stream(clip.camera, POINTS), clip.frame(0)
+    pose: Any = np.eye(4).tolist()
+    with contextlib.suppress(TypeCheckError):
+        assert stream.step(frame.rgb, frame.depth_m, 0.0, pose).names == ("a", "b")
 
 
 def test_specks_of_depth_make_no_reference(clip: Clip):
@@ -200,6 +222,15 @@ def test_a_label_is_looked_for_in_several_frames(clip: Clip):
     assert feed(stream, clip, range(2, 3))[0].query == (0,)
 
 
+def test_ignored_frames_use_up_no_patience(clip: Clip):
+    stream = make_tracker().stream(clip.camera, POINTS[:1])
+    feed(stream, clip, range(1))
+    number = stream.add(Query.semantic("handle"))
+    for _ in range(9):
+        assert "duplicate" in feed(stream, clip, range(1))[0].flags[0]
+    assert feed(stream, clip, range(1, 2))[0].query == (0, number)
+
+
 def test_signals_are_measured(clip: Clip):
     states = feed(make_tracker().stream(clip.camera, POINTS), clip, range(3))
     for state in states:
@@ -246,6 +277,17 @@ def test_an_alarm_is_told_and_searched(clip: Clip):
     assert not states[-1].visible.any()
 
 
+def test_an_open_alarm_goes_by_the_new_name(clip: Clip):
+    stream, events = watched(alarming=True).stream(clip.camera, POINTS, alpha=0.1), Events()
+    for t, state in enumerate(feed(stream, clip, range(4))):
+        events.step(t, state)
+    stream.rename("b", "b")
+    stream.rename("a", "lid")
+    state = feed(stream, clip, range(4, 5))[0]
+    assert [alarm.name for alarm in state.alarm if alarm is not None] == ["lid", "b"]
+    assert events.step(4, state) == ()
+
+
 def test_a_callback_may_save_the_stream_or_fail(clip: Clip):
     tracker = watched(alarming=True)
     stream, saved = tracker.stream(clip.camera, POINTS, alpha=0.1), []
@@ -278,8 +320,9 @@ def test_a_saved_stream_keeps_what_alpha_is_for(clip: Clip):
     for budget in (Budget(0.1), Budget(0.2, 90)):
         stream = tracker.stream(clip.camera, POINTS, alpha=budget.alpha, alpha_frames=budget.frames)
         assert tracker.restore(tracker.save(stream)).budget == budget
-    with pytest.raises(ConfigError, match="alpha_frames"):
-        tracker.stream(clip.camera, POINTS, alpha_frames=0)
+    for each in (tracker, make_tracker()):
+        with pytest.raises(ConfigError, match="alpha_frames"):
+            each.stream(clip.camera, POINTS, alpha_frames=0)
 
 
 def test_numbers_of_numpy_are_saved():

@@ -87,6 +87,17 @@ def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
     assert np.abs(alone.uv_px[0, 0] - tracks.uv_px[0, 1]).max() < 64
 
 
+def test_what_is_not_watched_has_no_alarms(clip: Clip):
+    """None, which a file of tracks keeps apart from an alarm that is not open."""
+    tracker = make_tracker()
+    assert tracker.track(clip, POINTS).lost_p is None
+    tracker.calibration = make_calibration(alarming=False)
+    unwatched, watched = (tracker.track(clip, POINTS, alpha=alpha) for alpha in (None, 0.1))
+    assert unwatched.lost_p is unwatched.alarm is None
+    assert watched.lost_p is not None
+    assert watched.alarm is not None
+
+
 def test_before_a_point_is_asked_there_is_no_answer(clip: Clip):
     tracks = make_tracker().track(clip, [Query.point(2, 20, 30)])
     assert np.isnan(tracks.uv_px[:2]).all()

@@ -33,7 +33,7 @@ class EvalMonitor:
         split: parts of the object split.
         level: levels to evaluate; all by default.
         alpha: shares of loss-free streams that may alarm.
-        alpha_frames: --alpha is for every so many frames of a stream instead.
+        alpha_frames: --alpha is for every so many frames of a stream instead; a multiple of the calibration's blocks.
         shard: part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one judges.
         resamples: of the bootstrap over objects.
         seed: of the bootstrap.
@@ -92,13 +92,19 @@ class EvalMonitor:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is judged yet")
             return 0
+        block_frames = tracker.calibration.block_frames
+        if self.alpha_frames is not None and self.alpha_frames % block_frames:
+            raise ConfigError(
+                f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
+                f"{self.alpha_frames}"
+            )
         known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
         both = {r.object_id for r in known} & {r.object_id for r in recorded.records}
         if both:
             raise ConfigError(f"objects {', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
         detectors = (
             our_monitor(tracker.calibration),
-            *rivals(known, block_frames=tracker.calibration.block_frames),
+            *rivals(known, block_frames=block_frames),
         )
         rows = drift_rows(detectors, recorded.records, budgets=budgets, resamples=self.resamples, seed=self.seed)
         Console(width=TABLE_WIDTH).print(drift_table(rows))

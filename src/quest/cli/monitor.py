@@ -37,7 +37,7 @@ class Monitor(Source):
     alpha: float = 0.05
     """Share of streams without any loss that may raise an alarm."""
     alpha_frames: int | None = None
-    """--alpha is for every so many frames instead, such as 1800, so that alarms come as readily late as early."""
+    """--alpha is for every so many frames instead, such as 300, so that alarms come as readily late as early."""
     jsonl: Path | None = None
     """Write one JSON object per frame to this file; - is standard output, and then the view goes to standard error."""
     realtime: bool = False
@@ -58,7 +58,7 @@ class Monitor(Source):
         if not 0.0 < self.alpha < 1.0:
             raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
         if self.alpha_frames is not None and self.alpha_frames < 1:
-            raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 1800")
+            raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
         console = self._console()
         source = self.open()
         if source.length is None:
@@ -74,7 +74,9 @@ class Monitor(Source):
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
                 "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
             )
-        elif tracker.calibration is not None and (shortfall := tracker.calibration.shortfall(stream.budget)):
+        elif tracker.calibration is not None and (
+            shortfall := tracker.calibration.shortfall(stream.budget, frames=length)
+        ):
             console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {shortfall}; `quest weights calibrate`")
         view = LiveView(console, name=source.name, frames=length, budget=stream.budget)
         state = None

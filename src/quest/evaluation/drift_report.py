@@ -250,9 +250,13 @@ def _alarm_row(
 
 
 def parts_of(frames: int, each: int | None) -> list[tuple[int, int]]:
-    """First frame, and frame after the last, of the parts of a stream that alpha is for; the whole where None."""
-    each = frames if each is None else each
-    return [(first, min(first + each, frames)) for first in range(0, frames, each)]
+    """First frame, and frame after the last, of the parts of a stream that alpha is for; the whole where None.
+
+    What is left at the end counts for nothing: it is too short to alarm as often. A stream that is shorter than a part
+    counts as one.
+    """
+    each = frames if each is None else min(each, frames)
+    return [(first, first + each) for first in range(0, frames - each + 1, each)]
 
 
 def _finite(value: float | None) -> float | None:

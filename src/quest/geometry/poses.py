@@ -20,7 +20,7 @@ def is_rigid(pose: Float[np.ndarray, "*T 4 4"]) -> bool:
 
 def nearest_rigid(pose: Float[np.ndarray, "4 4"]) -> Float64[np.ndarray, "4 4"]:
     """The rigid pose nearest to one that is rigid up to rounding."""
-    left, _, right = np.linalg.svd(np.asarray(pose[:3, :3], np.float64))
     exact = np.array(pose, np.float64)
+    left, _, right = np.linalg.svd(exact[:3, :3])
     exact[:3, :3] = left @ right
     return exact

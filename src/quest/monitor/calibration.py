@@ -69,24 +69,30 @@ class Calibration:
         """Smallest alpha of a stream whose first block has a threshold that is promised, not extrapolated."""
         return least_alpha(len(self.maxima))
 
-    def shortfall(self, budget: Budget) -> str | None:
+    def shortfall(self, budget: Budget, *, frames: int | None = None) -> str | None:
         """Which alarms there will never be, as the calibration is too small for it; None if all can be.
 
-        Where alpha is for a whole stream, thresholds rise from block to block, and the statistic has a largest value.
+        Where alpha is for a whole stream, thresholds rise from block to block, and the statistic, which starts anew in
+        each, has a largest value.
+
+        Args:
+            budget: of false alarms.
+            frames: length of the stream, if it is known: what comes after it is not missed.
         """
-        most = self.statistic.most(LOGIT_LIMIT)
+        most = self.statistic.most(LOGIT_LIMIT, self.block_frames)
 
         def silent(block: int) -> bool:
             part = budget.part(block=block, restart=0, block_frames=self.block_frames)
             return self.threshold(part).value >= most
 
-        block = bisect.bisect_left(range(1, _MANY_BLOCKS), True, key=silent)
-        if block == _MANY_BLOCKS - 1:
+        blocks = _MANY_BLOCKS if frames is None else -(-frames // self.block_frames)
+        block = bisect.bisect_left(range(1, blocks + 1), True, key=silent)
+        if block == blocks:
             return None
         rest = f"after {block * self.block_frames} frames of a stream" if block else "at all"
         return (
             f"no alarm {rest} at {budget}: calibrated on {len(self.maxima)} loss-free streams of "
-            f"{self.block_frames} frames; more and longer ones promise more"
+            f"{self.block_frames} frames; more and longer ones promise more, and so does alpha for so many frames"
         )
 
     def to_json(self) -> str:

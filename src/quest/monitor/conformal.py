@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int
 
 from quest.errors import ConfigError
 
@@ -84,27 +84,33 @@ class Budget:
     def __post_init__(self) -> None:
         if not 0.0 < self.alpha < 1.0:
             raise ConfigError(f"monitor: expected 0 < alpha < 1, got {self.alpha}")
-        if self.frames is not None and self.frames < 1:
-            raise ConfigError(f"monitor: expected alpha_frames >= 1, got {self.frames}")
+        if self.frames is not None and not (isinstance(self.frames, int | np.integer) and self.frames >= 1):
+            raise ConfigError(f"monitor: expected alpha_frames as a whole number >= 1, got {self.frames!r}")
 
     def __str__(self) -> str:
         return f"alpha {self.alpha:g}" + ("" if self.frames is None else f" in {self.frames} frames")
+
+    def since(self, age: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
+        """Frames since alpha was last given out: blocks count from there.
+
+        Args:
+            age: frames since the start of the stream or the restart.
+        """
+        return age if self.frames is None else age % self.frames
 
     def part(self, *, block: int, restart: int, block_frames: int) -> float:
         """The part of alpha that one block of a query's watch may spend.
 
         For a whole stream the first block gets four fifths, and over all blocks the parts add up to
-        ``alpha / 2**restart``. For so many frames, all blocks get the same: alpha, divided by the most blocks that so
-        many frames, counted from the start of the stream, can be in.
+        ``alpha / 2**restart``. For so many frames, all blocks in these get the same.
 
         Args:
-            block: 1, 2, ..., counted from the start of the stream or the restart.
+            block: 1, 2, ..., counted from the start of the stream, or from the restart where alpha is for all of it.
             restart: 0 before any alarm was cleared; the j-th restart of the stream has j.
             block_frames: length of a block, that of the calibration streams.
         """
         if self.frames is not None:
-            late = block_frames - math.gcd(self.frames, block_frames)  # how far in a block they can begin
-            return self.alpha / -(-(late + self.frames) // block_frames)
+            return float(self.alpha) / -(-int(self.frames) // block_frames)
         share = _FIRST_BLOCK if block == 1 else (1 - _FIRST_BLOCK) / ((block - 1) * block)
         return math.ldexp(self.alpha * share, -min(restart, _MOST_HALVINGS))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -85,13 +85,15 @@ class Monitor:
         self._open.pop(key, None)
 
     def rename(self, key: int, name: str) -> None:
-        """Call a query by another name in alarms from now on.
+        """Call a query by another name in alarms from now on, in an open one too.
 
         Raises:
             InputError: it is not being watched.
         """
         self._find(key)
         self._name[key] = name
+        if key in self._open:
+            self._open[key] = replace(self._open[key], name=name)
 
     def alarm(self, key: int) -> Alarm | None:
         """The open alarm of a query."""
@@ -100,7 +102,9 @@ class Monitor:
     def clear(self, key: int) -> None:
         """The identity is right again: the alarm ends, and the statistic starts anew.
 
-        What follows the j-th time spends alpha / 2^j, where alpha is for the whole stream.
+        What follows the j-th time spends alpha / 2^j, where alpha is for the whole stream, and its blocks count from
+        here. Where alpha is for so many frames, all queries share the blocks of the stream, or there would be more of
+        them in so many frames than alpha is divided by.
 
         Raises:
             InputError: the query is not being watched.
@@ -109,7 +113,8 @@ class Monitor:
         if self._open.pop(key, None) is not None:
             self._restarts += 1
             self._restart[row] = self._restarts
-            self._origin[row] = self._frames
+            if self.budget.frames is None:
+                self._origin[row] = self._frames
         self._memory[row] = memories.forgive(self._memory[row])
         self._statistic[row] = 0.0
 
@@ -136,21 +141,20 @@ class Monitor:
         memory, features = calibrator.step(self._memory[rows], values)
         logit = calibrator.logit(features)
         lost_p = probability(logit)
-        age = self._frames - self._origin[rows]
-        # A block begins as a calibration stream did, from nothing: only so are its maxima comparable.
-        begun = (age % self.calibration.block_frames == 0) & (age > 0)
-        state = np.where(begun[:, None], 0.0, self._statistic[rows])
-        state, statistic = self.calibration.statistic.update(state, logit)
+        age = self.budget.since(self._frames - self._origin)
+        # A block begins as a calibration stream did, from nothing: only so are its maxima comparable; also who rests.
+        self._statistic[age % self.calibration.block_frames == 0] = 0.0
+        state, statistic = self.calibration.statistic.update(self._statistic[rows], logit)
         self._memory[rows], self._statistic[rows] = memory, state
-        block = age // self.calibration.block_frames + 1
+        block = age[rows] // self.calibration.block_frames + 1
         raised = []
         for i, key in enumerate(keys):
             limit = self._threshold(int(block[i]), int(self._restart[rows[i]]))
             if key not in self._open and statistic[i] > limit.value:
                 why = self._reason(features[i], memory[i], values[i], float(lost_p[i]))
                 alarm = Alarm(
-                    self._name[key], key, frame, stamp_s, float(statistic[i]), limit.value, limit.alpha, why,
-                    limit.extrapolated,
+                    self._name[key], int(key), int(frame), float(stamp_s), float(statistic[i]), limit.value,
+                    limit.alpha, why, limit.extrapolated,
                 )  # fmt: skip
                 self._open[key] = alarm
                 raised.append(alarm)

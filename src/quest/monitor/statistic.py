@@ -6,7 +6,6 @@ of N queries is an array of N by :attr:`size` numbers.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -61,10 +60,10 @@ class Cusum:
         if not np.isfinite(self.drift) or not 0.0 <= self.keep <= 1.0:
             raise ConfigError(f"statistic: expected a finite drift and 0 <= keep <= 1, got {self.drift}, {self.keep}")
 
-    def most(self, evidence: float) -> float:
-        """What the sum never exceeds where no frame has more evidence."""
+    def most(self, evidence: float, frames: int) -> float:
+        """What the sum never exceeds in so many frames from its start, where none has more evidence."""
         rise = max(0.0, evidence - self.drift)
-        return rise / (1.0 - self.keep) if self.keep < 1.0 else math.inf if rise > 0.0 else 0.0
+        return rise * (frames if self.keep == 1.0 else (1.0 - self.keep**frames) / (1.0 - self.keep))
 
     def update(
         self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]

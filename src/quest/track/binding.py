@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -152,6 +152,10 @@ class Binding:
             self._join(observed, frames, self._canvas(due), torch.tensor(label), torch.tensor(intent))
             found += [self._begin(w, w.query.name or f"point {w.number}", w.query.label) for w in due]
         return found
+
+    def wait(self) -> None:
+        """A frame is ignored: labels and slots look one frame longer."""
+        self.waiting = [w if w.query.kind == "point" else replace(w, since=w.since + 1) for w in self.waiting]
 
     def keep(self, rows: Sequence[int]) -> None:
         """Drop the anchors of all rows but these."""

@@ -63,9 +63,11 @@ class Events:
         for k, number in enumerate(state.query):
             for kind, text in self._compare(frame, state, k, number):
                 told.append((kind, state.names[k], text))
-        if state.flags and state.flags != self._flags:
+        # What follows the colon may differ in every frame: how late it is.
+        flags = tuple(flag.partition(":")[0] for flag in state.flags)
+        if flags and flags != self._flags:
             told.append(("degraded", "", "; ".join(state.flags)))
-        self._flags = state.flags
+        self._flags = flags
         self._alarm = dict(zip(state.query, state.alarm, strict=True))
         self._lost = {number: value is State.LOST for number, value in zip(state.query, state.state, strict=True)}
         return tuple(Event(frame, state.stamp_s, kind, name, text) for kind, name, text in told)
@@ -73,10 +75,12 @@ class Events:
     def _compare(self, frame: int, state: StreamState, k: int, number: int) -> list[tuple[Happening, str]]:
         before, now = self._alarm.get(number), state.alarm[k]
         told: list[tuple[Happening, str]] = []
-        if before is not None and now != before:
+        # An alarm is the same under another name.
+        same = before is not None and now is not None and before.frame == now.frame
+        if before is not None and not same:
             self.cleared += 1
             told.append(("cleared", f"alarm cleared after {frame - before.frame} frames"))
-        if now is not None and now != before:
+        if now is not None and not same:
             self.raised += 1
             return [*told, ("alarm", f"ALARM: {now.reason}")]
         # With an alarm the query is lost and found by it; that is told already.

@@ -166,6 +166,10 @@ class Ground:
         self._recent.append((self._clock, point))
         self._along, self._hidden = None, 0.0
 
+    def wait(self, elapsed: float) -> None:
+        """A frame passes that tells nothing of places, so many frames after the one before."""
+        self._clock += elapsed
+
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
         floor = _OFF_FIXED if self.fixed else self._config.off_joint

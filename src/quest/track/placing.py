@@ -78,6 +78,7 @@ class Placer:
         self._elapsed = elapsed
         log_p = prediction.logits[0, 0].log_softmax(dim=-1)
         self._evidence = [FrameEvidence(frames, log_p[k], network) for k in range(len(following))]
+        self._no_depth = not bool((frames.depth_m > 0).any())
         self._seen = prediction.visible_logit[0, 0].sigmoid().double().cpu().numpy()
         self._right = prediction.right_logit[0, 0].sigmoid().double().cpu().numpy()
 
@@ -104,6 +105,8 @@ class Placer:
                 point[i] = self._hold(i, own, seen[i])
             elif np.isfinite(own).all():
                 point[i], query.buried = self._see(i, own, joints[i]), False
+            elif self._no_depth:
+                query.ground.wait(self._elapsed)
             judged[i] = point[i]
         room = np.array([e.room(p[None])[0] for e, p in zip(self._evidence, judged, strict=True)]).reshape(k)
         doubted = np.array([query.doubted for query in self._following], bool)

@@ -29,7 +29,7 @@ class StreamState:
         query: the number of the query that each row answers; discovered slots count up.
         joint: the joint that explains each track so far, in the world, metres; None before the first seen point and
             without depth.
-        lost_p: calibrated probability that the identity is lost; NaN where the weights carry no calibration.
+        lost_p: calibrated probability that the identity is lost; NaN where nothing is watched.
         alarm: the open alarm of each query, or None.
         signals: what the monitor judged by.
         flags: degradations of this frame in words, such as missing depth; a late or duplicate frame repeats the answer

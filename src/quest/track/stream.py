@@ -134,7 +134,7 @@ class Stream:
             InputError: no query of that number or name is followed or waits, or another has the new name.
         """
         number = self._binding.find(query, self._following)
-        if name in self._binding.names(self._following).values():
+        if name in {other for k, other in self._binding.names(self._following).items() if k != number}:
             raise InputError(f"query {query!r}: another query is called {name!r} already; choose another name")
         for following in self._following:
             if following.query == number:
@@ -176,6 +176,7 @@ class Stream:
         intake.check(self._t, rgb, depth_m, stamp_s, cam_from_world)
         if intake.admit(rgb, stamp_s) is not Arrival.NEW:
             self._t += 1
+            self._binding.wait()
             return self._state()
         with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
             frames, renewed = intake.prepare(rgb, depth_m, cam_from_world)

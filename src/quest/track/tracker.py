@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from quest.grounding import JointKind
 from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.weights import load_network
-from quest.monitor import Calibration, Monitor
+from quest.monitor import Budget, Calibration, Monitor
 from quest.track.intake import Intake
 from quest.track.saving import SavedStream
 from quest.track.settings import REVISION, TrackerConfig
@@ -89,7 +89,7 @@ class Tracker:
             queries: what to follow; None discovers entities in the first frame.
             alpha: probability of any alarm in a stream in which no identity is lost (``docs/monitor.md`` says what is
                 promised); None for no alarms and no recovery. Weights without a calibration raise no alarms.
-            alpha_frames: alpha is for every so many frames instead, such as 1800 for a minute at 30 frames a second:
+            alpha_frames: alpha is for every so many frames instead, such as 300 for ten seconds at 30 frames a second:
                 alarms then come as readily late in a stream as early.
 
         Raises:
@@ -97,8 +97,10 @@ class Tracker:
             ConfigError: alpha is no probability, or there are no frames.
         """
         monitor = None
-        if alpha is not None and self.calibration is not None:
-            monitor = Monitor(self.calibration, alpha=alpha, alpha_frames=alpha_frames)
+        if alpha is not None:
+            Budget(alpha, alpha_frames)  # refused in words whether or not it is of use
+            if self.calibration is not None:
+                monitor = Monitor(self.calibration, alpha=alpha, alpha_frames=alpha_frames)
         return Stream(
             self.network, self.config, camera, queries, device=self.device, autocast=self._autocast, monitor=monitor
         )
@@ -172,7 +174,8 @@ class Tracker:
         for t in range(len(clip)):
             frame = clip.frame(t)
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
-        return collect(states, queries)
+        tracks = collect(states, queries)
+        return tracks if stream.budget is not None else replace(tracks, lost_p=None, alarm=None)
 
     def _maker(self, camera: Camera, alpha: float | None) -> dict[str, Any]:
         """What a saved stream must be restored with."""
