@@ -28,8 +28,9 @@ class FineTune:
 
     objects: tuple[str, ...] = (str(Path(__file__).parent / "toolbox"),)
     """Your object: a folder with one URDF, or the URDF itself (docs/objects.md)."""
-    out: Path = Path("runs/toolbox")
-    """Folder for takes, run and results."""
+    out: Path | None = None
+    """Folder for takes, run and results; default: runs/NAME of the object. Another object or number of steps needs
+    a folder of its own."""
     weights: str = "quest-s16"
     """Weights to start from."""
     takes: int = 12
@@ -41,9 +42,14 @@ class FineTune:
     learning_rate: float = 1e-4
     """A quarter of what training anew takes: the weights are good already."""
 
+    @property
+    def folder(self) -> Path:
+        """Where everything goes: objects do not share a run, which would go on from one to the other."""
+        return self.out or Path("runs") / Path(self.objects[0]).resolve().name.removesuffix(".urdf")
+
     def run(self) -> None:
         """Run all steps and print the table."""
-        takes, run = self.out / "takes", self.out / "run"
+        takes, run = self.folder / "takes", self.folder / "run"
         few = max(2, self.takes // 3)
         for name, seed, count, every in (
             ("mine", 0, self.takes, 3),
@@ -64,8 +70,8 @@ class FineTune:
         }
         say("train", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
         found = {"data": data, "validation": takes / "choose", "weights": run / "weights.safetensors"}
-        say("train", stage="map", out=self.out / "map", **found, **training)
-        mine = self.out / "map" / "weights.safetensors"
+        say("train", stage="map", out=self.folder / "map", **found, **training)
+        mine = self.folder / "map" / "weights.safetensors"
         say("weights", "tune", str(mine), takes=takes / "choose")
         self.judge(mine, "after")
         self.compare()
@@ -74,7 +80,7 @@ class FineTune:
 
     def judge(self, weights: str | Path, name: str) -> None:
         """Evaluate weights on the takes that are held out."""
-        held_out, out = self.out / "takes" / "held-out", self.out / f"{name}.json"
+        held_out, out = self.folder / "takes" / "held-out", self.folder / f"{name}.json"
         protocol = ("point", "semantic")
         say("eval", takes=held_out, split="unlisted", trackers="quest", protocol=protocol, weights=weights, out=out)
 
@@ -84,7 +90,7 @@ class FineTune:
         rows = {
             (row.protocol, name): row
             for name in ("before", "after")
-            for row in read_results(self.out / f"{name}.json").rows
+            for row in read_results(self.folder / f"{name}.json").rows
             if row.reading == "moved" and row.tracker == "quest"
         }
         for protocol, name in sorted(rows, key=lambda key: (key[0], key[1] != "before")):

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -87,6 +89,16 @@ def test_other_errors_are_not_hidden(monkeypatch):
         run_with(monkeypatch, ZeroDivisionError())
 
 
+def test_places_that_cannot_be_used_are_one_line(monkeypatch, capsys):
+    assert run_with(monkeypatch, OSError(errno.EACCES, "Permission denied", "/locked/sheet.png")) == 2
+    error = capsys.readouterr().err
+    assert error == "error: /locked/sheet.png: cannot be written or read (Permission denied); name another place\n"
+    assert run_with(monkeypatch, OSError(errno.ENOSPC, "No space left on device")) == 2
+    assert capsys.readouterr().err.startswith("error: cannot be written or read (No space left")
+    with pytest.raises(OSError, match="Input/output error"):
+        run_with(monkeypatch, OSError(errno.EIO, "Input/output error"))
+
+
 def test_interrupted(monkeypatch):
     assert run_with(monkeypatch, KeyboardInterrupt()) == 130
 
@@ -171,3 +183,43 @@ def test_output_that_nobody_reads_is_no_error():
     )
     assert "Traceback" not in done.stderr
     assert done.stdout.splitlines()[-1] in ("0", "141")
+
+
+@pytest.mark.parametrize("words", ["print('x')", "Console().print('x')"])
+def test_nobody_reads_what_a_command_prints(words):
+    """Neither rich's own exit code, which means something else here, nor a complaint of Python's at the end."""
+    code = (
+        "import sys, quest.cli.main as program\n"
+        "from rich.console import Console\n"
+        f"class Says:\n    def run(self):\n        {words}\n        return 0\n"
+        "program.parse = lambda arguments: Says()\n"
+        "sys.stdin.readline()\n"
+        "sys.exit(program.main(['ls']))"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
+    assert process.stderr is not None
+    process.stdout.close()
+    process.stdin.write("go\n")
+    process.stdin.close()
+    told = process.stderr.read()
+    process.stderr.close()
+    assert process.wait(60) == 141
+    assert told == ""
+
+
+def test_letters_that_the_terminal_lacks():
+    environment = {**os.environ, "PYTHONIOENCODING": "latin-1:strict"}
+    code = (
+        "import sys, quest.cli.main as program\n"
+        "class Says:\n    def run(self):\n        print('\u628a')\n        return 0\n"
+        "program.parse = lambda arguments: Says()\n"
+        "sys.exit(program.main(['ls']))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60, env=environment
+    )
+    assert (done.returncode, done.stdout) == (0, "\\u628a\n")

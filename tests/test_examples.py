@@ -51,6 +51,14 @@ def test_fine_tuning_runs_commands_that_exist(tmp_path: Path, monkeypatch: pytes
     assert [command.takes for command in evaluated] == [held_out, held_out]
 
 
+def test_every_object_has_a_run_of_its_own():
+    module = example("fine_tune")
+    assert module.FineTune().folder == Path("runs/toolbox")
+    assert module.FineTune(objects=("path/to/mine",)).folder == Path("runs/mine")
+    assert module.FineTune(objects=("path/to/arm.urdf",)).folder == Path("runs/arm")
+    assert module.FineTune(out=Path("elsewhere")).folder == Path("elsewhere")
+
+
 def test_the_tool_chest_has_three_handles():
     text = (EXAMPLES / "toolbox" / "toolbox.urdf").read_text(encoding="utf-8")
     assert text.count('type="prismatic"') == 2

@@ -58,6 +58,24 @@ def test_ls(whole: Path, broken: Path, capsys: pytest.CaptureFixture[str]):
     assert "torn" not in captured.out
 
 
+def test_names_with_brackets(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    store, take = TakeStore(tmp_path / "takes"), make_take(frames=9, views=1, size=(64, 48))
+    store.write(replace(take, info=replace(take.info, name="chest[old]-1", category="[i]Chest")))
+    assert quest("ls", tmp_path / "takes") == 0
+    out = capsys.readouterr().out
+    assert "chest[old]-1" in out
+    assert "[i]Chest" in out
+
+
+def test_show_the_folder_that_one_is_in(whole: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(whole)
+    try:
+        assert quest("show", ".") == 0
+        assert (whole / "takes.png").is_file()
+    finally:
+        (whole / "takes.png").unlink(missing_ok=True)
+
+
 def test_show_a_take(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "pictures" / "sheet.png"
     assert quest("show", whole / "panels.zarr", "--out", out, "--columns", 4) == 0
@@ -163,6 +181,7 @@ def test_export_to_mcap(whole: Path, tmp_path: Path):
     ("arguments", "said"),
     [
         (["ls", "nowhere"], "no such folder"),
+        (["ls", "takes/nowhere.zarr"], "no folder"),
         (["show", "nowhere"], "no such folder"),
         (["show", "takes/nowhere.zarr"], "no folder"),
         (["show", "takes", "--rrd", "x.rrd"], "is a store; name one, such as takes/panels.zarr"),

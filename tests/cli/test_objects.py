@@ -32,6 +32,7 @@ def test_list_names_objects_entities_and_what_is_broken(tmp_path: Path, capsys: 
     [
         ([], "no object is named"),
         (["procedural:chest-0", "--count", "0"], "--count >= 1"),
+        (["procedural:chest-0", "--out", "sheet"], "--out sheet: expected a picture, .png"),
         (["procedural:spaceship-0"], "expected CATEGORY-SEED"),
         (["nowhere/arm.urdf"], "expected an object folder"),
         (["arm.urdf.xacro"], "run: xacro"),
@@ -40,6 +41,14 @@ def test_list_names_objects_entities_and_what_is_broken(tmp_path: Path, capsys: 
 def test_bad_requests_are_told(arguments: list[str], named: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["objects", "show", *arguments]) == 2
     assert named in capsys.readouterr().err
+
+
+def test_a_list_without_a_terminal_has_whole_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = "kitchen_wall_unit_with_handles[left side]"
+    write_cabinet(tmp_path / name)
+    assert main(["objects", "list", "--objects-root", str(tmp_path)]) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if name in line)
+    assert line.rstrip().endswith("1 handle, 1 rim")
 
 
 @pytest.mark.render

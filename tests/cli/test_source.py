@@ -13,12 +13,14 @@ import tyro
 from quest.cli.main import main
 from quest.cli.source import Source
 from quest.cli.track import Track
+from quest.data.camera_file import CameraFile, write_camera
 from quest.data.frame_source import FrameSource
 from quest.data.lerobot_export import Episode, export_lerobot
 from quest.data.mcap_export import export_mcap
 from quest.data.recording import write_recording
 from quest.data.store import TakeStore
 from quest.data.tracks_file import read_tracks
+from quest.data.video import write_video
 from quest.errors import RecordingError
 from quest.model.weights import save_network
 from quest.track import Stream, TrackerConfig
@@ -92,6 +94,17 @@ def test_monitor_reads_frame_by_frame(
     assert "the dataset has no camera poses" not in capsys.readouterr().out
 
 
+def test_monitor_reads_videos_of_unknown_length_frame_by_frame(
+    clip: Clip, weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+):
+    """Matroska does not tell how many frames there are."""
+    write_video(tmp_path / "rgb.mkv", clip.rgb, frames_per_s=30)
+    write_camera(CameraFile(clip.camera), tmp_path / "camera.json")
+    monkeypatch.setattr(FrameSource, "clip", lambda source: pytest.fail("the whole clip was read"))
+    assert main(["monitor", str(tmp_path), "--weights", weights, "--point", "0,20,30"]) == 0
+    assert f": {FRAMES} frames in" in capsys.readouterr().out
+
+
 def test_monitor_stops_where_the_recording_is_torn(
     sources: dict[str, str], weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ):
@@ -148,7 +161,14 @@ def test_every_clip_has_a_folder_of_its_own(
 
 @pytest.mark.parametrize(
     ("name", "folder"),
-    [("a/b", "a-b"), ("..", "clip"), ("C:\\x", "C--x"), ("sample", "sample"), ("Küche 1.5", "Küche 1.5")],
+    [
+        ("a/b", "a-b"),
+        ("..", "clip"),
+        ("C:\\x", "C--x"),
+        ("sample", "sample"),
+        ("caf\udce9", "caf-"),
+        ("Küche 1.5", "Küche 1.5"),
+    ],
 )
 def test_names_become_folders(clip: Clip, name: str, folder: str):
     assert Track("anything")._name(replace(clip, name=name)) == folder
@@ -158,6 +178,26 @@ def test_names_become_folders(clip: Clip, name: str, folder: str):
 def test_a_take_has_depth_and_a_camera_of_its_own(words: list[str]):
     with pytest.raises(RecordingError, match="of its own"):
         tyro.cli(Track, args=["takes/a.zarr", *words]).open()
+
+
+@pytest.mark.parametrize(
+    ("source", "words", "named"),
+    [
+        ("folder", ["--episode", "1"], "--episode 1 is for LeRobot datasets"),
+        ("folder", ["--topic-depth", "none"], "--topic-depth none is for bags"),
+        ("clip.mcap", ["--camera-key", "front"], "--camera-key front is for LeRobot datasets"),
+        ("lerobot", ["--sync-s", "0.1"], "--sync-s 0.1 is for bags"),
+        ("lerobot", ["--view", "1"], "--view is for takes"),
+    ],
+)
+def test_options_of_other_kinds_are_refused(sources: dict[str, str], source: str, words: list[str], named: str):
+    with pytest.raises(RecordingError, match=named):
+        tyro.cli(Track, args=[sources[source], *words]).open()
+
+
+def test_a_take_has_neither_episodes_nor_topics():
+    with pytest.raises(RecordingError, match=r"take takes/a\.zarr/: --episode 2 is for LeRobot datasets"):
+        tyro.cli(Track, args=["takes/a.zarr/", "--episode", "2"]).open()
 
 
 def test_no_such_recording():

@@ -106,6 +106,27 @@ def test_words_that_are_not_utf8(tmp_path: Path):
     assert len(list(play_video(path))) == 1
 
 
+def test_two_writers_of_one_video(tmp_path: Path):
+    """The last to finish counts, and neither takes the other's half-made file."""
+    path, frame = tmp_path / "overlay.mp4", np.full((48, 64, 3), 90, np.uint8)
+
+    def frames():
+        yield from [frame] * 80  # more than the encoder keeps to itself before it opens the file
+        assert write_video(path, [frame] * 3, frames_per_s=30) == 3
+        yield frame
+
+    assert write_video(path, frames(), frames_per_s=30) == 81
+    assert len(read_video(path)[0]) == 81
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_other_systems_leave_beside_a_video_is_no_video(tmp_path: Path):
+    clip = make_take(frames=3, views=1, size=(64, 48)).views[0].clip
+    write_recording(clip, tmp_path / "clip")
+    (tmp_path / "clip" / "._rgb.mp4").write_bytes(b"Mac OS X")
+    assert len(read_recording(tmp_path / "clip")) == 3
+
+
 def test_a_colon_is_part_of_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     path = Path("drawer:3.mp4")

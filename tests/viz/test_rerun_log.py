@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quest.data.store import TakeStore
 from quest.errors import ConfigError, MissingExtraError
 from quest.extras import is_installed
 from quest.types import Take
@@ -91,6 +92,21 @@ def test_values(take: Take, recording: Recording):
     assert np.array_equal(np.reshape(masks, take.views[0].link_id.shape), take.views[0].link_id)
     seen = recording.values("/world/view_0/image/entities/seen", "Points2D:positions")
     assert [len(points) for points in seen] == take.views[0].visible.sum(axis=1).tolist()
+
+
+@needs_rerun
+def test_frames_that_are_left_out_are_counted(tmp_path: Path):
+    """Of a thinned take, numbers are those of the whole one, and trails still reach back a second."""
+    store, take = TakeStore(tmp_path / "takes"), make_take(frames=61, views=1, size=(24, 20), name="long")
+    store.write(take)
+    save_rrd(store.read("long", frames=slice(None, None, 10)), tmp_path / "thin.rrd", every=10)
+    recording = Recording(tmp_path / "thin.rrd")
+    frames = [0, 10, 20, 30, 40, 50, 60]
+    assert sorted(recording.values("/world/view_0/image/rgb", "frame")) == frames
+    assert recording.values(f"/joints/{take.info.joints[0].name}", "frame") == frames
+    name = take.info.entities[0].name.replace("/", "\\/")
+    trails = recording.values(f"/world/trails/{name}", "LineStrips3D:strips")
+    assert [len(trail[0]) for trail in trails] == [1, 2, 3, 4, 4, 4, 4]
 
 
 @needs_rerun

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from quest.data.store import TakeStore
 
 MOST_FRAMES_SHOWN = 600
-PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 
 
 @dataclass(frozen=True)
@@ -48,13 +47,13 @@ class DataShow:
 
     def run(self) -> int:
         """Write the picture or the recording and say where it is."""
-        from quest.cli.takes import open_takes
+        from quest.cli.takes import check_picture, open_takes
         from quest.errors import ConfigError, TakeError
 
         if (self.every is not None and self.every < 1) or self.rows < 1 or self.columns < 1:
             raise ConfigError("show: expected --every, --rows and --columns of at least 1")
-        if self.out is not None and self.out.suffix.lower() not in PICTURES:
-            raise ConfigError(f"show: --out {self.out}: expected a picture, {', '.join(PICTURES)}")
+        if self.out is not None:
+            check_picture("show", self.out)
         store, names = open_takes(self.takes)
         if names is not None:
             return self._show_take(store, names[0])
@@ -73,11 +72,11 @@ class DataShow:
             from quest.viz.rerun_log import open_viewer, save_rrd
 
             if self.rrd is not None:
-                save_rrd(take, self.rrd)
+                save_rrd(take, self.rrd, every=every)
                 megabytes = self.rrd.stat().st_size / 1e6
                 print(f"{self.rrd}: {megabytes:.1f} MB, take {name}; open it with: rerun {self.rrd}")
             if self.rerun:
-                open_viewer(take)
+                open_viewer(take, every=every)
         if self.out is not None or not (self.rrd or self.rerun):
             from quest.viz.contact_sheet import contact_sheet
 
@@ -99,7 +98,8 @@ class DataShow:
             step = max(1, (headers[name].frames - 1) // max(self.columns - 1, 1))
             takes.append(store.read(name, views=[0], frames=slice(None, None, step)))
         title = f"{self.takes}: {len(takes)} of {len(names)} takes"
-        name = self.takes.rstrip("/\\").replace("\\", "/").rpartition("/")[2] or "takes"
+        where = str(store.root.resolve()) if store.is_folder else self.takes
+        name = where.rstrip("/\\").replace("\\", "/").rpartition("/")[2] or "takes"
         sheet = takes_sheet(takes, title=title, columns=self.columns)
         self._write(sheet, self.out or Path(f"{name}.png"), f"{len(takes)} takes")
         return 0
@@ -140,6 +140,9 @@ class DataLs:
             counts = map(str, (info.level, header.frames, len(header.cameras), len(info.entities)))
             megabytes = f"{sum(header.files.values()) / 1e6:.1f}"
             table.add_row(name, info.suite, info.category, *counts, megabytes, header.data_hash[:12])
+        for name in names or ():
+            if name not in headers and name not in problems:
+                store.header(name)  # says that there is none
         console = wide_console()
         console.print(table)
         frames = sum(header.frames * len(header.cameras) for header in headers.values())

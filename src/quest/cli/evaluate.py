@@ -91,10 +91,10 @@ class Eval:
         from quest.evaluation.selection import Shard, select_takes
         from quest.evaluation.tables import FULL_WIDTH, results_table
 
-        if not self.protocol or not self.trackers or self.resamples < 1:
+        if not self.protocol or not self.trackers or self.resamples < 1 or self.seed < 0:
             raise ConfigError(
-                f"eval: expected a protocol, a tracker and resamples >= 1, got {self.protocol}, {self.trackers}, "
-                f"{self.resamples}"
+                f"eval: expected a protocol, a tracker, resamples >= 1 and seed >= 0, got {self.protocol}, "
+                f"{self.trackers}, {self.resamples}, {self.seed}"
             )
         if self.out is not None and self.out.suffix != ".json":
             raise ConfigError(f"eval: expected --out to end in .json, got {self.out}")

@@ -11,9 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from quest.data.store import TakeStore
+    from quest.evaluation.detectors import Detector
     from quest.evaluation.results import Run
     from quest.evaluation.selection import SplitPart
+    from quest.evaluation.stream_record import StreamRecord
+    from quest.monitor import Calibration
     from quest.track import Tracker
 
 
@@ -23,7 +28,8 @@ class EvalMonitor:
 
     Every view of every take is tracked once with alarms off and its signals are kept in --records; the monitor, CUSUM,
     Page-Hinkley and a threshold on the network's confidence are then played on them, all calibrated on the same
-    streams.
+    streams. A monitor that was calibrated with --unit take is judged by other takes of the same objects: every take
+    then counts as an object.
 
     Attributes:
         takes: stores with takes of objects that took no part in the calibration.
@@ -58,23 +64,22 @@ class EvalMonitor:
 
         Raises:
             ConfigError: weights without a calibration, objects that they were calibrated on, or bad settings.
-            InputError: the calibration streams are missing or of other weights.
+            InputError: the calibration streams are missing, of other weights, or not those of the calibration.
             TakeError: a store is missing or a take is torn.
         """
         from rich.console import Console
 
         from quest.data.store import TakeStore
         from quest.errors import ConfigError
-        from quest.evaluation.detectors import our_monitor, rivals
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
         from quest.evaluation.selection import Shard, select_takes
-        from quest.evaluation.stream_record import read_records, record_streams, tracker_id
+        from quest.evaluation.stream_record import OF_TAKES, by_take, read_records, record_streams, tracker_id
         from quest.monitor import Budget
         from quest.track import load
 
         budgets = [Budget(alpha, self.alpha_frames) for alpha in self.alpha]
-        if self.resamples < 1 or not budgets:
-            raise ConfigError(f"eval-monitor: expected resamples >= 1 and at least one alpha, got {self}")
+        if self.resamples < 1 or self.seed < 0 or not budgets:
+            raise ConfigError(f"eval-monitor: expected resamples >= 1, seed >= 0 and at least one alpha, got {self}")
         start_s = time.monotonic()
         console = Console(stderr=True, highlight=False)
         tracker = load(self.weights)
@@ -98,20 +103,34 @@ class EvalMonitor:
                 f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
                 f"{self.alpha_frames}"
             )
+        streams = recorded.records
         known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
-        both = {r.object_id for r in known} & {r.object_id for r in recorded.records}
+        if tracker.calibration.about.endswith(OF_TAKES):
+            streams, known = by_take(streams), by_take(known)
+            console.print("calibrated on takes of the same objects: every take counts as an object")
+        both = {r.object_id for r in known} & {r.object_id for r in streams}
         if both:
-            raise ConfigError(f"objects {', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
-        detectors = (
-            our_monitor(tracker.calibration),
-            *rivals(known, block_frames=block_frames),
-        )
-        rows = drift_rows(detectors, recorded.records, budgets=budgets, resamples=self.resamples, seed=self.seed)
+            raise ConfigError(f"{', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
+        detectors = self._detectors(tracker.calibration, known)
+        rows = drift_rows(detectors, streams, budgets=budgets, resamples=self.resamples, seed=self.seed)
         Console(width=TABLE_WIDTH).print(drift_table(rows))
         if self.out is not None:
             write_drift(rows, self._run(tracker, takes, start_s), tracker.calibration.about, self.out)
             console.print(f"wrote {self.out}")
         return 0
+
+    def _detectors(self, calibration: Calibration, known: Sequence[StreamRecord]) -> tuple[Detector, ...]:
+        """The monitor and the rules that it is compared with, on the streams that it was calibrated on."""
+        from quest.errors import InputError
+        from quest.evaluation.detectors import our_monitor, rivals
+
+        others, expected = rivals(known, block_frames=calibration.block_frames), len(calibration.maxima)
+        if len(others[0].maxima) != expected:
+            raise InputError(
+                f"calibration {self.calibration}: expected the streams that the weights were calibrated on, {expected} "
+                f"of which give thresholds, got {len(others[0].maxima)}; keep others in another folder"
+            )
+        return our_monitor(calibration), *others
 
     def _run(self, tracker: Tracker, takes: list[tuple[TakeStore, dict[str, SplitPart]]], start_s: float) -> Run:
         from quest.data.provenance import code_commit, combined_hash, machine, package_versions

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -27,6 +29,12 @@ from quest.extras import explain_missing
 EXIT_ERROR = 2
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
+
+_PLACES = (
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT),
+    *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR),
+)
+"""What is wrong with a place for files, and not with the program."""
 
 COMMANDS: dict[str, type[Command]] = {
     "generate": Generate,
@@ -83,12 +91,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit code: the command's own, 2 for an error that the user can mend, 130 when interrupted, 141 when nobody
         reads the output any more.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")  # names may have letters that the terminal has not
     try:
-        return _run(sys.argv[1:] if arguments is None else arguments)
+        code = _run(sys.argv[1:] if arguments is None else arguments)
+        print(end="", flush=True)
+        return code
     except BrokenPipeError:
         # As in `quest --help | head -1`. Nothing can be flushed at exit either.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_BROKEN_PIPE
+    except SystemExit as stop:
+        if isinstance(stop.__context__, BrokenPipeError):  # rich has silenced standard output already
+            return EXIT_BROKEN_PIPE
+        raise
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -107,6 +123,11 @@ def _run(arguments: Sequence[str]) -> int:
         if explained is None:
             raise
         return _fail(explained)
+    except OSError as error:
+        if error.errno not in _PLACES:
+            raise
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return _fail(QuestError(f"{place}cannot be written or read ({error.strerror}); name another place"))
     except KeyboardInterrupt:
         Console(stderr=True).print("interrupted", style="yellow")
         return EXIT_INTERRUPTED

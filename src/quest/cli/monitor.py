@@ -50,7 +50,6 @@ class Monitor(Source):
             ConfigError: alpha is no probability, or there are no frames.
             InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
         """
-        from quest.data.frame_source import source_of_clip
         from quest.errors import ConfigError, InputError
         from quest.track.state_lines import StateLines
         from quest.viz.live import LiveView, query_words
@@ -61,14 +60,12 @@ class Monitor(Source):
             raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
         console = self._console()
         source = self.open()
-        if source.length is None:
-            source = source_of_clip(source.clip())
         length = source.length
-        assert length is not None, "a clip in memory has a length"
         queries = self.queries(source)
         tracker = self.tracker()
         stream = tracker.stream(source.camera, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
-        console.print(f"watching {escape(source.name)}: {length} frames, {escape(self.weights)} on {tracker.device}")
+        frames = "" if length is None else f"{length} frames, "
+        console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
         if stream.budget is None:
             console.print(
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "

@@ -32,6 +32,7 @@ class ObjectsList:
         from rich.console import Console
         from rich.table import Table
 
+        from quest.cli.takes import wide_console
         from quest.viz.object_sheet import entity_words, size_words
 
         table = Table(box=None)
@@ -48,7 +49,7 @@ class ObjectsList:
             joints = str(len(thing.articulation.joints))
             table.add_row(thing.object_id, thing.category, joints, size_words(thing), entity_words(thing))
             warnings += [f"{thing.object_id}: {warning}" for warning in thing.warnings]
-        Console(highlight=False).print(table)
+        wide_console().print(table)
         print("size: width x depth x height, closed")
         for warning in warnings:
             Console(highlight=False, markup=False).print(warning, style="yellow", soft_wrap=True)
@@ -66,7 +67,7 @@ class ObjectsShow:
     (procedural:chest-12), a category (procedural:chest), or a mix (procedural:usual, procedural:broad)."""
 
     out: Path = Path("objects.png")
-    """Picture to write (PNG, JPEG)."""
+    """Picture to write (PNG, JPEG, WebP)."""
 
     objects_root: Path | None = None
     """Folder of object folders; QUEST_OBJECTS by default."""
@@ -90,6 +91,7 @@ class ObjectsShow:
         """Write the picture and say where it is."""
         from PIL import Image
 
+        from quest.cli.takes import check_picture
         from quest.sim.plan import ObjectShelf
         from quest.sim.portrait import portray
         from quest.sim.renderer import Renderer
@@ -101,6 +103,7 @@ class ObjectsShow:
             raise ConfigError(
                 f"objects show: expected --count >= 1 and --columns >= 0, got {self.count} and {self.columns}"
             )
+        check_picture("objects show", self.out)
         with ObjectShelf(self.objects_root) as shelf:
             things = [thing for name in self.objects for thing in self._named(name, shelf)]
             renderer = Renderer()

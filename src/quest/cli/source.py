@@ -56,17 +56,20 @@ class Source:
             MissingExtraError: bags need the extra ``ros``.
         """
         from quest.data.frame_source import source_of_clip
-        from quest.data.recording import open_recording
+        from quest.data.recording import open_recording, refuse_parts
         from quest.data.sample import sample_folder
         from quest.data.store import open_clip
         from quest.errors import RecordingError
 
-        if self.clip.rstrip("/").endswith(".zarr"):
+        if self.clip.rstrip("/\\").endswith(".zarr"):
             if (self.depth, self.camera, self.depth_scale_m) != (None, None, None):
                 raise RecordingError(
                     f"take {self.clip}: it has depth and a camera of its own; leave those options away"
                 )
+            refuse_parts(f"take {self.clip}", self.parts, allowed=())
             return source_of_clip(open_clip(self.clip, view=self.view))
+        if self.view != 0:
+            raise RecordingError(f"recording {self.clip}: --view is for takes (STORE/NAME.zarr); leave it out")
         path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
         return open_recording(
             path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m, parts=self.parts

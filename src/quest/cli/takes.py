@@ -1,13 +1,30 @@
-"""What commands that read takes share: a store or one of its takes, by folder or URL."""
+"""What commands that look at takes and objects share: a store or one of its takes, tables, pictures."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from quest.data.store import TakeStore
+
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+
+
+def check_picture(what: str, out: Path) -> None:
+    """Raise ConfigError, before anything is read or drawn, unless a file is named like a picture.
+
+    Args:
+        what: the command, for the message.
+        out: the file.
+    """
+    from quest.errors import ConfigError
+
+    if out.suffix.lower() not in PICTURES:
+        raise ConfigError(f"{what}: --out {out}: expected a picture, {', '.join(PICTURES)}")
 
 
 def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:
@@ -32,8 +49,11 @@ def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:
 
 
 def wide_console() -> Console:
-    """For tables: as wide as the terminal; where there is none, wide enough that lines are not broken."""
+    """For tables: as wide as the terminal; where there is none, wide enough that lines are not broken.
+
+    What stands in brackets is shown as it is: it may be in the name of a take or an object.
+    """
     from rich.console import Console
 
-    console = Console(highlight=False)
-    return console if console.is_terminal else Console(highlight=False, width=180)
+    console = Console(highlight=False, markup=False)
+    return console if console.is_terminal else Console(highlight=False, markup=False, width=180)

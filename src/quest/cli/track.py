@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -39,8 +40,11 @@ class Track(Source):
         out = self.out or Path("outputs") / self._name(clip)
         try:
             out.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=out).close()  # told before the work
         except OSError as error:
-            raise InputError(f"--out {out}: cannot be made a folder ({error.strerror}); name another") from error
+            raise InputError(
+                f"--out {out}: cannot be made a folder, or not be written to ({error.strerror}); name another"
+            ) from error
         with console.status(f"tracking {len(clip)} frames on {tracker.device}"):
             tracks = tracker.track(clip, queries)
         write_tracks(tracks, out / "tracks.parquet")
@@ -58,7 +62,7 @@ class Track(Source):
         """What to call the folder of a clip: views of a take, and episodes of a dataset, have folders of their own."""
         take = self.clip.rstrip("/\\")
         name = f"{Path(take).stem}-view{self.view}" if take.endswith(".zarr") else clip.name
-        return re.sub(r'[/\\:*?"<>|\x00-\x1f]', "-", name).strip(". ") or "clip"
+        return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
 
 
 def _summary(clip: Clip, tracks: Tracks) -> Table:

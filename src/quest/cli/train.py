@@ -84,7 +84,7 @@ class Train:
     windows: WindowConfig = field(default_factory=WindowConfig)
     """How windows are drawn."""
     losses: LossChanges = field(default_factory=LossChanges)
-    """Which losses count more or less than in the preset."""
+    """Which losses of stage 1 count more or less than in the preset."""
 
     def run(self) -> int:
         """Prepare, train, write the file."""
@@ -113,7 +113,7 @@ class Train:
                 fabric=fabric,
             )
         if first:
-            file = self._write(best, start, dataset.training_takes)
+            file = self._write(best, start, dataset)
             console.print(f"weights: {escape(str(file))}")
         return 0
 
@@ -128,7 +128,11 @@ class Train:
         from quest.train.flow import with_flow_head, without_flow_head
         from quest.train.mapping import with_own_map
 
+        if self.stage != 1 and self.losses != LossChanges():
+            raise ConfigError(f"train: stage {self.stage} has a loss of its own; leave --losses.* away")
         if self.weights is not None:
+            if self.encoder is not None:
+                raise ConfigError("train: trained weights have an encoder of their own; leave --encoder away")
             if self.network != NetworkChanges():
                 raise ConfigError("train: trained weights have a network of their own; leave --network.* away")
             loaded = load_network(self.weights)
@@ -172,17 +176,19 @@ class Train:
             return StageOne(network, self.losses.apply(network.config.preset))
         return StageMap(network) if self.stage == "map" else StageTwo(network)
 
-    def _write(self, best: Path, start: _Start, takes: int) -> Path:
+    def _write(self, best: Path, start: _Start, dataset: Dataset) -> Path:
         """The best checkpoint as a file that the tracker loads."""
         from quest.model.weights import save_network
         from quest.train.checkpoint import load_checkpoint
+        from quest.train.dataset import licence_after
 
         network = start.network.cpu()
         load_checkpoint(best, network, None)
         file = self.out / "weights.safetensors"
         how = f"--stage {self.stage}" if self.stage != 1 else f"--preset {network.config.preset}"
-        about = f"{start.about}quest train {how}, {takes} training takes"
-        save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=start.licence)
+        about = f"{start.about}quest train {how}, {dataset.training_takes} training takes"
+        licence = licence_after(start.licence, dataset.training_sources)
+        save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=licence)
         return file
 
 

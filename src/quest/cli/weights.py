@@ -220,13 +220,16 @@ class CalibrateWeights:
     def run(self) -> int:
         """Record, fit, rewrite the file."""
         from quest.data.store import TakeStore
+        from quest.errors import ConfigError
         from quest.evaluation.calibrate import fit_calibration
         from quest.evaluation.selection import Shard
-        from quest.evaluation.stream_record import record_streams
+        from quest.evaluation.stream_record import OF_TAKES, by_take, record_streams
         from quest.model.weights import load_network
         from quest.track import load
 
         _must_be_a_file(self.weights)
+        if self.block_frames is not None and self.block_frames < 1:
+            raise ConfigError(f"calibrate: expected block_frames of at least 1, got {self.block_frames}")
         console = Console(highlight=False)
         stores = [TakeStore(path) for path in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
@@ -240,13 +243,11 @@ class CalibrateWeights:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is fitted yet")
             return 0
-        records = recorded.records
-        if self.unit == "take":
-            records = [replace(record, object_id=record.take) for record in records]
+        records = by_take(recorded.records) if self.unit == "take" else recorded.records
         fitted = fit_calibration(records, block_frames=self.block_frames)
         about = fitted.calibration.about
         if self.unit == "take":
-            about = about.replace(" objects", " takes") + "; all of the same objects"
+            about = about.replace(" objects", " takes") + OF_TAKES
         console.print(f"{about}; alpha of at least {fitted.calibration.least_alpha:.3g} can be promised")
         console.print(
             f"cross-validated: AUROC {fitted.auroc:.4f}, ECE {fitted.ece:.4f}, mean delay {fitted.delay:.1f} frames; "

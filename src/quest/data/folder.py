@@ -129,7 +129,7 @@ def read_scale(source: Path, depth_scale_m: float | int | None) -> float | None:
 def _find_colours(source: Path) -> _Colours:
     videos = [source] if source.is_file() else []
     if not videos and not (source / "rgb").is_dir():
-        videos = sorted(path for path in source.iterdir() if path.suffix.lower() in SUFFIXES)
+        videos = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
         if len(videos) > 1:
             found = ", ".join(video.name for video in videos)
             raise RecordingError(f"recording {source}: expected one video, got {found}; name the video itself")

@@ -33,6 +33,8 @@ from quest.types import Camera, Frame
 VERSION = "v3.0"
 CAMERA_KEY = "quest.camera"
 """Where in a feature's ``info`` this project keeps intrinsics; other readers pass over it."""
+CAMERA_COLUMN = "quest/camera"
+"""Before the name of a view: column of ``meta/episodes`` with the intrinsics of each episode, which come first."""
 POSE, STAMP = "observation.cam_from_world", "observation.stamp_s"
 DEPTH_CODES = 4095
 """Depth videos have twelve bits."""
@@ -227,7 +229,9 @@ def _is_depth(feature: dict[str, Any]) -> bool:
 def _setup(episode: _Episode, key: str, camera: Path | Camera | None) -> CameraFile:
     if camera is not None:
         return read_setup(episode.root, camera, None)
-    kept = (episode.feature(key).get("info") or {}).get(CAMERA_KEY)
+    kept = episode.row.get(f"{CAMERA_COLUMN}/{key.rpartition('.')[2]}")
+    if kept is None:
+        kept = (episode.feature(key).get("info") or {}).get(CAMERA_KEY)
     if kept is None:
         raise RecordingError(
             f"dataset {episode.root}: LeRobot keeps no intrinsics; give those of {key} with --camera FILE "

@@ -2,7 +2,8 @@
 
 Each episode has its own data file and one video per view, which the format allows. Every episode of a dataset has the
 same features, so joints and entities have numbered places: an episode with fewer leaves the last ones empty, and which
-is which stands in the columns ``quest/joints`` and ``quest/entities`` of ``meta/episodes``.
+is which stands in the columns ``quest/joints`` and ``quest/entities`` of ``meta/episodes``, intrinsics of each view in
+``quest/camera/VIEW``.
 
 Reference: lerobot 0.6.2, ``lerobot/datasets`` (``utils.py``, ``dataset_metadata.py``, ``compute_stats.py``).
 """
@@ -21,8 +22,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from quest.data.frame_source import clean_depth
-from quest.data.lerobot import POSE, STAMP, VERSION, DepthRange
-from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, depth_key, image_key
+from quest.data.lerobot import CAMERA_COLUMN, CAMERA_KEY, POSE, STAMP, VERSION, DepthRange
+from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, camera_words, depth_key, image_key
 from quest.data.lerobot_stats import feature_stats, image_stats, merge_stats
 from quest.data.video import write_depth_video, write_video
 from quest.errors import InputError
@@ -99,6 +100,7 @@ class _Writer:
         self._tasks: dict[str, int] = {}
         self._frames = 0
         self._stats: dict[str, dict[str, np.ndarray]] = {}
+        self._own_cameras: set[str] = set()
 
     def add(self, episode: Episode) -> None:
         index, layout = len(self.rows), self._layout
@@ -116,6 +118,9 @@ class _Writer:
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + frames}
         for view, clip in episode.views.items():
             self._write_videos(clip, view, place)
+            camera = row[f"{CAMERA_COLUMN}/{view}"] = camera_words(clip.camera)
+            if camera != layout.cameras[view]:
+                self._own_cameras.add(view)
             stats[image_key(view)] = image_stats(clip.rgb, 255.0)
             if clip.depth_m is not None:
                 stats[depth_key(view)] = image_stats(clip.depth_m, 1.0)
@@ -135,10 +140,13 @@ class _Writer:
         episodes.parent.mkdir(parents=True)
         pq.write_table(pa.Table.from_pylist(self.rows), episodes)
         _write_tasks(self._tasks, meta / "tasks.parquet")
+        features = self._layout.features()
+        for view in self._own_cameras:  # what is said of all episodes must hold for all
+            del features[image_key(view)]["info"][CAMERA_KEY]
         info = {
             "codebase_version": VERSION,
             "fps": self._layout.fps,
-            "features": self._layout.features(),
+            "features": features,
             "total_episodes": len(self.rows),
             "total_frames": self._frames,
             "total_tasks": len(self._tasks),

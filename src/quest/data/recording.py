@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import shutil
 import uuid
+from collections.abc import Collection
+from dataclasses import fields
 from pathlib import Path
 from typing import Literal
 
@@ -35,6 +37,8 @@ __all__ = [
 ]
 
 _BAG_SUFFIXES = (".bag", ".db3")
+_OF_DATASETS = ("episode", "camera_key")
+_OF_BAGS = tuple(field.name for field in fields(Parts) if field.name not in _OF_DATASETS)
 
 
 def open_recording(
@@ -72,6 +76,7 @@ def open_recording(
         from quest.data.lerobot import open_lerobot
 
         _refuse_folder(source, depth, "a LeRobot dataset has its depth in a feature of its own")
+        refuse_parts(f"dataset {source}", parts, allowed=_OF_DATASETS)
         return open_lerobot(
             source,
             episode=parts.episode,
@@ -81,7 +86,9 @@ def open_recording(
         )
     if is_bag(source):
         _refuse_folder(source, depth, "a bag has its depth in a topic, which --topic-depth names")
+        refuse_parts(f"bag {source}", parts, allowed=_OF_BAGS)
         return _open_bag(source, _as_path(camera), scale_m, parts)
+    refuse_parts(f"recording {source}", parts, allowed=())
     return open_folder(
         source, depth=None if depth is None else Path(depth), camera=_as_path(camera), depth_scale_m=scale_m
     )
@@ -104,6 +111,23 @@ def is_bag(path: Path) -> bool:
     if path.is_dir():
         return (path / "metadata.yaml").is_file()
     return path.suffix.lower() in (".mcap", *_BAG_SUFFIXES)
+
+
+def refuse_parts(what: str, parts: Parts, *, allowed: Collection[str]) -> None:
+    """Raise RecordingError if a part is named that recordings of that kind do not have.
+
+    Args:
+        what: the recording, for the message.
+        parts: what was asked for.
+        allowed: fields of :class:`Parts` that mean something there.
+    """
+    usual = Parts()
+    for field in fields(Parts):
+        value = getattr(parts, field.name)
+        if field.name not in allowed and value != getattr(usual, field.name):
+            kind = "LeRobot datasets" if field.name in _OF_DATASETS else "bags"
+            option = "--" + field.name.replace("_", "-")
+            raise RecordingError(f"{what}: {option} {value} is for {kind}, and this is none; leave {option} out")
 
 
 def _refuse_folder(source: Path, depth: str | Path | None, why: str) -> None:

@@ -81,7 +81,8 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
     try:
-        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), partial, compression="zstd")
+        with partial.open("wb") as file:  # not by its path, which may be no UTF-8
+            pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
         os.replace(partial, target)
     finally:
         partial.unlink(missing_ok=True)
@@ -94,7 +95,8 @@ def read_tracks(path: str | Path) -> Tracks:
         InputError: the file is missing, torn, not a table of tracks, or of another format version.
     """
     try:
-        table = pq.read_table(Path(path))
+        with Path(path).open("rb") as file:
+            table = pq.read_table(file)
     except FileNotFoundError:
         raise InputError(f"tracks {path}: no such file; check the path, or run quest track") from None
     except (pa.ArrowException, OSError) as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -245,7 +246,7 @@ class _Codec:
 
 def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec: _Codec) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial{path.suffix}")
+    partial = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:8]}{path.suffix}")
     written, size = 0, None
     try:
         with av.open(str(partial.resolve()), "w") as container:

@@ -54,11 +54,11 @@ class LiveView:
     Args:
         console: where to show it.
         name: what is being watched.
-        frames: how many frames there will be.
+        frames: how many frames there will be; None where only the end tells.
         budget: of false alarms; None where nothing raises any.
     """
 
-    def __init__(self, console: Console, *, name: str, frames: int, budget: Budget | None) -> None:
+    def __init__(self, console: Console, *, name: str, frames: int | None, budget: Budget | None) -> None:
         self._console = console
         self._name = name
         self._frames = frames
@@ -138,7 +138,8 @@ class LiveView:
         seconds = max(self._ends_s[-1] - self._begun_s, 1e-6)
         frames = self._frame + 1
         text = Text(
-            f"{self._name}: {frames} of {_frames(self._frames)} in {seconds:.1f} s ({frames / seconds:.1f} per s)"
+            f"{self._name}: {_frames(frames) if self._frames is None else f'{frames} of {_frames(self._frames)}'} "
+            f"in {seconds:.1f} s ({frames / seconds:.1f} per s)"
         )
         if self._budget is None:
             text.append("; no alarms, because the weights carry no calibration", style="yellow")
@@ -151,7 +152,8 @@ class LiveView:
 
     def _head(self) -> Text:
         text = Text(self._name, style="bold")
-        text.append(f"   frame {max(self._frame, 0)} (0 to {self._frames - 1})", style="not bold")
+        of = "" if self._frames is None else f" (0 to {self._frames - 1})"
+        text.append(f"   frame {max(self._frame, 0)}{of}", style="not bold")
         if self._state is not None:
             text.append(f"   {self._state.stamp_s:.2f} s", style="not bold")
         took_s = self._ends_s[-1] - self._ends_s[0]

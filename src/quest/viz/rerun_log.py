@@ -30,12 +30,13 @@ TRAIL_S = 1.0
 _JPEG_QUALITY = 90
 
 
-def save_rrd(take: Take, path: str | Path) -> None:
+def save_rrd(take: Take, path: str | Path, *, every: int = 1) -> None:
     """Write a take as a Rerun recording, all or nothing.
 
     Args:
         take: the take.
         path: file to write, ``.rrd`` by custom; its folder is made.
+        every: of a longer take, these are every n-th frame; for the numbers of frames.
 
     Raises:
         MissingExtraError: the extra ``viz`` is not installed.
@@ -46,7 +47,7 @@ def save_rrd(take: Take, path: str | Path) -> None:
     recording = _new_recording(take)
     try:
         recording.save(partial, default_blueprint=take_blueprint(take))
-        log_take(take, recording)
+        log_take(take, recording, every=every)
         recording.flush()
         recording.disconnect()
         partial.replace(path)
@@ -54,8 +55,12 @@ def save_rrd(take: Take, path: str | Path) -> None:
         partial.unlink(missing_ok=True)
 
 
-def open_viewer(take: Take) -> None:
+def open_viewer(take: Take, *, every: int = 1) -> None:
     """Open Rerun's viewer, or the one that is open, on a take.
+
+    Args:
+        take: the take.
+        every: of a longer take, these are every n-th frame; for the numbers of frames.
 
     Raises:
         ConfigError: there is no screen.
@@ -68,16 +73,17 @@ def open_viewer(take: Take) -> None:
             "FILE and open it elsewhere"
         )
     recording.spawn(default_blueprint=take_blueprint(take))
-    log_take(take, recording)
+    log_take(take, recording, every=every)
     recording.flush()
 
 
-def log_take(take: Take, recording: rr.RecordingStream) -> None:
+def log_take(take: Take, recording: rr.RecordingStream, *, every: int = 1) -> None:
     """Log everything of a take.
 
     Args:
         take: the take.
         recording: where to.
+        every: of a longer take, these are every n-th frame; for the numbers of frames.
 
     Raises:
         MissingExtraError: the extra ``viz`` is not installed.
@@ -87,9 +93,9 @@ def log_take(take: Take, recording: rr.RecordingStream) -> None:
     recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for v, view in enumerate(take.views):
         _log_camera(rerun, recording, take, view, v)
-    _log_joint_curves(rerun, recording, take)
+    _log_joint_curves(rerun, recording, take, every)
     for t in range(len(take)):
-        _set_time(recording, take, t)
+        _set_time(recording, take, t, every)
         _log_world(rerun, recording, take, t, colours)
         for v, view in enumerate(take.views):
             _log_view(rerun, recording, view, v, t, colours)
@@ -123,8 +129,8 @@ def _new_recording(take: Take) -> rr.RecordingStream:
     return recording
 
 
-def _set_time(recording: rr.RecordingStream, take: Take, t: int) -> None:
-    recording.set_time("frame", sequence=t)
+def _set_time(recording: rr.RecordingStream, take: Take, t: int, every: int) -> None:
+    recording.set_time("frame", sequence=t * every)
     recording.set_time("time", duration=float(take.stamp_s[t]))
 
 
@@ -148,9 +154,9 @@ def _log_camera(rerun: ModuleType, recording: rr.RecordingStream, take: Take, vi
     recording.log(f"world/view_{v}/image/links", rerun.AnnotationContext(classes), static=True)
 
 
-def _log_joint_curves(rerun: ModuleType, recording: rr.RecordingStream, take: Take) -> None:
+def _log_joint_curves(rerun: ModuleType, recording: rr.RecordingStream, take: Take, every: int) -> None:
     times = [
-        rerun.TimeColumn("frame", sequence=np.arange(len(take))),
+        rerun.TimeColumn("frame", sequence=np.arange(len(take)) * every),
         rerun.TimeColumn("time", duration=take.stamp_s.astype(np.float64)),
     ]
     for j, joint in enumerate(take.info.joints):
@@ -164,7 +170,7 @@ def _log_joint_curves(rerun: ModuleType, recording: rr.RecordingStream, take: Ta
 
 def _log_world(rerun: ModuleType, recording: rr.RecordingStream, take: Take, t: int, colours: list[RGB]) -> None:
     size_m = take.info.half_diagonal_m
-    begin = max(0, t - round(TRAIL_S * take.info.frames_per_s))
+    begin = int(np.searchsorted(take.stamp_s, take.stamp_s[t] - TRAIL_S - 1e-6))
     for e, entity in enumerate(take.info.entities):
         point = rerun.Points3D(
             take.point_world[t, e][None], colors=colours[e], radii=0.02 * size_m, labels=entity.name, show_labels=False
