@@ -13,6 +13,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -93,7 +95,7 @@ class Joints:
         result["recorded"] = self._recorded() if self.recorded.is_dir() else "the recorded tracks were not available"
         result |= {"tracks": self.tracks, "sigma_m": self.sigma_m, "seed": self.seed, "machine": machine()}
         result |= {"load": os.getloadavg()[0], "commit": code_commit(), "versions": package_versions()}
-        result |= {"command": f"python benchmarks/joints.py --tracks {self.tracks} --seed {self.seed}"}
+        result |= {"command": shlex.join(["python", "benchmarks/joints.py", *sys.argv[1:]])}
         Console().print_json(data=result)
         if self.out is not None:
             self.out.parent.mkdir(parents=True, exist_ok=True)

@@ -21,6 +21,7 @@ import tyro
 import quest
 from quest.cli.main import main
 from quest.model.weights import load_network
+from quest.train.dataset import licence_after
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
@@ -261,9 +262,12 @@ class Release:
                self.work / "streams_validation", "--weights", self._weights, "--out", out)  # fmt: skip
 
     def _ship(self) -> None:
-        licence = "Apache-2.0" + (", research use only for the PartNet-Mobility objects that taught" * self.partnet)
+        made = load_network(self._weights)
+        # What --start was taught by counts too.
+        partnet = self.partnet or "PartNet-Mobility" in made.licence
+        licence = licence_after("Apache-2.0", ["partnet-mobility"] if partnet else [])
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
-        shipped = replace(load_network(self._weights), licence=licence, version=quest.__version__)
+        shipped = replace(made, licence=licence, version=quest.__version__)
         shipped.save(ASSETS / "weights" / self._weights.name)
 
     def _streams(self, part: str, *, first: int, count: int) -> Path:

@@ -173,6 +173,7 @@ TABLES = (
             "when": "moment",
             "objects/answers": "objects/answers",
             "kind right %": "%kind_right",
+            "by objects %": "%kind_right.over_objects",
             "axis error, degrees": "axis_error_deg",
             "p90": "axis_p90_deg",
         },

@@ -55,6 +55,19 @@ def test_clip_frames_agree_with_the_camera(take: Take) -> None:
     np.testing.assert_allclose(frames.to_world(moved), step, atol=1e-5)
 
 
+def test_specks_of_depth_make_no_reference_frame(take: Take) -> None:
+    clip = take.views[0].clip
+    assert clip.depth_m is not None
+    depth_m = clip.depth_m.copy()
+    depth_m[0] = 0
+    specks = dataclasses.replace(clip, depth_m=depth_m.copy())
+    assert specks.depth_m is not None
+    specks.depth_m[0, 20, 20] = 2.0
+    network = make_network()
+    without = ClipFrames(network, dataclasses.replace(clip, depth_m=depth_m), device=CPU)
+    assert ClipFrames(network, specks, device=CPU).scale_m == without.scale_m != 1.0
+
+
 def test_clip_frames_keep_a_window_of_what_was_seen(take: Take) -> None:
     network = make_network()
     frames = ClipFrames(network, take.views[0].clip, device=CPU)

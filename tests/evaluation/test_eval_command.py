@@ -156,6 +156,7 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
         ({"takes": "no-such-folder"}, TakeError, "quest generate"),
         ({"trackers": ()}, ConfigError, "expected a protocol"),
         ({"resamples": 0}, ConfigError, "resamples"),
+        ({"seed": -1}, ConfigError, "seed"),
         ({"out": Path("result.txt")}, ConfigError, "json"),
         ({"protocol": ("semantic",), "trackers": ("lk",)}, ConfigError, "semantic"),
         ({"level": (4,)}, ConfigError, "no take is left"),

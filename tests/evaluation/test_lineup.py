@@ -54,6 +54,15 @@ def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, t
         line_up(["raft"], weights="any", unit_m=unit_m)
 
 
+def test_trackers_of_weights_know_which(monkeypatch: pytest.MonkeyPatch) -> None:
+    tracker = make_tracker(flow=True)
+    tracker.weights_hash = "0123"
+    monkeypatch.setattr(quest, "load", lambda weights: tracker, raising=False)
+    for name in OF_WEIGHTS:
+        (alone,) = line_up([name], weights="runs/mine", unit_m=unit_m)
+        assert getattr(alone, "weights_hash", None) == "0123"  # answers of other weights do not count
+
+
 def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quest, "load", None, raising=False)
     assert [t.name for t in line_up(["lk", "hold-still"], weights="none", unit_m=unit_m)] == ["lk", "hold-still"]

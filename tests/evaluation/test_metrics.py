@@ -108,7 +108,13 @@ def test_nothing_visible_gives_nan_and_no_count() -> None:
 @pytest.mark.parametrize(("frames", "share", "frame"), [(240, 0.5, 120), (240, 1.0, 239), (61, 0.5, 30), (1, 0.5, 0)])
 def test_distance_at_frame(frames: int, share: float, frame: int) -> None:
     gap = np.tile(np.arange(frames, dtype=float), (2, 1))
-    assert m.distance_at(gap, share).mean() == frame
+    assert m.distance_at(gap, share, np.ones(gap.shape, dtype=bool)).mean() == frame
+
+
+def test_distance_at_a_frame_before_the_query_does_not_count() -> None:
+    gap = np.array([[0.2] * 9, [1.0] * 6 + [0.4] * 3])
+    half = m.distance_at(gap, 0.5, np.arange(9) >= np.array([[0], [6]]))
+    assert (half.mean(), half.count.tolist()) == (0.2, [1, 0])
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def folder(tmp_path: Path, stores: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     return tmp_path
 
 
-def calibrated(folder: Path, **changes: str) -> int:
+def calibrated(folder: Path, **changes: str | int) -> int:
     command = CalibrateWeights(folder / "w.safetensors", (str(folder / "validation"),), folder / "records")
     return replace(command, **changes).run()  # type: ignore[arg-type]
 
@@ -120,6 +120,35 @@ def test_objects_of_the_calibration_are_not_judged(folder: Path):
         judged(folder, calibration=folder / "elsewhere")
     with pytest.raises(ConfigError, match="alpha"):
         judged(folder, alpha=(0.0,))
+    with pytest.raises(ConfigError, match="seed"):
+        judged(folder, seed=-1)
+    with pytest.raises(ConfigError, match="block_frames"):
+        calibrated(folder, block_frames=0)
+
+
+def test_a_monitor_of_takes_is_judged_by_other_takes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+):
+    def one_object(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
+        return replace(made_up(tracker, take, view, part=part), object_id="chest")
+
+    monkeypatch.setattr(stream_record, "record_stream", one_object)
+    assert calibrated(folder, unit="take") == 0
+    assert judged(folder) == 0
+    assert "every take counts as an object" in capsys.readouterr().err
+    raw = json.loads((folder / "drift.json").read_text())
+    assert [row["objects"] for row in raw["rows"]] == [4] * 4
+    assert raw["calibration"].endswith("of the same objects")
+    with pytest.raises(ConfigError, match="calibrated on them"):
+        judged(folder, takes=(str(folder / "validation"),), split=("validation",))
+
+
+def test_the_rivals_need_the_streams_of_the_calibration(folder: Path):
+    calibrated(folder)
+    for left in sorted((folder / "records").iterdir())[:4]:
+        left.unlink()
+    with pytest.raises(InputError, match="expected the streams that the weights were calibrated on"):
+        judged(folder)
 
 
 def test_a_monitor_outlives_being_saved_again(folder: Path):

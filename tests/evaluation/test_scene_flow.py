@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from quest.errors import ConfigError
 from quest.evaluation.scene_flow import ANSWERS, flow_errors, flow_rows, records_of
 from quest.train.feature_cache import CachedView
 from quest.train.flow import with_flow_head
@@ -46,7 +47,11 @@ def test_lifting_at_the_truth_knows_even_motion(views: list[CachedView]):
 
 def test_nothing_to_ask_for(views: list[CachedView]):
     view = replace(views[0], visible=np.zeros_like(views[0].visible))
-    assert flow_errors(with_flow_head(make_network()).eval(), view, stride=1, device=torch.device("cpu")) is None
+    network = with_flow_head(make_network()).eval()
+    assert flow_errors(network, view, stride=1, device=torch.device("cpu")) is None
+    assert flow_errors(network, views[0], stride=len(views[0]), device=CPU) is None
+    with pytest.raises(ConfigError, match="stride"):
+        flow_errors(network, views[0], stride=0, device=CPU)
 
 
 def test_rows_are_pooled_over_what_is_judged(views: list[CachedView], tmp_path: Path):

@@ -41,6 +41,8 @@ def test_the_map_is_the_mean_and_the_rest_stays(tmp_path: Path):
     bound, free = (replace(part, licence=name) for part, name in ((low, "research only"), (base, "Apache-2.0")))
     joined = merge(replace(free, version="1.0"), maps=[bound, free])
     assert (joined.licence, joined.version) == ("Apache-2.0; research only", "")
+    assert merge(base, maps=[low]).licence == ""
+    assert merge(base, maps=[free]).licence == "not said for a part of it; Apache-2.0"
 
 
 def test_a_flow_head_comes_along_by_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quest.errors import ConfigError
-from quest.train.dataset import Dataset, open_dataset
+from quest.train.dataset import Dataset, licence_after, open_dataset
 from quest.train.settings import WindowConfig
 from tests.tiny import make_network
 from tests.train.prepared import CPU, make_store
@@ -47,6 +47,7 @@ def test_one_store_is_divided_by_the_split(tmp_path: Path):
     assert objects(dataset) == (["panels-3"], ["panels-100003"])
     assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
     assert told == [(1, 2, 4), (2, 2, 8)]
+    assert dataset.training_sources == {"procedural"}
 
 
 def test_sources_are_those_of_takes_that_teach(tmp_path: Path):
@@ -54,6 +55,14 @@ def test_sources_are_those_of_takes_that_teach(tmp_path: Path):
     assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
     with pytest.raises(ConfigError, match="no train takes"):
         opened(tmp_path / "other", (TRAIN, VALIDATION), sources=("partnet-mobility",))
+
+
+def test_the_licence_says_what_taught():
+    bound = "Apache-2.0, research use only for the PartNet-Mobility objects that taught"
+    assert licence_after("Apache-2.0", {"procedural", "own"}) == "Apache-2.0"
+    assert licence_after("Apache-2.0", {"procedural", "partnet-mobility"}) == bound
+    assert licence_after(bound, {"partnet-mobility"}) == bound
+    assert licence_after("", {"partnet-mobility"}) == ""
 
 
 def test_own_objects_need_a_store_to_choose_by(tmp_path: Path):

@@ -67,6 +67,16 @@ def test_nothing_is_made_twice(tmp_path: Path):
     assert times(tmp_path) == before
 
 
+def test_frames_of_another_take_are_no_pictures_of_this_ones_truth(tmp_path: Path):
+    """A thinned take has the name of the whole one: one run reads on while another prepares the other."""
+    cache = cache_in(tmp_path)
+    build(cache, store_with(tmp_path))
+    view = cache.views([NAME])[0]
+    build(cache_in(tmp_path), store_with(tmp_path, frames=8))
+    with pytest.raises(ConfigError, match="its own --cache"):
+        _ = view.features
+
+
 def test_another_take_of_the_same_name_is_made_again(tmp_path: Path):
     build(cache_in(tmp_path), store_with(tmp_path))
     build(cache_in(tmp_path), store_with(tmp_path, frames=5, views=1, name=NAME, seed=3))

@@ -19,7 +19,7 @@ from quest.types import Clip
 class ClipFrames:
     """Prepares and observes the frames of one clip in order, as the tracker does with a stream.
 
-    The reference frame is that of the first frame with depth; of the first frame if there is none.
+    The reference frame is that of the first frame with depth, more than specks; of the first frame if there is none.
 
     Args:
         network: whose input is prepared.
@@ -38,9 +38,8 @@ class ClipFrames:
         self._device = device
         self._window: deque[Observation] = deque(maxlen=network.config.window)
         self._framer = Framer(network, self.letterbox.camera, device=device)
-        first = 0
-        if clip.depth_m is not None:
-            first = int(np.argmax([bool(((d > 0) & np.isfinite(d)).any()) for d in clip.depth_m]))
+        with_depth = range(0 if clip.depth_m is None else len(clip))
+        first = next((t for t in with_depth if self._framer.shows_depth(self._depth(t))), 0)
         self._cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).double()
         self._reference = self._framer.reference(self._depth(first), self._cam_from_world[first])
         self.scale_m = float(self._reference.scale[0])

@@ -57,6 +57,7 @@ class FlowChain:
         if noise < 0:
             raise ConfigError(f"flow-chain: expected a noise of at least 0, got {noise}")
         self.detector = detector
+        self.weights_hash = detector.weights_hash
         self.unit_m = unit_m
         self.noise = noise
         self.seed = seed

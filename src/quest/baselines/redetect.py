@@ -54,6 +54,7 @@ class Detector:
         radius_cells: of peaks closer than this the best stays.
         depth_window_px: odd side of the window whose median depth lifts a pixel.
         autocast: whether the network computes in bfloat16.
+        weights_hash: SHA-256 of the file that the network came from, for result files.
 
     Raises:
         WeightsError: the network has learned queries and no affordance map.
@@ -68,6 +69,7 @@ class Detector:
         radius_cells: float = 1.5,
         depth_window_px: int = 3,
         autocast: bool = False,
+        weights_hash: str | None = None,
     ) -> None:
         if network.config.head != "heatmap":
             raise WeightsError(
@@ -80,6 +82,7 @@ class Detector:
         self.radius_cells = radius_cells
         self.depth_window_px = depth_window_px
         self.autocast = autocast
+        self.weights_hash = weights_hash
 
     def frames(self, clip: Clip) -> ClipFrames:
         """The clip's frames as the network takes them."""
@@ -121,6 +124,7 @@ class Redetect:
 
     def __init__(self, detector: Detector, *, every: int = 4, reach: float = 0.25, name: str = "redetect") -> None:
         self.detector = detector
+        self.weights_hash = detector.weights_hash
         self.every = every
         self.reach = reach
         self.name = name

@@ -206,7 +206,7 @@ def _sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:
         counted = (np.arange(gap.shape[1]) >= r.first_frame)[None]
         parts["ape"].append(frame_mean(gap, counted))
         parts["ape_2d"].append(frame_mean(gap_px / INPUT_PX, counted))
-        parts["d100"].append(distance_at(gap, 1.0))
+        parts["d100"].append(distance_at(gap, 1.0, counted))
         parts["acc"].append(accuracy(r.follows[None].astype(np.int64), np.array([r.entity]), counted))
     return {
         name: Sums(np.concatenate([s.total for s in each]), np.concatenate([s.count for s in each]))

@@ -98,6 +98,7 @@ def detector_of(tracker: Tracker) -> Detector:
         min_logit=odds / config.slot_gain - config.slot_bias,
         radius_cells=config.slot_radius_cells,
         autocast=fast_bfloat16(tracker.device),
+        weights_hash=tracker.weights_hash,
     )
 
 

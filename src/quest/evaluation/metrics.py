@@ -131,10 +131,10 @@ def frame_mean(value: Float[np.ndarray, "N T"], counted: Bool[np.ndarray, "N T"]
     return Sums(np.where(counted, value, 0.0).sum(axis=-1, dtype=np.float64), counted.sum(axis=-1, dtype=np.float64))
 
 
-def distance_at(gap: Float[np.ndarray, "N T"], share: float) -> Sums:
-    """Sums for D@p: the distance at frame round(p (T - 1)), halves rounded up."""
+def distance_at(gap: Float[np.ndarray, "N T"], share: float, counted: Bool[np.ndarray, "N T"]) -> Sums:
+    """Sums for D@p: the distance at frame round(p (T - 1)), halves rounded up, of the records that count it."""
     frame = math.floor(share * (gap.shape[1] - 1) + 0.5)
-    return Sums(gap[:, frame].astype(np.float64), np.ones(len(gap)))
+    return frame_mean(gap[:, frame : frame + 1], counted[:, frame : frame + 1])
 
 
 def accuracy(follows: Int[np.ndarray, "N T"], own: Int[np.ndarray, " N"], counted: Bool[np.ndarray, "N T"]) -> Sums:

@@ -23,6 +23,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from quest.errors import ConfigError
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
 from quest.evaluation.metrics import Sums
 from quest.evaluation.protocols import START_FRAMES
@@ -124,7 +125,7 @@ class ViewFlow:
 def flow_errors(
     network: QuestNetwork, view: CachedView, *, stride: int, device: torch.device, batch: int = 8
 ) -> ViewFlow | None:
-    """Errors of all answers in one view; None where no entity is seen in the first frames.
+    """Errors of all answers in one view; None where no entity is seen in the first frames, or no frame has a next one.
 
     Args:
         network: with a flow head, in evaluation mode, on the device.
@@ -132,10 +133,15 @@ def flow_errors(
         stride: frames between the frames of a window.
         device: where to compute.
         batch: windows at a time.
+
+    Raises:
+        ConfigError: the stride is not at least 1.
     """
+    if stride < 1:
+        raise ConfigError(f"scene flow: expected a stride of at least 1, got {stride}")
     anchor = int(view.visible[:START_FRAMES].sum(axis=1).argmax())
     scored = view.visible[anchor]
-    if not scored.any():
+    if not scored.any() or len(view) <= stride:
         return None
     parts: dict[str, list[np.ndarray]] = defaultdict(list)
     for plan in _plans(view, anchor, window=network.config.window, stride=stride, batch=batch):

@@ -6,7 +6,7 @@ import hashlib
 import json
 import os
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
@@ -28,6 +28,9 @@ LIFTING_PX = 8.0
 
 FORMAT = 2
 """Version of the files."""
+
+OF_TAKES = "; all of the same objects"
+"""How a calibration says that what it promises is about other takes of its objects."""
 
 
 @dataclass(frozen=True)
@@ -160,6 +163,11 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
         moved=take.moved[entities],
         confidence=_confidence(signals),
     )
+
+
+def by_take(records: Sequence[StreamRecord]) -> tuple[StreamRecord, ...]:
+    """The same streams with every take for an object of its own: what they show is about takes of the same objects."""
+    return tuple(replace(record, object_id=record.take) for record in records)
 
 
 def tracker_id(tracker: Tracker) -> str:

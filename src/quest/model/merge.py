@@ -13,6 +13,8 @@ from quest.model.network import QuestNetwork
 from quest.model.weights import LoadedNetwork
 
 _MAP, _FLOW = "affordance", "flow."
+_UNSAID = "not said for a part of it"
+"""What is free in one part does not make the whole free."""
 
 
 def merge(
@@ -20,7 +22,7 @@ def merge(
 ) -> LoadedNetwork:
     """Weights with the affordance map and the flow head of others.
 
-    The licences of all parts are joined, and the version is left open.
+    The licences of all parts are joined, one that is not said among them; the version is left open.
 
     Neither takes part in following what a query is bound to, so settings and the monitor's calibration stay good, but
     for the threshold of discovery (``quest weights tune --discovery-only``). The mean of the maps of one training's
@@ -55,10 +57,9 @@ def merge(
     network.load_state_dict(state)
     parts = [f"map of {', '.join(m.name for m in maps)}"] if maps else []
     parts += [f"flow head of {flow.name}"] if flow is not None else []
-    licences = dict.fromkeys(part.licence for part in (base, *maps, flow) if part is not None and part.licence)
-    return replace(
-        base, network=network.eval(), about="; ".join([base.about, *parts]), licence="; ".join(licences), version=""
-    )
+    licences = dict.fromkeys(part.licence or _UNSAID for part in (base, *maps, flow) if part is not None)
+    licence = "" if list(licences) == [_UNSAID] else "; ".join(licences)
+    return replace(base, network=network.eval(), about="; ".join([base.about, *parts]), licence=licence, version="")
 
 
 def _mean(tensors: list[Tensor]) -> Tensor:

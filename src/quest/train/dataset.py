@@ -17,6 +17,9 @@ from quest.train.feature_cache import FeatureCache
 from quest.train.windows import WindowConfig, WindowSampler
 from quest.types import TakeInfo
 
+PARTNET_TERMS = "research use only for the PartNet-Mobility objects that taught"
+"""What the licence of weights says beside, if such objects taught."""
+
 
 @dataclass(frozen=True)
 class Dataset:
@@ -27,12 +30,14 @@ class Dataset:
         validation: of validation objects.
         training_takes: how many takes teach.
         validation_takes: how many takes choose.
+        training_sources: of the takes that teach.
     """
 
     training: WindowSampler
     validation: WindowSampler
     training_takes: int
     validation_takes: int
+    training_sources: frozenset[str]
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,7 @@ class _Wanted:
     name: str
     part: str
     mirrored: bool
+    source: str
 
     @property
     def entry(self) -> str:
@@ -100,7 +106,7 @@ def open_dataset(
                 teaches = part == "train" == role and (sources is None or info.source in sources)
                 chooses = part == "validation" and not mirrored and (role == "validation" or not validation_stores)
                 if teaches or chooses:
-                    wanted.append(_Wanted(store, name, part, mirrored))
+                    wanted.append(_Wanted(store, name, part, mirrored, info.source))
     takes = {part: [w.entry for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
         if not found:
@@ -122,7 +128,20 @@ def open_dataset(
         part: WindowSampler(features.views(found), network.config, windows, anchors_only=anchors_only)
         for part, found in takes.items()
     }
-    return Dataset(samplers["train"], samplers["validation"], len(takes["train"]), len(takes["validation"]))
+    return Dataset(
+        samplers["train"],
+        samplers["validation"],
+        len(takes["train"]),
+        len(takes["validation"]),
+        frozenset(w.source for w in wanted if w.part == "train"),
+    )
+
+
+def licence_after(licence: str, sources: Collection[str]) -> str:
+    """The licence of weights after objects of these sources taught; one that is not said stays so."""
+    if not licence or "PartNet-Mobility" in licence or "partnet-mobility" not in sources:
+        return licence
+    return f"{licence}, {PARTNET_TERMS}"
 
 
 def load_initial_encoder(network: QuestNetwork, path: Path) -> None:

@@ -56,6 +56,9 @@ class CachedView:
         label: index into LABELS.
         revolute: whether the entity's joint turns.
         axis_world: origin and direction of the joint's axis at rest; zero for what is fixed in the base.
+
+    Raises:
+        ConfigError: another run has put another number of frames in its place.
     """
 
     folder: Path
@@ -109,7 +112,13 @@ class CachedView:
         return self._map("cell_depth_m")
 
     def _map(self, name: str) -> np.ndarray:
-        return np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+        array = np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
+        if len(array) != len(self):
+            raise ConfigError(
+                f"{self.folder}: expected {len(self)} frames, got {len(array)}; another run has prepared another take "
+                "of this name here meanwhile, give each its own --cache"
+            )
+        return array
 
 
 _MAPPED = ("features", "rgb", "depth", "cell_depth_m")

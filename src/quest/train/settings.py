@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
@@ -58,6 +59,12 @@ class TrainingConfig:
         for name in counts:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: expected {name} to be at least 1, got {getattr(self, name)}")
+        for name in ("learning_rate", "clip_norm"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(f"training: expected {name} above 0, got {getattr(self, name)}")
+        for name in ("weight_decay", "warmup_steps", "seed"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"training: expected {name} to be at least 0, got {getattr(self, name)}")
         if not 0 <= self.average_decay < 1:
             raise ConfigError(f"training: expected average_decay from 0 to below 1, got {self.average_decay}")
         if self.devices != "auto" and self.devices < 1:
@@ -90,6 +97,16 @@ class WindowConfig:
     query_drop_share: float = 0.2
     colour_jitter: float = 0.2
 
+    def __post_init__(self) -> None:
+        if self.batch < 1:
+            raise ConfigError(f"windows: expected batch to be at least 1, got {self.batch}")
+        for name in ("max_stride", "point_jitter_px", "colour_jitter"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ConfigError(f"windows: expected {name} to be at least 0, got {getattr(self, name)}")
+        for name in ("first_frame_share", "label_share", "depth_drop_share", "query_drop_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigError(f"windows: expected {name} from 0 to 1, got {getattr(self, name)}")
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -120,6 +137,11 @@ class LossWeights:
     geo: float = 0.2
     map: float = 1.0
     joint: float = 0.1
+
+    def __post_init__(self) -> None:
+        for name, value in asdict(self).items():
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"losses: expected {name} to be at least 0, got {value}; 0 turns it off")
 
 
 LOSSES: dict[str, LossWeights] = {
