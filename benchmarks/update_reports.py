@@ -120,8 +120,9 @@ TABLES = (
         },
     ),
     _alarms("test", "Alarms per stream, at equal false alarms"),
+    _alarms("blocks", "The same streams, alpha for every 60 frames"),
     _alarms("long", "Streams of 240 frames, alpha for the whole stream"),
-    _alarms("long_blocks", "The same streams, alpha for every 60 frames"),
+    _alarms("long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
     Table(
         "grounding/standard_grounding.json",
         "Grounding on against off, ordinary takes",
