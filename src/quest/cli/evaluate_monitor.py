@@ -85,6 +85,12 @@ class EvalMonitor:
         tracker = load(self.weights)
         if tracker.calibration is None:
             raise ConfigError(f"weights {self.weights}: they have no monitor; run `quest weights calibrate` first")
+        block_frames = tracker.calibration.block_frames
+        if self.alpha_frames is not None and self.alpha_frames % block_frames:
+            raise ConfigError(
+                f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
+                f"{self.alpha_frames}"
+            )
         stores = [TakeStore(path) for path in self.takes]
         takes = [(s, select_takes(s.infos(), split=self.split, levels=self.level)) for s in stores]
         recorded = record_streams(
@@ -97,12 +103,6 @@ class EvalMonitor:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is judged yet")
             return 0
-        block_frames = tracker.calibration.block_frames
-        if self.alpha_frames is not None and self.alpha_frames % block_frames:
-            raise ConfigError(
-                f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
-                f"{self.alpha_frames}"
-            )
         streams = recorded.records
         known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
         if tracker.calibration.about.endswith(OF_TAKES):
