@@ -230,7 +230,7 @@ def test_patience(run: Run, tmp_path: Path, monkeypatch, scores: list[float], be
 
 def test_a_loss_that_explodes_is_an_error(run: Run):
     with pytest.raises(ConfigError, match="learning rate"):
-        run(weights=replace(LossWeights(), aff=float("inf")))
+        run(weights=replace(LossWeights(), aff=1e300))
 
 
 def test_schedule():
