@@ -165,6 +165,20 @@ TABLES = (
         },
     ),
     Table(
+        "joints/joints.json",
+        "Joints from true tracks with noise (2 mm unless said), after 30 degrees or 10 cm",
+        "simulated",
+        {"how": "key", "tracks": "all.kind_right.n", "kind right %": "%all.kind_right"}
+        | {f"axis error {kind}, degrees": f"{kind}.axis_error_deg.median" for kind in ("prismatic", "revolute")}
+        | {f"best possible, {kind}": f"best_possible_axis_error_deg.{kind}" for kind in ("prismatic", "revolute")},
+    ),
+    Table(
+        "joints/joints.json",
+        "Joints from real tracks that move that far",
+        "recorded",
+        {"how": "key", "tracks": "kind_right.n", "kind right %": "%kind_right"},
+    ),
+    Table(
         "grounding/predicted_joints.json",
         "Joints from predicted tracks",
         "rows",
