@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -65,29 +64,6 @@ def test_round_trip(dataset: Path, takes: list[Take], episode: int, view: int):
     np.testing.assert_array_equal(found.depth_m > 0, clip.depth_m > 0)
     np.testing.assert_allclose(found.depth_m, clip.depth_m, atol=2e-3)
     assert np.abs((found.rgb.astype(int) - clip.rgb) @ [0.299, 0.587, 0.114]).mean() < 4
-
-
-def test_every_episode_has_its_own_intrinsics(takes: list[Take], tmp_path: Path):
-    first, second = (Episode({"front": take.views[0].clip, "side": take.views[1].clip}, "look") for take in takes)
-    clip = second.views["front"]
-    other = replace(clip, camera=replace(clip.camera, fx=1.5 * clip.camera.fx, fy=1.5 * clip.camera.fy))
-    export_lerobot([first, replace(second, views=second.views | {"front": other})], tmp_path / "set")
-    for index, episode in enumerate((first.views["front"], other)):
-        parts = Parts(episode=index, camera_key="front")
-        assert open_recording(tmp_path / "set", parts=parts).camera == episode.camera
-    features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
-    assert "quest.camera" not in features["observation.images.front"]["info"], "it would hold for one episode only"
-    assert "quest.camera" in features["observation.images.side"]["info"]
-
-
-def test_datasets_with_intrinsics_in_the_feature_alone(takes: list[Take], dataset: Path, tmp_path: Path):
-    """As they were written before there was a column for them."""
-    folder = tmp_path / "set"
-    shutil.copytree(dataset, folder)
-    path = next(folder.glob("meta/episodes/*/*.parquet"))
-    table = pq.read_table(path)
-    pq.write_table(table.drop_columns([name for name in table.column_names if name.startswith("quest/camera")]), path)
-    assert open_recording(folder).camera == takes[0].views[0].clip.camera
 
 
 def test_the_first_camera_is_taken_and_said(dataset: Path):
