@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import tyro
@@ -90,7 +90,9 @@ class Ablations:
     """Steps of stage 2, for the flow head that is chained."""
     batch: int = 16
     """Windows per step."""
-    learning_rate: float = 4e-4
+    optimizer: Literal["muon", "adamw"] = "muon"
+    """Of every run (see quest train)."""
+    learning_rate: float = 1e-3
     """Peak of the schedule."""
     split: tuple[SplitPart, ...] = ("test",)
     """Parts of the object split to evaluate on."""
@@ -180,6 +182,7 @@ class Ablations:
         out.mkdir(parents=True, exist_ok=True)
         config = TrainingConfig(
             steps=steps,
+            optimizer=self.optimizer,
             learning_rate=self.learning_rate,
             warmup_steps=max(1, min(100, steps // 10)),
             validate_every=steps,
@@ -210,6 +213,7 @@ class Ablations:
             "steps": self.steps,
             "flow_steps": self.flow_steps if item.flow else 0,
             "batch": self.batch,
+            "optimizer": self.optimizer,
             "learning_rate": self.learning_rate,
             "network": json.loads(item.network.to_json()),
             "losses": asdict(item.losses),
@@ -321,6 +325,7 @@ class Ablations:
             "steps": self.steps,
             "flow_steps": self.flow_steps,
             "batch": self.batch,
+            "optimizer": self.optimizer,
             "learning_rate": self.learning_rate,
             "seeds": list(self.seeds),
             "run_commits": sorted(commits),

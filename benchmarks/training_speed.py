@@ -36,6 +36,7 @@ from quest.track.tracker import pick_device
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
+from quest.train.optimizer import make_optimizer
 from quest.train.settings import LossWeights, TrainingConfig, WindowConfig
 from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler
@@ -130,7 +131,7 @@ class _Bare:
     ) -> None:
         network.encoder.requires_grad_(False)
         self.objective = StageOne(network.train(), LossWeights())
-        self.optimizer = torch.optim.AdamW(network.trainable(), lr=1e-5, weight_decay=config.weight_decay)
+        self.optimizer = make_optimizer(network, network.trainable(), replace(config, learning_rate=1e-5))
         self.autocast = autocast
         self.device = next(network.parameters()).device
         rng = np.random.default_rng(1)

@@ -23,6 +23,7 @@ from quest.train.averaging import RunningMean
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
 from quest.train.devices import deterministic_algorithms, divide, generator_states, launch, restore_generators
+from quest.train.optimizer import make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
 from quest.train.stage import Objective, Scores
@@ -136,7 +137,7 @@ class _Learner:
         chosen = {id(p) for p in self.trained}
         for parameter in objective.network.parameters():
             parameter.requires_grad_(id(parameter) in chosen)
-        self.optimizer = torch.optim.AdamW(self.trained, lr=config.learning_rate, weight_decay=config.weight_decay)
+        self.optimizer = make_optimizer(objective.network, self.trained, config)
         self.mean = RunningMean(self.trained, self.optimizer, config.average_decay)
 
     def resume(self, rng: np.random.Generator, out: Path) -> Progress:

@@ -15,8 +15,10 @@ class TrainingConfig:
 
     Attributes:
         steps: optimiser steps at most.
+        optimizer: ``muon`` for the matrices inside the network and AdamW for all else, or ``adamw`` for everything, as
+            published.
         learning_rate: peak of the schedule (linear warm-up, then cosine to a twentieth).
-        weight_decay: of AdamW.
+        weight_decay: share of the learning rate by which a step shrinks the weights.
         warmup_steps: steps of the warm-up.
         clip_norm: largest norm of the gradient.
         average_decay: share of the running mean of the weights that a step keeps; the mean is what is validated and
@@ -37,7 +39,8 @@ class TrainingConfig:
     """
 
     steps: int = 3000
-    learning_rate: float = 4e-4
+    optimizer: Literal["muon", "adamw"] = "muon"
+    learning_rate: float = 1e-3
     weight_decay: float = 0.01
     warmup_steps: int = 100
     clip_norm: float = 1.0
@@ -65,6 +68,8 @@ class TrainingConfig:
         for name in ("weight_decay", "warmup_steps", "seed"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"training: expected {name} to be at least 0, got {getattr(self, name)}")
+        if self.optimizer not in ("muon", "adamw"):
+            raise ConfigError(f"training: expected optimizer muon or adamw, got {self.optimizer!r}")
         if not 0 <= self.average_decay < 1:
             raise ConfigError(f"training: expected average_decay from 0 to below 1, got {self.average_decay}")
         if self.devices != "auto" and self.devices < 1:
