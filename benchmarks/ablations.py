@@ -92,7 +92,7 @@ class Ablations:
     """Windows per step."""
     optimizer: Literal["muon", "adamw"] = "muon"
     """Of every run (see quest train)."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Peak of the schedule."""
     split: tuple[SplitPart, ...] = ("test",)
     """Parts of the object split to evaluate on."""

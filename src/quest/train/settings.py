@@ -40,7 +40,7 @@ class TrainingConfig:
 
     steps: int = 3000
     optimizer: Literal["muon", "adamw"] = "muon"
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     weight_decay: float = 0.01
     warmup_steps: int = 100
     clip_norm: float = 1.0
