@@ -82,5 +82,5 @@ def test_a_state_that_is_loaded_goes_on() -> None:
 
 
 def test_another_optimizer_is_refused() -> None:
-    with pytest.raises((ConfigError, TypeCheckError), match="sgd|Literal"):
+    with pytest.raises((ConfigError, TypeCheckError), match=r"sgd|Literal"):
         replace(CONFIG, optimizer="sgd")
