@@ -147,7 +147,7 @@ class Release:
     """Procedural test objects on which the monitor's promise is checked."""
     start: str | None = None
     """Trained weights to start from, instead of the encoder alone."""
-    steps: int = 6000
+    steps: int = 2000
     """Optimiser steps."""
     map_steps: int = 1200
     """Optimiser steps of the affordance map."""
