@@ -6,10 +6,10 @@ Reference: Jordan et al., *Muon: an optimizer for hidden layers in neural networ
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from quest.train.settings import TrainingConfig
 
@@ -49,15 +49,9 @@ class _Both(torch.optim.Optimizer):
         super().__init__([*first.param_groups, *second.param_groups], {})
         self._parts = (first, second)
 
-    @torch.no_grad()
-    def step(self, closure: Callable[[], Tensor | float] | None = None) -> Tensor | float | None:  # type: ignore[override]
+    def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step of both."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
         for part, group in zip(self._parts, self.param_groups, strict=True):
             # Anew in every step: loading a state replaces both.
             part.param_groups, part.state = [group], self.state
             part.step()
-        return loss

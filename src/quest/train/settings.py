@@ -18,7 +18,7 @@ class TrainingConfig:
         optimizer: ``muon`` for the matrices inside the network and AdamW for all else, or ``adamw`` for everything, as
             published.
         learning_rate: peak of the schedule (linear warm-up, then cosine to a twentieth).
-        weight_decay: share of the learning rate by which a step shrinks the weights.
+        weight_decay: a step takes this times the learning rate off every weight, as a share of it.
         warmup_steps: steps of the warm-up.
         clip_norm: largest norm of the gradient.
         average_decay: share of the running mean of the weights that a step keeps; the mean is what is validated and
