@@ -1,9 +1,10 @@
-"""Write the figures of the README and of the model card out of the result files of `quest eval`.
+"""Write the figures of the README and of the model cards out of the result files of `quest eval`.
 
-    python benchmarks/update_readme.py            # rewrite README.md
-    python benchmarks/update_readme.py --check    # fail if either would change
+    python benchmarks/update_readme.py            # rewrite README.md and the cards
+    python benchmarks/update_readme.py --check    # fail if one would change
 
-Result files are all `benchmarks/results/*.json`; nothing in the table is typed in.
+Result files are all `benchmarks/results/*.json`, for weights other than the default those of the folder of their name;
+nothing in the tables is typed in.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ import tyro
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.results import Results, read_results
 from quest.evaluation.summary import Row
+from quest.track.tracker import DEFAULT_WEIGHTS
 
 ROOT = Path(__file__).parents[1]
+CARDS = ROOT / "src" / "quest" / "assets" / "weights"
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
 
 COLUMNS = (
@@ -35,24 +38,28 @@ COLUMNS = (
 class UpdateReadme:
     """Rewrite the figures from the result files."""
 
-    pages: tuple[Path, ...] = (ROOT / "README.md", ROOT / "src" / "quest" / "assets" / "weights" / "quest-s16.md")
-    """Files with a pair of markers."""
     results: Path = ROOT / "benchmarks" / "results"
     check: bool = False
     """Change nothing; exit with 1 if the table is out of date."""
 
     def run(self) -> int:
         """Return 0, or 1 if --check finds a page out of date."""
-        table, stale = figures(self.results), 0
-        for page in self.pages:
+        stale = 0
+        for page, folder in pages(self.results).items():
             text = page.read_text(encoding="utf-8")
-            updated = with_figures(text, table)
+            updated = with_figures(text, figures(folder))
             if self.check and updated != text:
                 print(f"{page} is out of date: python benchmarks/update_readme.py", file=sys.stderr)
                 stale = 1
             elif updated != text:
                 page.write_text(updated, encoding="utf-8")
         return stale
+
+
+def pages(results: Path) -> dict[Path, Path]:
+    """Every page with a pair of markers, and the folder of what it shows."""
+    cards = {card: results / card.stem for card in sorted(CARDS.glob("*.md"))}
+    return {ROOT / "README.md": results, **cards, CARDS / f"{DEFAULT_WEIGHTS}.md": results}
 
 
 def with_figures(text: str, table: str) -> str:

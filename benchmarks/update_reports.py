@@ -61,12 +61,18 @@ def _alarms(file: str, title: str) -> Table:
     false = {"loss-free streams": "each.trials", "false alarms": "each.false_alarms"}
     false |= {"95 % from": "%each.low", "to": "%each.high"}
     found = {"missed %": "%each.missed", "delay median": "each.delay_median", "p90": "each.delay_p90"}
-    return Table(f"monitor/{file}.json", title, "rows", OBJECTS | about | false | found, each="alarms")
+    return Table(f"{file}.json", title, "rows", OBJECTS | about | false | found, each="alarms")
 
 
 def _tracking(file: str, title: str) -> Table:
     """What `quest eval` says of moved entities."""
-    about = {"suite": "suite", "level": "level", "tracker": "tracker", "objects/takes/tracks": "objects/takes/tracks"}
+    about = {
+        "protocol": "protocol",
+        "suite": "suite",
+        "level": "level",
+        "tracker": "tracker",
+        "objects/takes/tracks": "objects/takes/tracks",
+    }
     metrics = {"APE": "metrics.ape", "D@100": "metrics.d100", "Acc %": "%metrics.acc", "slope": "metrics.slope"}
     return Table(file, title, "rows", OBJECTS | about | metrics, only={"reading": "moved"})
 
@@ -105,6 +111,7 @@ TABLES = (
     _ablation("losses", "Every loss left out by itself", PARTS),
     _ablation("design", "Heatmap against regression, anchors against learned queries, 3D position codes", PARTS),
     _ablation("data", "Trained on procedural objects only", PARTS),
+    _tracking("quest-s16-free/test.json", "Released weights that learned from procedural objects only"),
     Table(
         "monitor/test.json",
         "Drift per frame: the monitor beside plainer rules",
@@ -119,10 +126,11 @@ TABLES = (
             "ECE": "ece",
         },
     ),
-    _alarms("test", "Alarms per stream, at equal false alarms"),
-    _alarms("blocks", "The same streams, alpha for every 60 frames"),
-    _alarms("long", "Streams of 240 frames, alpha for the whole stream"),
-    _alarms("long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
+    _alarms("monitor/test", "Alarms per stream, at equal false alarms"),
+    _alarms("monitor/blocks", "The same streams, alpha for every 60 frames"),
+    _alarms("monitor/long", "Streams of 240 frames, alpha for the whole stream"),
+    _alarms("monitor/long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
+    _alarms("quest-s16-free/monitor/test", "Alarms per stream, weights that learned from procedural objects only"),
     Table(
         "grounding/standard_grounding.json",
         "Grounding on against off, ordinary takes",

@@ -80,8 +80,11 @@ def benchmark(name: str):
 
 def test_figures_are_those_of_the_result_files():
     module = benchmark("update_readme")
-    text = README.read_text(encoding="utf-8")
-    assert text == module.with_figures(text, module.figures(ROOT / "benchmarks" / "results"))
+    pages = module.pages(ROOT / "benchmarks" / "results")
+    assert README in pages
+    for page, folder in pages.items():
+        text = page.read_text(encoding="utf-8")
+        assert text == module.with_figures(text, module.figures(folder)), page
 
 
 def test_the_page_of_results_is_that_of_the_reports():
