@@ -74,6 +74,17 @@ def test_places_are_exact_where_the_network_computes_in_bfloat16():
         torch.testing.assert_close(frames.from_reference(point), pixel)
 
 
+def test_points_of_the_whole_image_are_those_of_its_pixels():
+    frames = make_frames()
+    turn = torch.linalg.qr(torch.randn(2, 4, 3, 3, generator=torch.Generator().manual_seed(0))).Q
+    frames.ref_from_cam[..., :3, :3] = turn
+    h, w = frames.depth_m.shape[-2:]
+    y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
+    uv = torch.stack((x, y), dim=-1).reshape(1, 1, h * w, 2).expand(*frames.depth_m.shape[:2], -1, -1)
+    expected = frames.to_reference(uv, frames.depth_m.flatten(2)).nan_to_num(0.0)
+    assert torch.allclose(frames.image_points().flatten(3).transpose(2, 3), expected, atol=1e-5)
+
+
 def test_missing_depth_does_not_spoil_the_gradient():
     frames = make_frames(batch=1, frames=1)
     uv = torch.tensor([[[[10.0, 10.0], [20.0, 20.0]]]], requires_grad=True)

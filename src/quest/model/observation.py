@@ -88,6 +88,21 @@ class FrameBatch:
         point = (point - self.center[:, None, None]) / self.scale[:, None, None, None]
         return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
 
+    def image_points(self) -> Float[Tensor, "B T 3 H W"]:
+        """Points of the reference frame under the centres of all pixels; 0 where depth is 0."""
+        h, w = self.depth_m.shape[-2:]
+        fx, fy, cx, cy = self.intrinsics[:, None, None].unbind(-1)
+        x = (torch.arange(w, device=self.depth_m.device) + 0.5 - cx) / fx
+        y = (torch.arange(h, device=self.depth_m.device) + 0.5 - cy) / fy
+        scale = self.scale[:, None, None]
+        right, down, ahead = (self.ref_from_cam[..., :3, :3] / scale[..., None]).unbind(-1)
+        # Rays first, which are sums of a row and a column: every pixel is gone through thrice, in place.
+        column = (down.unsqueeze(-1) * y.unsqueeze(-2) + ahead.unsqueeze(-1)).unsqueeze(-1)
+        point = (right.unsqueeze(-1) * x.unsqueeze(-2)).unsqueeze(-2) + column
+        point *= self.depth_m.unsqueeze(2)
+        point += ((self.ref_from_cam[..., :3, 3] - self.center[:, None]) / scale)[..., None, None]
+        return point.mul_((self.depth_m > 0).unsqueeze(2))
+
     def to_camera(self, point: Float[Tensor, "B T Q 3"]) -> Float[Tensor, "B T Q 3"]:
         """Points of the reference frame in each frame's camera, metres."""
         metric = point * self.scale[:, None, None, None] + self.center[:, None, None]
@@ -273,15 +288,10 @@ class Observer(nn.Module):
         rgb = frames.rgb.permute(0, 1, 4, 2, 3).to(frames.depth_m.dtype) / 127.5 - 1
         if not self.config.points3d:
             return F.pad(rgb, (0, 0, 0, 0, 0, DetailStem.channels - 3))
-        b, t, h, w = frames.depth_m.shape
-        y, x = torch.meshgrid(torch.arange(h) + 0.5, torch.arange(w) + 0.5, indexing="ij")
-        uv = torch.stack((x, y), dim=-1).to(frames.depth_m).reshape(1, 1, h * w, 2).expand(b, t, -1, -1)
-        depth = frames.depth_m.flatten(2)
-        point, valid = frames.to_reference(uv, depth), (depth > 0).unsqueeze(-1)
-        point = torch.where(valid, point, torch.zeros_like(point)).clamp(-4, 4)
-        geometry = torch.cat((point, valid.to(point.dtype)), dim=-1).transpose(2, 3).reshape(b, t, 4, h, w)
-        standing_out = relief(frames.depth_m, frames.scale[:, None].expand(b, t))
-        return torch.cat((rgb, geometry, standing_out), dim=2)
+        depth = frames.depth_m
+        point, valid = frames.image_points().clamp_(-4, 4), (depth > 0).to(depth.dtype).unsqueeze(2)
+        standing_out = relief(depth, frames.scale[:, None].expand(depth.shape[:2]))
+        return torch.cat((rgb, point, valid, standing_out), dim=2)
 
 
 def cell_centres(config: NetworkConfig, *, device: torch.device | None = None) -> Float[Tensor, "C 2"]:

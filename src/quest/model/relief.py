@@ -43,7 +43,7 @@ def relief(depth_m: Float[Tensor, "*B H W"], scale: Float[Tensor, "*B"]) -> Floa
 def _box_sum(value: Float[Tensor, "*B H W"], radius: int) -> Float[Tensor, "*B H W"]:
     """Sums over squares of 2 radius + 1 pixels; outside the image there is nothing."""
     side = 2 * radius + 1
-    for axis in (-1, -2):
-        sums = F.pad(value.transpose(axis, -1), (radius + 1, radius)).cumsum(-1)
-        value = (sums[..., side:] - sums[..., :-side]).transpose(axis, -1)
-    return value
+    rows = F.pad(value, (radius + 1, radius)).cumsum(-1)
+    value = rows[..., side:] - rows[..., :-side]
+    columns = F.pad(value, (0, 0, radius + 1, radius)).cumsum(-2)
+    return columns[..., side:, :] - columns[..., :-side, :]
