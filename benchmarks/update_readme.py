@@ -18,7 +18,7 @@ import tyro
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.results import Results, read_results
 from quest.evaluation.summary import Row
-from quest.track.tracker import DEFAULT_WEIGHTS
+from quest.model.weights import DEFAULTS
 
 ROOT = Path(__file__).parents[1]
 CARDS = ROOT / "src" / "quest" / "assets" / "weights"
@@ -58,8 +58,9 @@ class UpdateReadme:
 
 def pages(results: Path) -> dict[Path, Path]:
     """Every page with a pair of markers, and the folder of what it shows."""
-    cards = {card: results / card.stem for card in sorted(CARDS.glob("*.md"))}
-    return {ROOT / "README.md": results, **cards, CARDS / f"{DEFAULT_WEIGHTS}.md": results}
+    defaults = DEFAULTS.values()
+    cards = {card: results if card.stem in defaults else results / card.stem for card in sorted(CARDS.glob("*.md"))}
+    return {ROOT / "README.md": results, **cards}
 
 
 def with_figures(text: str, table: str) -> str:

@@ -111,7 +111,7 @@ TABLES = (
     _ablation("losses", "Every loss left out by itself", PARTS),
     _ablation("design", "Heatmap against regression, anchors against learned queries, 3D position codes", PARTS),
     _ablation("data", "Trained on procedural objects only", PARTS),
-    _tracking("quest-s16-free/test.json", "Released weights that learned from procedural objects only"),
+    _tracking("quest-s16-apache/test.json", "Released weights that learned from procedural objects only"),
     Table(
         "monitor/test.json",
         "Drift per frame: the monitor beside plainer rules",
@@ -130,7 +130,7 @@ TABLES = (
     _alarms("monitor/blocks", "The same streams, alpha for every 60 frames"),
     _alarms("monitor/long", "Streams of 240 frames, alpha for the whole stream"),
     _alarms("monitor/long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
-    _alarms("quest-s16-free/monitor/test", "Alarms per stream, weights that learned from procedural objects only"),
+    _alarms("quest-s16-apache/monitor/test", "Alarms per stream, weights that learned from procedural objects only"),
     Table(
         "grounding/standard_grounding.json",
         "Grounding on against off, ordinary takes",

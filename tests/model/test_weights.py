@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from quest.errors import WeightsError
 from quest.model.config import NetworkConfig
-from quest.model.weights import FORMAT, load_network, save_network, shipped_weights
+from quest.model.weights import DEFAULTS, FORMAT, load_network, save_network, shipped_weights
 from tests.tiny import DEFAULT, PAPER, make_network
 
 
@@ -95,4 +95,6 @@ def test_tensors_of_another_shape(tmp_path: Path):
 
 
 def test_shipped_names_are_files():
-    assert all(path.is_file() and path.stem == name for name, path in shipped_weights().items())
+    shipped = shipped_weights()
+    assert set(DEFAULTS) < set(shipped)
+    assert all(path.is_file() and path.stem == DEFAULTS.get(name, name) for name, path in shipped.items())

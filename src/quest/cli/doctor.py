@@ -148,6 +148,8 @@ def _weights() -> Iterator[Finding]:
         return  # torch is broken, which is reported already
     shipped = shipped_weights()
     for name, path in shipped.items():
+        if name != path.stem:
+            continue  # another name of one that comes later
         with path.open("rb") as file:
             digest = hashlib.file_digest(file, "sha256").hexdigest()[:12]
         yield Finding("weights", "ok", f"{name}, {path.stat().st_size / 1e6:.1f} MB, sha256 {digest}")

@@ -24,12 +24,18 @@ class ListWeights:
     """List the weights that come with the package."""
 
     def run(self) -> int:
-        """Print name, size and file of each."""
+        """Print name, size, licence and file of each."""
+        from quest.model.shared_parts import read_tensors
         from quest.model.weights import shipped_weights
 
         console = Console(highlight=False)
         for name, path in shipped_weights().items():
-            console.print(f"{name}  {path.stat().st_size / 1e6:.1f} MB  {escape(str(path))}")
+            if name != path.stem:
+                console.print(f"{name}  stands for {path.stem}")
+                continue
+            metadata, _ = read_tensors(path, ())
+            size, licence = f"{path.stat().st_size / 1e6:.1f} MB", metadata.get("licence", "not said")
+            console.print(f"{name}  {size}  {escape(licence)}  {escape(str(path))}", soft_wrap=True)
         return 0
 
 

@@ -24,6 +24,9 @@ from quest.model.shared_parts import fetch_shared, leave_out, read_tensors
 
 FORMAT = "quest-network-2"
 
+DEFAULTS = {"quest-s16": "quest-s16-research"}
+"""Names that leave the licence open, and which of the weights that ship they stand for."""
+
 FOLDER_FILES = (FILE, "weights.safetensors")
 """What a folder is searched for: what ``save_pretrained`` writes, then what ``quest train`` writes."""
 
@@ -212,12 +215,13 @@ def weights_digest(module: nn.Module, *, beside: str = "") -> str:
 
 
 def shipped_weights() -> dict[str, Path]:
-    """Name and file of every network that comes with the package."""
+    """Name and file of every network that comes with the package; :data:`DEFAULTS` come first."""
     folder = resources.files("quest") / "assets" / "weights"
     if not folder.is_dir():
         return {}
     found = [Path(str(entry)) for entry in folder.iterdir() if entry.name.endswith(".safetensors")]
-    return {path.stem: path for path in sorted(found)}
+    files = {path.stem: path for path in sorted(found)}
+    return {name: files[stem] for name, stem in DEFAULTS.items() if stem in files} | files
 
 
 def load_network(name: str | Path) -> LoadedNetwork:
