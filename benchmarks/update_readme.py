@@ -31,6 +31,7 @@ COLUMNS = (
     ("Acc %", "acc", ".1f", 100),
     ("prec %", "precision", ".1f", 100),
     ("recall %", "recall", ".1f", 100),
+    ("place %", "place_recall", ".1f", 100),
 )
 
 

@@ -148,6 +148,8 @@ def test_semantic_undiscovered_and_unsure_and_mislabelled_are_missing(take: Take
     assert row.metrics.recall is not None
     assert row.metrics.precision is not None
     assert row.metrics.recall.mean == pytest.approx(1 / 3)
+    assert row.metrics.place_recall is not None
+    assert row.metrics.place_recall.mean == pytest.approx(2 / 3)
     assert row.metrics.precision.mean == pytest.approx(1 / 3)  # a second slot on entity 0 is no second discovery
 
 

@@ -124,7 +124,16 @@ def evaluate_semantic(tracker: ClipTracker, take: Take, view: int, subject: Subj
     entity_labels = np.array([take.info.entities[e].label for e in scored], dtype=object)
     for k, e in assign(gap, slot_labels[:, None] == entity_labels[None]):
         answers[e] = slots[k]
-    discovery = Discovery(subject, take.info.name, view, slots=len(slots), matched=int((answers >= 0).sum()))
+    placed = assign(gap, np.ones_like(gap, bool))
+    discovery = Discovery(
+        subject,
+        take.info.name,
+        view,
+        slots=len(slots),
+        matched=int((answers >= 0).sum()),
+        placed=len(placed),
+        entities=len(scored),
+    )
     return ViewOutcome(_records(tracks, take, view, subject, scored, np.zeros_like(first), answers), discovery)
 
 

@@ -85,6 +85,8 @@ class Discovery:
         view: index of the view.
         slots: answers.
         matched: answers that were assigned to an entity.
+        placed: answers that are assigned to an entity if labels do not count; None in files from before there was this.
+        entities: that could be discovered; None there too.
     """
 
     subject: Subject
@@ -92,6 +94,8 @@ class Discovery:
     view: int
     slots: int
     matched: int
+    placed: int | None = None
+    entities: int | None = None
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -150,5 +150,5 @@ def read_results(path: str | Path) -> Results:
 
 def _row(raw: dict[str, Any]) -> Row:
     values = raw["metrics"]
-    metrics = {f.name: None if values[f.name] is None else Value(**values[f.name]) for f in fields(Metrics)}
+    metrics = {name: None if value is None else Value(**value) for name, value in values.items()}
     return Row(**{**raw, "metrics": Metrics(**metrics)})

@@ -37,6 +37,7 @@ class Metrics:
         slope: growth of the 3D distance per 100 frames.
         precision: share of the tracker's own discoveries that are entities (semantic, reading ``all``).
         recall: share of the entities that were discovered (semantic).
+        place_recall: the same if labels do not count (semantic, reading ``all``).
     """
 
     ape: Value | None
@@ -52,6 +53,7 @@ class Metrics:
     slope: Value | None
     precision: Value | None = None
     recall: Value | None = None
+    place_recall: Value | None = None
 
 
 @dataclass(frozen=True)
@@ -171,6 +173,10 @@ def _metrics(
         slots = np.array([d.slots for d in found], dtype=float)
         owner = np.array([index[d.subject.object_id] for d in found])
         values["precision"] = mean_value(Sums(matched, slots), owner, draws)
+    counted = [(d.placed, d.entities, index[d.subject.object_id]) for d in found if d.placed is not None]
+    if counted:
+        placed, entities, owner = np.array(counted).T
+        values["place_recall"] = mean_value(Sums(placed.astype(float), entities.astype(float)), owner, draws)
     return Metrics(**values)
 
 

@@ -48,6 +48,7 @@ COLUMNS = (
     Column("ape_2d", "APE_2d", 3, 1.0, 10),
     Column("precision", "prec %", 1, 100.0, 1),
     Column("recall", "rec %", 1, 100.0, 1),
+    Column("place_recall", "place %", 1, 100.0, 8),
 )
 """What a wide table shows, in this order; the result file has everything."""
 
