@@ -205,3 +205,12 @@ def test_show_and_save(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert load_network(tmp_path / "saved").version == "1.2"
     assert main(["weights", "show", str(tmp_path / "none.safetensors")]) == 2
     assert "no such weights" in capsys.readouterr().err
+
+
+def test_weights_whose_monitor_is_of_no_use_are_shown(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
+    path = tmp_path / "older.safetensors"
+    replace(load_network(file), monitor='{"format": 1}').save(path)
+    assert main(["weights", "show", str(path)]) == 0
+    printed = capsys.readouterr().out
+    assert "weights calibrate" in " ".join(printed.split())
+    assert "Apache-2.0" in printed

@@ -385,7 +385,7 @@ def test_a_stream_saved_before_its_first_frame(clip: Clip):
     assert_equal(feed(again, clip, range(2))[-1], feed(tracker.stream(clip.camera), clip, range(2))[-1])
 
 
-def test_what_is_no_saved_stream_is_refused(clip: Clip):
+def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     tracker = make_tracker()
     stream = tracker.stream(clip.camera, POINTS)
     feed(stream, clip, range(2))
@@ -393,6 +393,8 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip):
     for torn in (b"", b"abc", data[:-7], data[: len(data) // 2]):
         with pytest.raises(InputError, match="saved stream"):
             tracker.restore(torn)
-    other = make_tracker(config=replace(EAGER, jump=0.2))
     with pytest.raises(InputError, match="other weights, settings"):
-        other.restore(data)
+        make_tracker(config=replace(EAGER, jump=0.2)).restore(data)
+    monkeypatch.setattr("quest.track.tracker.REVISION", -1)
+    with pytest.raises(InputError, match="another revision"):
+        tracker.restore(data)

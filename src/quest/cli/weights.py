@@ -325,11 +325,15 @@ def _must_be_a_file(weights: Path) -> None:
 
 
 def _monitor(calibration: str | None) -> str:
+    from quest.errors import WeightsError
     from quest.monitor import Calibration
 
     if calibration is None:
         return "not calibrated: no alarms; see `quest weights calibrate`"
-    monitor = Calibration.from_json(calibration)
+    try:
+        monitor = Calibration.from_json(calibration)
+    except WeightsError as error:
+        return str(error)  # everything else that the file holds is of use still
     return f"{monitor.about}; alpha of at least {monitor.least_alpha:.3g} can be promised"
 
 

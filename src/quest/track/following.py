@@ -115,6 +115,7 @@ class Following:
     def doubt(self) -> None:
         """Go back to what was known before things went wrong, and search everywhere."""
         self.doubted, self.good, self.belief = True, 0, None
+        self.buried, self.refused = False, 0
         if self.safe:
             self.ground, self.place = self.safe[0].ground.copy(), self.safe[0].place.copy()
             self.held = True
@@ -122,6 +123,7 @@ class Following:
     def trust(self, place: Float[np.ndarray, "3"]) -> None:
         """The search has found the entity; without depth its place is not known and stays what it was."""
         self.doubted, self.good, self.since_safe = False, 0, 0
+        self.buried, self.refused = False, 0
         self.place, self.held = place if np.isfinite(place).all() else self.place, False
 
     def state(self) -> dict[str, np.ndarray]:

@@ -138,7 +138,8 @@ class Tracker:
         camera = Camera(**saved.maker["camera"])
         if saved.maker != self._maker(camera, saved.alpha):
             raise InputError(
-                "saved stream: it belongs to other weights, settings or calibration; load those that it was made with"
+                "saved stream: it belongs to other weights, settings or calibration, or to another revision of the "
+                "tracker; load those that it was made with"
             )
         stream = self.stream(camera, (), alpha=saved.alpha, alpha_frames=saved.alpha_frames)
         stream.restore(saved.arrays, saved.words)
@@ -183,6 +184,7 @@ class Tracker:
         return {
             "weights": self.weights_hash,
             "settings": self.config.to_json(),
+            "revision": REVISION,
             "monitor": hashlib.sha256(watched.encode()).hexdigest(),
             "camera": asdict(camera),
         }
