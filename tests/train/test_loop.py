@@ -220,7 +220,7 @@ def test_a_run_of_another_network_is_not_resumed(run: Run):
 def test_patience(run: Run, tmp_path: Path, monkeypatch, scores: list[float], best_step: int, stopped: int):
     """Training stops after two validations without a better score, and there is a best checkpoint whatever happens."""
     left = iter(scores)
-    monkeypatch.setattr(StageOne, "validate", lambda *_, **__: WindowScores(1.0, next(left), 0.5, 0.5, 1))
+    monkeypatch.setattr(StageOne, "validate", lambda *_, **__: WindowScores(1.0, 0.5, next(left), None, 0.5, 0.5, 1))
     config = replace(SHORT, steps=9, validate_every=1, patience=2)
     network, reports = run(config)
     assert reports[-1].step == stopped
@@ -265,6 +265,9 @@ def test_validation_is_the_same_at_every_call(samplers: dict[str, WindowSampler]
     assert one == two
     assert one.answers > 0
     assert 0 <= one.mean_distance <= 1
+    halves = [d for d in (one.moved_distance, one.still_distance) if d is not None]
+    assert min(halves) <= one.mean_distance <= max(halves)
+    assert one.score == pytest.approx(sum(halves) / len(halves))
     assert 0 <= one.right <= 1
     assert one.discovery_f1 is None, "neither reads a map off what its queries look at"
 
