@@ -20,6 +20,7 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train.losses import masked_mean
 from quest.train.objective import Rollout, roll_out
+from quest.train.validation import mean_of
 from quest.train.windows import WindowSampler, WindowTruth
 
 _MOVING = 0.005
@@ -101,10 +102,10 @@ class StageTwo:
         error, length = torch.cat(epe), torch.cat(zero)
         moving = length > _MOVING
         return FlowScores(
-            epe=_mean(error),
-            epe_moving=_mean(error[moving]),
-            zero=_mean(length),
-            zero_moving=_mean(length[moving]),
+            epe=mean_of(error) or 0.0,
+            epe_moving=mean_of(error[moving]) or 0.0,
+            zero=mean_of(length) or 0.0,
+            zero_moving=mean_of(length[moving]) or 0.0,
             answers=len(error),
             moving=int(moving.sum()),
         )
@@ -140,7 +141,3 @@ def _judged(roll: Rollout, truth: WindowTruth) -> Bool[Tensor, "B K"]:
 
 def _length(truth: WindowTruth) -> Float[Tensor, "B K"]:
     return truth.flow.norm(dim=-1) / truth.unit[:, None]
-
-
-def _mean(values: Float[Tensor, " N"]) -> float:
-    return float(values.mean()) if len(values) else 0.0

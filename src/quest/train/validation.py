@@ -83,15 +83,16 @@ def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, dev
     return WindowScores(
         median_px=float(all_px.median()) if len(all_px) else math.inf,
         mean_distance=float(all_distance.mean()),
-        moved_distance=_mean(all_distance[all_moved]),
-        still_distance=_mean(all_distance[~all_moved]),
+        moved_distance=mean_of(all_distance[all_moved]),
+        still_distance=mean_of(all_distance[~all_moved]),
         right=float(torch.cat(right).mean()),
         discovery_f1=float(2 * hits / max(proposed + present, 1)) if reads_map else None,
         answers=sum(len(d) for d in distance),
     )
 
 
-def _mean(values: Float[Tensor, " N"]) -> float | None:
+def mean_of(values: Float[Tensor, " N"]) -> float | None:
+    """The mean of what was judged; None where nothing was."""
     return float(values.mean()) if len(values) else None
 
 
@@ -101,8 +102,8 @@ def _score(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> tuple[Te
     distance = (roll.prediction.point - roll.truth_point).norm(dim=-1) / truth.unit[:, None, None]
     right, _ = is_right(roll.prediction.point, truth, px)
     distance = distance.nan_to_num(1.0).clamp(max=1.0)
-    asked = roll.mask
-    return px[asked & roll.visible], distance[asked].float(), right[asked].float(), has_moved(truth)[asked]
+    counted = roll.mask
+    return px[counted & roll.visible], distance[counted].float(), right[counted].float(), has_moved(truth)[counted]
 
 
 def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation, truth: WindowTruth) -> np.ndarray:
