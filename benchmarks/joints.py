@@ -28,7 +28,7 @@ from scipy.stats import binomtest
 
 from quest.data.provenance import code_commit, machine, package_versions
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, fit_joint
-from quest.grounding.joint import perpendicular
+from quest.grounding.vectors import perpendicular
 
 KIND_OF_FOLDER = {
     "drawer": JointKind.PRISMATIC,

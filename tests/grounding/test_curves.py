@@ -7,8 +7,8 @@ import pytest
 
 from quest.grounding import JointKind, JointPrior, curves
 from quest.grounding.curves import Track, fit_circle, fit_line
-from quest.grounding.joint import perpendicular
 from quest.grounding.starts import start_circles, start_lines
+from quest.grounding.vectors import perpendicular
 from tests.grounding.tracks import angle_deg, make_track
 
 

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
-from quest.grounding.joint import perpendicular
 from quest.grounding.prior import JointPrior
 from quest.grounding.starts import Starts
+from quest.grounding.vectors import cross, perpendicular
 
 _ROBUST_SIGMAS = 2.5
 _OUTLIER_SIGMAS = 4.0
@@ -285,7 +285,7 @@ def _tilt(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Sine of the angle to an expected axis, as a vector, with its derivatives by the slopes."""
     now, by_slope = _tilted(axis, basis, slopes)
-    return np.cross(now, expected) / sigma_rad, np.cross(by_slope.T, expected).T / sigma_rad
+    return cross(now, expected) / sigma_rad, cross(by_slope.T, expected).T / sigma_rad
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -13,9 +13,10 @@ from jaxtyping import Float
 
 from quest.errors import InputError
 from quest.grounding.curves import Curve, Track, fit_circle, fit_line, rebased
-from quest.grounding.joint import Joint, JointKind, perpendicular
+from quest.grounding.joint import Joint, JointKind
 from quest.grounding.prior import JointPrior
 from quest.grounding.starts import Starts, circle_through, join, line_through, start_circles, start_lines
+from quest.grounding.vectors import cross, perpendicular
 
 _MOST_MISFIT = 9.0
 _OUTLIER_SIGMAS = 4.0
@@ -242,5 +243,5 @@ def _misfit(joint: Joint, points: np.ndarray, sigma: np.ndarray, stray: np.ndarr
 
 
 def _surprise(axis: np.ndarray, expected: np.ndarray, sigma_rad: float) -> float:
-    sine = np.cross(axis, expected) / sigma_rad
+    sine = cross(axis, expected) / sigma_rad
     return min(float(sine @ sine), _MOST_MISFIT)

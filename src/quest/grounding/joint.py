@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import InputError
+from quest.grounding.vectors import cross, perpendicular
 
 
 class JointKind(StrEnum):
@@ -85,7 +86,7 @@ class Joint:
         if self.kind is JointKind.PRISMATIC:
             return self.rest + q[:, None] * self.axis
         arm = self.rest - self.origin
-        return self.origin + np.cos(q)[:, None] * arm + np.sin(q)[:, None] * np.cross(self.axis, arm)
+        return self.origin + np.cos(q)[:, None] * arm + np.sin(q)[:, None] * cross(self.axis, arm)
 
     def locate(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
         """Coordinate q of the nearest point of the curve; within [-pi, pi] for turning, 0 for a static point."""
@@ -95,7 +96,7 @@ class Joint:
             return (points - self.rest) @ self.axis
         arm = self.rest - self.origin
         offset = points - self.origin
-        return np.arctan2(offset @ np.cross(self.axis, arm), offset @ arm)
+        return np.arctan2(offset @ cross(self.axis, arm), offset @ arm)
 
     def spread(self, q: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
         """Standard deviation of the curve per direction across itself, by the covariance to first order."""
@@ -165,7 +166,7 @@ class Joint:
             return np.zeros((len(q), 3))
         if self.kind is JointKind.PRISMATIC:
             return np.repeat(self.axis[None], len(q), axis=0)
-        turned = np.cross(self.axis, self.at(q) - self.origin)
+        turned = cross(self.axis, self.at(q) - self.origin)
         return turned / np.maximum(np.linalg.norm(turned, axis=1, keepdims=True), 1e-12)
 
     def _moves(self, q: np.ndarray) -> np.ndarray:
@@ -178,7 +179,7 @@ class Joint:
             return np.concatenate((q[:, None, None] * basis, shift), axis=2)
         arm = self.at(q) - self.origin
         # The axis moves towards each basis vector: a rotation about axis x basis vector.
-        tilt = np.stack([np.cross(np.cross(self.axis, basis[:, i]), arm) for i in range(2)], axis=2)
+        tilt = np.stack([cross(cross(self.axis, basis[:, i]), arm) for i in range(2)], axis=2)
         radial = arm / np.maximum(np.linalg.norm(arm, axis=1, keepdims=True), 1e-12)
         height = np.repeat(self.axis[None, :, None], len(q), axis=0)
         return np.concatenate((tilt, shift, radial[:, :, None], height), axis=2)
@@ -186,11 +187,3 @@ class Joint:
 
 def _numbers(vector: np.ndarray) -> str:
     return "(" + ", ".join(f"{x:.2f}" for x in vector) + ")"
-
-
-def perpendicular(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
-    """Two unit vectors across an axis and each other, the same for the same axis."""
-    other = np.eye(3)[int(np.abs(axis).argmin())]
-    first = np.cross(axis, other)
-    first = first / np.linalg.norm(first)
-    return np.stack((first, np.cross(axis, first)), axis=1)

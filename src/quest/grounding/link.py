@@ -15,7 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
-from quest.grounding.joint import Joint, JointKind, perpendicular
+from quest.grounding.joint import Joint, JointKind
+from quest.grounding.vectors import cross, perpendicular
 
 _OUTLIER_SIGMAS = 4.0
 _RELATIVE_SIGMA = 0.01
@@ -67,7 +68,7 @@ def carried(joint: Joint, points: Float[np.ndarray, "M K 3"], q: Float[np.ndarra
         return points + q * joint.axis
     arm = points - joint.origin
     height = (arm @ joint.axis)[..., None] * joint.axis
-    return joint.origin + height + np.cos(q) * (arm - height) + np.sin(q) * np.cross(joint.axis, arm)
+    return joint.origin + height + np.cos(q) * (arm - height) + np.sin(q) * cross(joint.axis, arm)
 
 
 def evidence(tracks: Tracks) -> Float[np.ndarray, "K K"]:
@@ -116,7 +117,7 @@ def _steps(points: np.ndarray, valid: np.ndarray) -> np.ndarray:
 def _tangents(joint: Joint, rest: np.ndarray) -> np.ndarray:
     if joint.kind is JointKind.PRISMATIC:
         return np.repeat(joint.axis[None], len(rest), axis=0)
-    tangent = np.cross(joint.axis, rest - joint.origin)
+    tangent = cross(joint.axis, rest - joint.origin)
     return tangent / np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
 
 
@@ -215,7 +216,7 @@ def _fit_turning(
         height = arm @ axis
         flat = arm - height[..., None] * axis
         zero = zero - (zero @ axis)[:, None] * axis
-        angle = np.arctan2((flat * np.cross(axis, zero)).sum(-1), (flat * zero).sum(-1))
+        angle = np.arctan2((flat * cross(axis, zero)).sum(-1), (flat * zero).sum(-1))
         out = np.sqrt(np.square(flat).sum(-1))
         radius, level = (out * valid).sum(axis=0) / count, (height * valid).sum(axis=0) / count
         q, phase = _common(angle, valid * np.square(radius / noise))
@@ -256,7 +257,7 @@ def _fit_turning(
 
 
 def _rotated(arm: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    return np.cos(angle) * arm + np.sin(angle) * np.cross(axis, arm)
+    return np.cos(angle) * arm + np.sin(angle) * cross(axis, arm)
 
 
 def _common(along: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

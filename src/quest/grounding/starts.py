@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from quest.grounding.vectors import cross
+
 _TRIPLES = 24
 _MOST_SCORED = 96
 _MOST_MISFIT = 9.0
@@ -92,9 +94,9 @@ def circles(points: Float[np.ndarray, "N 3"]) -> Starts:
     thirds = np.stack([np.median(part, axis=0) for part in np.array_split(points, 3)])
     triple = np.concatenate((_triples(points), thirds[None]))
     one, other = triple[:, 1] - triple[:, 0], triple[:, 2] - triple[:, 0]
-    normal = np.cross(one, other)
+    normal = cross(one, other)
     area, first, second = (np.square(v).sum(1, keepdims=True) for v in (normal, one, other))
-    arm = np.cross(normal, one) * second + np.cross(other, normal) * first
+    arm = cross(normal, one) * second + cross(other, normal) * first
     keep = (area > 1e-12 * first * second)[:, 0]
     arm, area = arm[keep] / (2 * area[keep]), area[keep]
     through = Starts(normal[keep] / np.sqrt(area), triple[keep, 0] + arm, np.linalg.norm(arm, axis=1))
