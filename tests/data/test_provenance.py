@@ -1,4 +1,4 @@
-"""Which commit a result says it is of."""
+"""Which commit and command a result says it is of."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import importlib.util
 import shutil
 import subprocess
 from pathlib import Path
+
+import pytest
 
 from quest.data import provenance
 
@@ -30,3 +32,9 @@ def test_other_results_do_not_make_a_commit_dirty_but_code_does(tmp_path: Path):
     assert module.code_commit() == commit
     code.write_text(code.read_text() + "\n")
     assert module.code_commit() == commit + "+dirty"
+
+
+@pytest.mark.parametrize("shard", [[], ["--shard", "1/2"], ["--shard=1/2"]])
+def test_the_command_of_a_result_is_that_of_all_shards(shard: list[str], monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("sys.argv", ["/bin/quest", "eval", *shard, "--takes", "my takes", "--out", "a.json"])
+    assert provenance.command_line() == "quest eval --takes 'my takes' --out a.json"

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
-import sys
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -87,7 +85,7 @@ def _print(found: StoreReport) -> None:
 
 
 def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
-    from quest.data.provenance import code_commit, combined_hash, machine
+    from quest.data.provenance import code_commit, combined_hash, command_line, machine
 
     headers = store.headers()
     known = {report.name: headers[report.name] for report in found.takes if report.name in headers}
@@ -103,7 +101,7 @@ def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
         "data_hash": combined_hash((name, header.data_hash) for name, header in known.items()),
         "commit": code_commit(),
         "machine": machine(),
-        "command": shlex.join(["quest", *sys.argv[1:]]),
+        "command": command_line(),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(finite(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")

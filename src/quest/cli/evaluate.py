@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -213,12 +211,12 @@ class Eval:
     def _run(
         self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], start_s: float
     ) -> Run:
-        from quest.data.provenance import code_commit, combined_hash, machine, package_versions
+        from quest.data.provenance import code_commit, combined_hash, command_line, machine, package_versions
         from quest.evaluation.results import Run
 
         with_quest = any(name not in ("lk", "hold-still") for name in self.trackers)
         return Run(
-            command=shlex.join(["quest", *sys.argv[1:]]),
+            command=command_line(),
             commit=code_commit(),
             data_hash=combined_hash((name, store.data_hash(name)) for name in chosen),
             weights=self.weights if with_quest else None,

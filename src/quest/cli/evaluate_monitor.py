@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 import time
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -133,12 +131,12 @@ class EvalMonitor:
         return our_monitor(calibration), *others
 
     def _run(self, tracker: Tracker, takes: list[tuple[TakeStore, dict[str, SplitPart]]], start_s: float) -> Run:
-        from quest.data.provenance import code_commit, combined_hash, machine, package_versions
+        from quest.data.provenance import code_commit, combined_hash, command_line, machine, package_versions
         from quest.evaluation.results import Run
 
         hashes = [(name, store.data_hash(name)) for store, chosen in takes for name in chosen]
         return Run(
-            command=shlex.join(["quest", *sys.argv[1:]]),
+            command=command_line(),
             commit=code_commit(),
             data_hash=combined_hash(hashes),
             weights=self.weights,

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import shlex
 import subprocess
+import sys
 from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
@@ -33,6 +35,16 @@ def code_commit() -> str:
     except (OSError, subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pass  # no git or no checkout: a released version says as much
     return f"version {quest.__version__}"
+
+
+def command_line() -> str:
+    """The command of this process, in a shell's words, without ``--shard``.
+
+    Shards share one result, which the last of them writes and the command without them makes as well.
+    """
+    words = iter(sys.argv[1:])
+    kept = [word for word in words if not word.startswith("--shard=") and not (word == "--shard" and next(words, True))]
+    return shlex.join(["quest", *kept])
 
 
 def code_hash() -> str:
