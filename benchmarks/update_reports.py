@@ -298,7 +298,9 @@ def page(folder: Path) -> str:
         "# Results of ablations, monitor, grounding, suites and simulator",
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
         "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
-        "Validation objects chose settings; test objects did not.",
+        "Validation objects chose settings; test objects did not. Every table names its commit: the tracker answers "
+        "differently since the front of a link tells how far it has turned, and tables of older commits are of the "
+        "tracker before.",
     ]
     parts += [_section(table, folder / table.file) for table in TABLES if (folder / table.file).is_file()]
     return "\n\n".join(parts) + "\n"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from quest.cli.weights import CalibrateWeights, TuneWeights
+from quest.cli.weights import CalibrateWeights, ShowWeights, TuneWeights
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, WeightsError
 from quest.evaluation import calibrate, stream_record, tuning
@@ -78,7 +78,9 @@ def test_only_files_are_rewritten(takes: Path, tmp_path: Path):
             CalibrateWeights(name, (str(takes),), tmp_path / "records").run()
 
 
-def test_own_takes_calibrate_the_monitor(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
+def test_own_takes_calibrate_the_monitor(
+    takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
     def made_up(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
         stream = make_stream(take.info.seed, frames=40, part=part)
         return replace(stream, take=take.info.name, view=view, object_id=take.info.object_id)
@@ -91,7 +93,12 @@ def test_own_takes_calibrate_the_monitor(takes: Path, weights: Path, monkeypatch
     assert replace(command, unit="take").run() == 0
     loaded = load_network(weights)
     assert loaded.monitor is not None
-    about = Calibration.from_json(loaded.monitor).about
-    assert "as many other takes" in about
-    assert about.endswith("all of the same objects")
+    calibration = Calibration.from_json(loaded.monitor)
+    assert calibration.unit == "take"
+    assert ShowWeights(str(weights)).run() == 0
+    assert "as many other takes of the same objects" in " ".join(capsys.readouterr().out.split())
+    outdated = replace(calibration, revision=0).to_json()
+    replace(loaded, monitor=outdated).save(weights)
+    assert ShowWeights(str(weights)).run() == 0
+    assert "of no use" in capsys.readouterr().out
     assert (loaded.licence, loaded.version) == ("MIT", "3")

@@ -110,14 +110,12 @@ def test_missing_depth_and_poses_are_flagged(clip: Clip):
     assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
 
 
-def test_time_passes_without_depth(clip: Clip):
-    tracker = make_tracker(config=replace(EAGER, hold_below=0.0))
+def test_time_passes_in_every_frame(clip: Clip):
+    tracker = make_tracker()
     stream = tracker.stream(clip.camera, POINTS[:1])
-    dark = without_depth(clip, slice(3, 6))
-    feed(stream, dark, range(3))
-    before = stream._following[0].ground._clock
-    feed(stream, dark, range(3, 6))
-    assert stream._following[0].ground._clock == before + 3
+    feed(stream, without_depth(clip, slice(1, 3)), range(3))
+    feed(stream, clip, range(3, 4), stamp_s=1.0)
+    assert [s._intake.now for s in (stream, tracker.restore(tracker.save(stream)))] == [3 + 28, 3 + 28]
 
 
 def test_poses_that_begin_late_move_nothing(clip: Clip):

@@ -71,7 +71,7 @@ class EvalMonitor:
         from quest.errors import ConfigError
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
         from quest.evaluation.selection import Shard, select_takes
-        from quest.evaluation.stream_record import OF_TAKES, by_take, read_records, record_streams, tracker_id
+        from quest.evaluation.stream_record import by_unit, read_records, record_streams, tracker_id
         from quest.monitor import Budget
         from quest.track import load
 
@@ -101,10 +101,10 @@ class EvalMonitor:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is judged yet")
             return 0
-        streams = recorded.records
         known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
-        if tracker.calibration.about.endswith(OF_TAKES):
-            streams, known = by_take(streams), by_take(known)
+        unit = tracker.calibration.unit
+        streams, known = by_unit(recorded.records, unit), by_unit(known, unit)
+        if unit == "take":
             console.print("calibrated on takes of the same objects: every take counts as an object")
         both = {r.object_id for r in known} & {r.object_id for r in streams}
         if both:

@@ -229,7 +229,7 @@ class CalibrateWeights:
         from quest.errors import ConfigError
         from quest.evaluation.calibrate import fit_calibration
         from quest.evaluation.selection import Shard
-        from quest.evaluation.stream_record import OF_TAKES, by_take, record_streams
+        from quest.evaluation.stream_record import record_streams
         from quest.model.weights import load_network
         from quest.track import load
 
@@ -249,18 +249,14 @@ class CalibrateWeights:
         if recorded.missing:
             console.print(f"{recorded.missing} streams are left to other shards; nothing is fitted yet")
             return 0
-        records = by_take(recorded.records) if self.unit == "take" else recorded.records
-        fitted = fit_calibration(records, block_frames=self.block_frames)
-        about = fitted.calibration.about
-        if self.unit == "take":
-            about = about.replace(" objects", " takes") + OF_TAKES
-        console.print(f"{about}; alpha of at least {fitted.calibration.least_alpha:.3g} can be promised")
+        fitted = fit_calibration(recorded.records, block_frames=self.block_frames, unit=self.unit)
+        monitor = fitted.calibration.to_json()
+        console.print(_monitor(monitor))
         console.print(
             f"cross-validated: AUROC {fitted.auroc:.4f}, ECE {fitted.ece:.4f}, mean delay {fitted.delay:.1f} frames; "
             f"{fitted.hidden} hidden units, decay {fitted.decay}, {fitted.calibration.statistic}"
         )
-        calibration = replace(fitted.calibration, about=about)
-        replace(load_network(self.weights), monitor=calibration.to_json()).save(self.weights)
+        replace(load_network(self.weights), monitor=monitor).save(self.weights)
         return 0
 
 
@@ -327,6 +323,7 @@ def _must_be_a_file(weights: Path) -> None:
 def _monitor(calibration: str | None) -> str:
     from quest.errors import WeightsError
     from quest.monitor import Calibration
+    from quest.track.settings import REVISION
 
     if calibration is None:
         return "not calibrated: no alarms; see `quest weights calibrate`"
@@ -334,6 +331,11 @@ def _monitor(calibration: str | None) -> str:
         monitor = Calibration.from_json(calibration)
     except WeightsError as error:
         return str(error)  # everything else that the file holds is of use still
+    if monitor.revision != REVISION:
+        return (
+            f"of no use: calibrated on a tracker of revision {monitor.revision}, this is {REVISION}; "
+            "run `quest weights calibrate` again"
+        )
     return f"{monitor.about}; alpha of at least {monitor.least_alpha:.3g} can be promised"
 
 

@@ -21,10 +21,10 @@ from quest.errors import ConfigError
 from quest.evaluation.detectors import choose, fit_part, loss_free_maxima
 from quest.evaluation.drift import auroc, calibration_error
 from quest.evaluation.replay import replay_features, replay_logits
-from quest.evaluation.stream_record import StreamRecord
+from quest.evaluation.stream_record import StreamRecord, by_unit
 from quest.monitor import SIGNALS, Calibration
 from quest.monitor import memory as memories
-from quest.monitor.calibration import rounded
+from quest.monitor.calibration import Unit, rounded
 from quest.monitor.calibrator import LOGIT_LIMIT, Calibrator, probability
 from quest.monitor.statistic import Cusum
 from quest.track.settings import REVISION
@@ -105,7 +105,11 @@ class _Frames:
 
 
 def fit_calibration(
-    records: Sequence[StreamRecord], *, config: FitConfig | None = None, block_frames: int | None = None
+    records: Sequence[StreamRecord],
+    *,
+    config: FitConfig | None = None,
+    block_frames: int | None = None,
+    unit: Unit = "object",
 ) -> Fitted:
     """Fit calibrator, statistic and maxima.
 
@@ -114,11 +118,13 @@ def fit_calibration(
         config: how to fit.
         block_frames: length of the streams that thresholds rest on; shorter ones are left out, longer ones cut. That
             of the shortest stream by default.
+        unit: what promises are to be about.
 
     Raises:
         ConfigError: a stream is not of a validation object, or they do not suffice.
     """
     config = FitConfig() if config is None else config
+    records = by_unit(records, unit)
     wrong = [r.take for r in records if r.part != "validation"]
     if wrong or not records:
         raise ConfigError(f"calibration: expected streams of validation objects only, got {wrong[:3] or 'none'}")
@@ -150,12 +156,13 @@ def fit_calibration(
     maxima = loss_free_maxima(
         statistic, rest, replay_logits(calibrator, replay_features(calibrator, rest)), block_frames=block_frames
     )
+    same = " of the same objects" if unit == "take" else ""
     about = (
-        f"fitted on {len(fit)} streams of {len(objects)} objects ({frames.lost.mean():.1%} of frames lost); thresholds "
-        f"from {len(maxima)} loss-free streams of as many other objects, {block_frames} frames each"
+        f"fitted on {len(fit)} streams of {len(objects)} {unit}s ({frames.lost.mean():.1%} of frames lost); thresholds "
+        f"from {len(maxima)} loss-free streams of as many other {unit}s{same}, {block_frames} frames each"
     )
     return Fitted(
-        calibration=Calibration(calibrator, statistic, maxima, block_frames, about, REVISION),
+        calibration=Calibration(calibrator, statistic, maxima, block_frames, about, REVISION, unit),
         objects=len(objects),
         streams=len(fit),
         frames=len(frames.lost),

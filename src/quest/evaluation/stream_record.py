@@ -19,6 +19,7 @@ from quest.errors import ConfigError, InputError
 from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
 from quest.evaluation.selection import Chosen, Shard
 from quest.monitor import SIGNALS
+from quest.monitor.calibration import Unit
 from quest.track import Tracker
 from quest.track.settings import REVISION
 from quest.types import Query, Take
@@ -28,9 +29,6 @@ LIFTING_PX = 8.0
 
 FORMAT = 2
 """Version of the files."""
-
-OF_TAKES = "; all of the same objects"
-"""How a calibration says that what it promises is about other takes of its objects."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +163,9 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
     )
 
 
-def by_take(records: Sequence[StreamRecord]) -> tuple[StreamRecord, ...]:
-    """The same streams with every take for an object of its own: what they show is about takes of the same objects."""
-    return tuple(replace(record, object_id=record.take) for record in records)
+def by_unit(records: Sequence[StreamRecord], unit: Unit) -> tuple[StreamRecord, ...]:
+    """The same streams; where promises are about takes, every take is an object of its own."""
+    return tuple(replace(record, object_id=record.take) if unit == "take" else record for record in records)
 
 
 def tracker_id(tracker: Tracker) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import json
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -17,8 +17,11 @@ from quest.monitor.conformal import Budget, Threshold, least_alpha, threshold
 from quest.monitor.signals import SIGNALS
 from quest.monitor.statistic import Cusum
 
-FORMAT = 2
+FORMAT = 3
 """Version of the text."""
+
+Unit = Literal["object", "take"]
+"""What a promise is about: other objects, or other takes of the same objects."""
 
 _DIGITS = 4
 """Significant digits of the calibrator's numbers."""
@@ -41,6 +44,7 @@ class Calibration:
         block_frames: length of the calibration streams, frames.
         about: what it was calibrated on, a line for people.
         revision: of the tracker whose signals these are (``quest.track.settings.REVISION``).
+        unit: what each of the maxima is of, and so what the promise is about.
     """
 
     calibrator: Calibrator
@@ -49,10 +53,13 @@ class Calibration:
     block_frames: int
     about: str
     revision: int
+    unit: Unit = "object"
 
     def __post_init__(self) -> None:
         if not len(self.maxima) or not np.isfinite(self.maxima).all() or (np.diff(self.maxima) < 0).any():
             raise WeightsError("monitor: expected at least one maximum, finite and ascending; calibrate again")
+        if self.unit not in get_args(Unit):
+            raise WeightsError(f"monitor: expected unit object or take, got {self.unit!r}; calibrate again")
         if self.block_frames < 1:
             raise WeightsError(f"monitor: expected block_frames >= 1, got {self.block_frames}; calibrate again")
 
@@ -111,6 +118,7 @@ class Calibration:
             "block_frames": self.block_frames,
             "about": self.about,
             "revision": self.revision,
+            "unit": self.unit,
         }
         return json.dumps(raw, separators=(",", ":"), allow_nan=False)
 
@@ -136,6 +144,7 @@ class Calibration:
                 block_frames=int(raw["block_frames"]),
                 about=str(raw["about"]),
                 revision=int(raw["revision"]),
+                unit=raw["unit"],
             )
         except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
             raise WeightsError(

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, joint_from_prior
-from quest.model.joint_head import JointBelief
+from quest.grounding.hinge import Plane
 from quest.track.evidence import Evidence
+from quest.track.expectation import BeliefRow, Expectation
+from quest.track.front import Front
 from quest.track.settings import TrackerConfig
 
 _SAMPLES = 97
@@ -31,78 +33,11 @@ _MOST_CLOSED = 6.0
 _STANDING = 8
 """Sights that tell where something fixed stands; nothing moves in the first frames of a stream."""
 _OFF_FIXED = -3.0
-
-
-@dataclass(frozen=True)
-class BeliefRow:
-    """What the network believes of one query's joint in one frame (see :class:`~quest.model.joint_head.JointBelief`).
-
-    Attributes:
-        revolute_logit: above zero where the joint turns rather than slides.
-        slide_axis: unit direction of sliding.
-        turn_axis: unit direction of the axis of turning.
-        foot: from the entity to the nearest point of the axis of turning.
-        spread: scales of the Laplace-like errors of the two directions and of ``foot``.
-    """
-
-    revolute_logit: float
-    slide_axis: Float[np.ndarray, "3"]
-    turn_axis: Float[np.ndarray, "3"]
-    foot: Float[np.ndarray, "3"]
-    spread: Float[np.ndarray, "3"]
-
-
-def joint_rows(belief: JointBelief) -> list[BeliefRow]:
-    """The beliefs of all queries in the newest frame of the first batch element."""
-    newest = [getattr(belief, f.name)[0, -1].cpu().double().numpy() for f in fields(belief)]
-    logit, slide, turn, foot, log_spread = newest
-    return [BeliefRow(float(logit[k]), slide[k], turn[k], foot[k], np.exp(log_spread[k])) for k in range(len(logit))]
-
-
-@dataclass
-class _Expectation:
-    """The network's beliefs so far, joined."""
-
-    rows: int = 0
-    logit: float = 0.0
-    slide: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
-    turn: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
-    foot: np.ndarray = field(default_factory=lambda: np.zeros(3))
-    information: np.ndarray = field(default_factory=lambda: np.zeros(3))
-
-    def add(self, row: BeliefRow, point: np.ndarray) -> None:
-        weight = 1 / np.square(row.spread)
-        self.rows += 1
-        self.logit += row.revolute_logit
-        self.slide += weight[0] * np.outer(row.slide_axis, row.slide_axis)
-        self.turn += weight[1] * np.outer(row.turn_axis, row.turn_axis)
-        self.foot += weight[2] * (point + row.foot)
-        self.information += weight
-
-    def state(self) -> dict[str, np.ndarray]:
-        """All fields as arrays."""
-        return {f.name: np.array(getattr(self, f.name)) for f in fields(self)}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> _Expectation:
-        """Read what :meth:`state` gave."""
-        joined = {f.name: np.array(state[f.name]) for f in fields(cls)}
-        return cls(**{**joined, "rows": int(joined["rows"]), "logit": float(joined["logit"])})
-
-    def prior(self) -> JointPrior:
-        """The beliefs as one; errors of neighbouring frames are alike, so that many are worth no more than one."""
-        (slide, slide_scatter), (turn, turn_scatter) = _principal(self.slide), _principal(self.turn)
-        spread = np.sqrt(self.rows / self.information)
-        # Standard deviation per coordinate of a density exp(-e / b) in two and in three dimensions.
-        return JointPrior(
-            revolute_probability=float(np.clip(1 / (1 + np.exp(-self.logit / self.rows)), 0.01, 0.99)),
-            prismatic_axis=slide,
-            prismatic_axis_sigma_rad=float(np.hypot(3**0.5 * spread[0], slide_scatter)),
-            revolute_axis=turn,
-            revolute_axis_sigma_rad=float(np.hypot(3**0.5 * spread[1], turn_scatter)),
-            origin=self.foot / self.information[2],
-            origin_sigma=float(2 * spread[2]),
-        )
+_TURN_SIGMA_RAD = 0.05
+_LEAST_TURN_WEIGHT = -4.0
+_OFF_TURN = 0.1
+_SAME_AXIS_RAD = 0.2
+_SAME_AXIS = 0.1
 
 
 @dataclass(frozen=True)
@@ -136,39 +71,46 @@ class Ground:
     def __init__(self, config: TrackerConfig, *, fixed: bool = False) -> None:
         self.fixed = fixed
         self._config = config
-        self._expectation = _Expectation()
+        self._expectation = Expectation()
         self._estimator = JointEstimator(config.point_sigma)
         self._curves: tuple[Curve, ...] = ()
         self._recent: deque[tuple[float, np.ndarray]] = deque(maxlen=_RECENT)
-        self._clock = 0.0
         self._along: np.ndarray | None = None
         self._hidden = 0.0
+        self.front = Front(config.point_sigma)
 
     @property
     def joint(self) -> Joint | None:
         """The joint that the track so far shows; None before the first point."""
-        return self._estimator.joint
+        turning, own = self.front.joint, self._estimator.joint
+        if turning is None:
+            return own
+        # Sights say more of the radius, the front of the axis: where they agree both count.
+        return own if own is not None and _agree(own, turning) else turning
 
-    def see(self, point: Float[np.ndarray, "3"], row: BeliefRow, *, elapsed: float = 1.0) -> None:
+    def face(self, plane: Plane | None, *, elapsed: float) -> None:
+        """Take how the front of the link stands in the newest frame (see :meth:`~quest.track.front.Front.see`)."""
+        if self.front.see(plane, elapsed=elapsed) and self._estimator.prior is not None:
+            self._curves = self._make_curves(self._estimator.prior)
+
+    def see(self, point: Float[np.ndarray, "3"], row: BeliefRow, *, now: float) -> None:
         """Learn from a frame in which the query is seen and trusted.
 
         Args:
             point: where it is.
             row: what the network believes of its joint.
-            elapsed: frames since the one before.
+            now: time of the frame, in frames.
         """
-        self._clock += elapsed
         if not (self.fixed and self._expectation.rows >= _STANDING):
             self._expectation.add(row, point)
-            self._estimator.prior = prior = self._expectation.prior()
-            self._estimator.add(point)
+            if not self.fixed:
+                self.front.learn(point)
+            self._estimator.prior = prior = self.front.belief or self._expectation.prior()
+            if self._on_turn(point):
+                self._estimator.add(point)
             self._curves = self._make_curves(prior)
-        self._recent.append((self._clock, point))
+        self._recent.append((now, point))
         self._along, self._hidden = None, 0.0
-
-    def wait(self, elapsed: float) -> None:
-        """A frame passes that tells nothing of places, so many frames after the one before."""
-        self._clock += elapsed
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
@@ -180,7 +122,7 @@ class Ground:
             # Squares by a matrix product: this runs for every cell, query and frame.
             square = np.square(point).sum(1)[:, None] - 2 * point @ curve.point.T + np.square(curve.point).sum(1)
             variance = np.square(curve.spread) + self._config.joint_sigma**2
-            best = (-0.5 * square / variance).max(axis=1) + curve.log_weight
+            best = (-0.5 * square / variance + self._turned(curve)).max(axis=1) + curve.log_weight
             total = np.logaddexp(total, np.where(np.isnan(best), -np.inf, best))
         return np.minimum(total, 0.0)
 
@@ -190,12 +132,19 @@ class Ground:
             return point
         curve = self._best_curve
         q = curve.joint.locate(point[None])
+        turned = self.front.turned(curve.joint)
+        if turned is not None:
+            # How the front stands tells more than where on it something is seen.
+            sigma = np.hypot(_TURN_SIGMA_RAD, self._config.point_sigma / max(curve.joint.radius, 1e-6))
+            gap = float(np.angle(np.exp(1j * (q[0] - turned))))
+            share = _TURN_SIGMA_RAD**2 / sigma**2 if abs(gap) < 3 * sigma else 0.0
+            q = np.array([turned + share * gap])
         on, spread = curve.joint.at(q)[0], float(curve.joint.spread(q)[0])
         sigma = self._config.point_sigma
         share = spread**2 / (spread**2 + sigma**2)
-        # What is too far from the joint is not on it.
-        doubt = 1 - np.exp(-0.5 * np.square(np.linalg.norm(point - on) / np.hypot(spread, 2 * sigma)))
-        return on + max(share, doubt) * (point - on)
+        near = np.exp(-0.5 * np.square(np.linalg.norm(point - on) / np.hypot(spread, 2 * sigma)))
+        # What is too far from the joint is not on it, unless the front of the link tells that it is.
+        return on + (share * near if turned is not None else max(share, 1 - near)) * (point - on)
 
     def residual(self, point: Float[np.ndarray, "3"]) -> float:
         """Distance of a point to the curve of the joint, in standard deviations of both; NaN before the first sight."""
@@ -260,7 +209,6 @@ class Ground:
                 as it moved; else it is its own link that hides it, and the network knows roughly where.
             elapsed: frames since it was there.
         """
-        self._clock += elapsed
         if not self._curves:
             return before
         curve, prior = self._best_curve, self._predicted(before, elapsed, moving=buried)
@@ -268,6 +216,8 @@ class Ground:
         if buried:
             # What seems to show it adds nothing: frames are alike, and a look-alike would soon outweigh everything.
             score = np.where(self._buried(frame), 0.0, np.clip(score, _LOG_MISSED, 0.0))
+        if not buried:
+            score = score + self._turned(curve)
         # Where one looks through the place, the query would be seen.
         tolerance = _TOLERANCE + (curve.spread if buried else 0.0)
         score = np.where(frame.room(curve.point) > tolerance, score + _LOG_FREE_SPACE, score)
@@ -288,28 +238,45 @@ class Ground:
         found = {f"expectation.{key}": value for key, value in self._expectation.state().items()}
         found |= {f"estimator.{key}": value for key, value in self._estimator.state().items()}
         found["recent"] = np.array([point for _, point in self._recent]).reshape(-1, 3)
-        found["recent_clock"] = np.array([clock for clock, _ in self._recent])
-        found |= {"clock": np.array(self._clock), "hidden": np.array(self._hidden)}
-        found["fixed"] = np.array(self.fixed)
+        found["recent_at"] = np.array([now for now, _ in self._recent])
+        found |= {"hidden": np.array(self._hidden), "fixed": np.array(self.fixed)}
+        found |= {f"front.{key}": value for key, value in self.front.state().items()}
         return found if self._along is None else {**found, "along": self._along}
 
     @classmethod
     def restored(cls, config: TrackerConfig, state: Mapping[str, np.ndarray]) -> Ground:
         """Go on where :meth:`state` was taken."""
         ground = cls(config, fixed=bool(state["fixed"]))
-        parts: dict[str, dict[str, np.ndarray]] = {"expectation": {}, "estimator": {}}
+        parts: dict[str, dict[str, np.ndarray]] = {"expectation": {}, "estimator": {}, "front": {}}
         for key, value in state.items():
             owner, _, name = key.partition(".")
             parts.setdefault(owner, {})[name] = value
-        ground._expectation = _Expectation.restored(parts["expectation"])
+        ground._expectation = Expectation.restored(parts["expectation"])
         ground._estimator.restore(parts["estimator"])
-        if ground._expectation.rows:
-            ground._estimator.prior = prior = ground._expectation.prior()
+        ground.front.restore(parts["front"])
+        prior = ground._estimator.prior
+        if prior is not None:
             ground._curves = ground._make_curves(prior)
-        ground._clock = float(state["clock"])
-        ground._recent.extend(zip(state["recent_clock"].tolist(), state["recent"], strict=True))
+        ground._recent.extend(zip(state["recent_at"].tolist(), state["recent"], strict=True))
         ground._along, ground._hidden = state.get("along"), float(state["hidden"])
         return ground
+
+    def _on_turn(self, point: np.ndarray) -> bool:
+        """Whether a sight is where the link's turn brings the query, as far as that is known."""
+        turning = self.front.joint
+        if turning is None or self._estimator.joint is None:
+            return True
+        turned = self.front.turned(turning)
+        q = turning.locate(point[None]) if turned is None else np.array([turned])
+        return bool(np.linalg.norm(point - turning.at(q)[0]) < _OFF_TURN)
+
+    def _turned(self, curve: Curve) -> np.ndarray | float:
+        """How well the samples of a curve agree with how the link's front stands: log weights."""
+        turned = self.front.turned(curve.joint)
+        if turned is None:
+            return 0.0
+        gap = np.angle(np.exp(1j * (curve.q - turned)))
+        return np.maximum(-0.5 * np.square(gap / _TURN_SIGMA_RAD), _LEAST_TURN_WEIGHT)
 
     @property
     def _best_curve(self) -> Curve:
@@ -360,7 +327,7 @@ class Ground:
         return self._hidden if np.allclose(before, left, atol=1e-6) else 0.0
 
     def _make_curves(self, prior: JointPrior) -> tuple[Curve, ...]:
-        joint = self._estimator.joint
+        joint = self.joint
         assert joint is not None  # a point was added
         if joint.kind is not JointKind.STATIC or self.fixed:
             return (_curve(joint, 0.0),)
@@ -371,6 +338,14 @@ class Ground:
         )
 
 
+def _agree(joint: Joint, turning: Joint) -> bool:
+    """Whether a joint turns about much the same axis as another."""
+    if joint.kind is not JointKind.REVOLUTE or abs(joint.axis @ turning.axis) < np.cos(_SAME_AXIS_RAD):
+        return False
+    apart = joint.origin - turning.origin
+    return bool(np.linalg.norm(apart - (apart @ turning.axis) * turning.axis) < _SAME_AXIS)
+
+
 def _curve(joint: Joint, log_weight: float) -> Curve:
     if joint.kind is JointKind.REVOLUTE:
         low = min(-_TURN_REACH_RAD, joint.lower - _TURN_MARGIN_RAD)
@@ -379,12 +354,6 @@ def _curve(joint: Joint, log_weight: float) -> Curve:
     else:
         q = np.linspace(min(joint.lower, 0.0) - _SLIDE_REACH, max(joint.upper, 0.0) + _SLIDE_REACH, _SAMPLES)
     return Curve(log_weight, joint, q, joint.at(q), joint.spread(q))
-
-
-def _principal(scatter: np.ndarray) -> tuple[np.ndarray, float]:
-    """Main direction of a sum of outer products, and the sine of the typical angle to it."""
-    value, vector = np.linalg.eigh(scatter)
-    return vector[:, -1], float(np.sqrt(max(0.0, 1 - value[-1] / value.sum())))
 
 
 def _normalised(log_p: np.ndarray) -> np.ndarray:

@@ -44,6 +44,8 @@ class Intake:
         letterbox: between the source image and the network's input.
         reference: the reference frame; None before the first frame.
         elapsed: time since the frame before in frames of 30 per second, within 1 to 10.
+        now: time of the newest frame in frames of 30 per second: the sum of what passed between frames, at least 1
+            each, however long it was.
         flags: degradations of the newest frame, in words.
     """
 
@@ -51,6 +53,7 @@ class Intake:
         self.letterbox = Letterbox(camera, network.config.encoder.image_size)
         self.reference: Reference | None = None
         self.elapsed = 1.0
+        self.now = 0.0
         self.flags: tuple[str, ...] = ()
         self._framer = Framer(network, self.letterbox.camera, device=device)
         self._device = device
@@ -112,7 +115,8 @@ class Intake:
             self._features = None
         since = 0.0 if before is None else stamp_s - before
         # Rounded, because stamps are: a 30th of a second is one frame, however it was written down.
-        self.elapsed = float(np.clip(round(since * _FRAMES_PER_S, 3), 1.0, _MOST_FRAMES))
+        passed = max(1.0, round(since * _FRAMES_PER_S, 3))
+        self.elapsed, self.now = min(passed, _MOST_FRAMES), self.now + passed
         self._stamp_s, self._digest = stamp_s, digest
         return Arrival.NEW
 
@@ -155,7 +159,7 @@ class Intake:
 
     def state(self) -> dict[str, np.ndarray]:
         """What the next frame depends on, as numeric arrays."""
-        found: dict[str, np.ndarray] = {"digest": np.frombuffer(self._digest, np.uint8)}
+        found: dict[str, np.ndarray] = {"digest": np.frombuffer(self._digest, np.uint8), "now": np.array(self.now)}
         if self._stamp_s is not None:
             found["stamp_s"] = np.array(self._stamp_s)
         if self._pose is not None:
@@ -169,7 +173,7 @@ class Intake:
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
         """Go on where :meth:`state` was taken."""
-        self._digest, self._features = state["digest"].tobytes(), None
+        self._digest, self._features, self.now = state["digest"].tobytes(), None, float(state["now"])
         self._stamp_s = float(state["stamp_s"]) if "stamp_s" in state else None
         self._pose = state.get("pose")
         self.reference = None

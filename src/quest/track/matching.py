@@ -11,11 +11,12 @@ from torch import Tensor
 
 from quest.model.decoder import Anchor, HeatmapHead, Prediction
 from quest.model.network import QuestNetwork
-from quest.model.observation import Observation, cell_centres
+from quest.model.observation import FrameBatch, Observation, cell_centres
 from quest.track.belief import Belief, moved, update
 from quest.track.following import Following
 from quest.track.placing import as_array
 from quest.track.settings import TrackerConfig
+from quest.track.surface import face
 
 
 def match(
@@ -23,6 +24,7 @@ def match(
     config: TrackerConfig,
     anchor: Anchor,
     window: Observation,
+    frames: FrameBatch,
     following: Sequence[Following],
     *,
     elapsed: float,
@@ -33,7 +35,8 @@ def match(
         network: the network, with a heatmap.
         config: settings of tracking.
         anchor: what the queries are bound to.
-        window: the newest frames.
+        window: the newest frames as observed.
+        frames: the newest frame.
         following: the queries; their beliefs are renewed.
         elapsed: frames since the one before.
     """
@@ -46,6 +49,7 @@ def match(
     cell_point = newest.cell_point[0, 0].float()
     favour = torch.zeros_like(logits[0, 0])
     if config.ground:
+        face(frames, following, elapsed=elapsed)
         place = cell_point.cpu().numpy()
         favour = torch.from_numpy(np.stack([f.ground.favour(place) for f in following])).to(logits)
     size = network.config.encoder.image_size

@@ -14,8 +14,8 @@ from quest.model.config import NetworkConfig
 from quest.model.decoder import Prediction
 from quest.model.observation import FrameBatch
 from quest.track.evidence import FrameEvidence
+from quest.track.expectation import BeliefRow
 from quest.track.following import Following
-from quest.track.grounded import BeliefRow
 from quest.track.settings import TrackerConfig
 
 LOST_BELOW = 0.3
@@ -26,6 +26,8 @@ _COVERED = 0.5
 _AFTER_ALL = 0.2
 _OFF_JOINT_SIGMAS = 4.0
 _INSISTING = 10
+_LONG_INSISTING = 30
+_OFF_TURN_SIGMAS = 2.5
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,7 @@ class Placer:
         network: its configuration.
         config: settings of tracking.
         elapsed: frames since the one before.
+        now: time of the frame, in frames.
     """
 
     def __init__(
@@ -72,13 +75,14 @@ class Placer:
         network: NetworkConfig,
         config: TrackerConfig,
         elapsed: float,
+        now: float,
     ) -> None:
         self._following = following
         self._config = config
         self._elapsed = elapsed
+        self._now = now
         log_p = prediction.logits[0, 0].log_softmax(dim=-1)
         self._evidence = [FrameEvidence(frames, log_p[k], network) for k in range(len(following))]
-        self._no_depth = not bool((frames.depth_m > 0).any())
         self._seen = prediction.visible_logit[0, 0].sigmoid().double().cpu().numpy()
         self._right = prediction.right_logit[0, 0].sigmoid().double().cpu().numpy()
 
@@ -105,8 +109,6 @@ class Placer:
                 point[i] = self._hold(i, own, seen[i])
             elif np.isfinite(own).all():
                 point[i], query.buried = self._see(i, own, joints[i]), False
-            elif self._no_depth:
-                query.ground.wait(self._elapsed)
             judged[i] = point[i]
         room = np.array([e.room(p[None])[0] for e, p in zip(self._evidence, judged, strict=True)]).reshape(k)
         doubted = np.array([query.doubted for query in self._following], bool)
@@ -118,7 +120,7 @@ class Placer:
         if not self._config.ground:
             return own
         if self._right[i] >= LOST_BELOW:
-            query.ground.see(own, joint, elapsed=self._elapsed)
+            query.ground.see(own, joint, now=self._now)
         return query.ground.settle(own)
 
     def _hold(self, i: int, own: np.ndarray, seen: float) -> np.ndarray:
@@ -139,6 +141,10 @@ class Placer:
         query, seen = self._following[i], float(self._seen[i])
         if query.place is None:
             return seen
+        turns = query.ground.front.joint is not None
+        if turns and not query.buried and residual > _OFF_TURN_SIGMAS and query.refused < _LONG_INSISTING:
+            query.refused += 1
+            return min(seen, _AFTER_ALL)
         leapt = not np.linalg.norm(own - query.place) < _LEAP
         if not (leapt or query.buried):
             return seen

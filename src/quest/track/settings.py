@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 from quest.errors import ConfigError, WeightsError
 
-REVISION = 5
+REVISION = 6
 """Grows when the same weights and settings give other answers, so that no monitor is fitted to streams of before."""
 
 

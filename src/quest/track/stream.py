@@ -20,8 +20,8 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.monitor import SIGNALS, Alarm, Budget, Monitor, Signals, Verdict
 from quest.track.binding import Binding, Waiting
+from quest.track.expectation import joint_rows
 from quest.track.following import Answer, Following, part
-from quest.track.grounded import joint_rows
 from quest.track.intake import Arrival, Intake
 from quest.track.lifting import lift_near
 from quest.track.matching import match
@@ -266,12 +266,12 @@ class Stream:
         window = Observation.stack(list(self._ring))
         newest = window.during(slice(-1, None))
         prediction = match(
-            self._network, self._config, self._binding.anchor, window, following, elapsed=self._intake.elapsed
+            self._network, self._config, self._binding.anchor, window, frames, following, elapsed=self._intake.elapsed
         )
         candidate = as_array(lift_near(prediction, frames, self._config.lift_tolerance))
         placer = Placer(
-            following, prediction, frames,
-            network=self._network.config, config=self._config, elapsed=self._intake.elapsed,
+            following, prediction, frames, network=self._network.config, config=self._config,
+            elapsed=self._intake.elapsed, now=self._intake.now,
         )  # fmt: skip
         placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:

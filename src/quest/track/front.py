@@ -1,0 +1,103 @@
+"""The front of the link that a query is on: how it stands, and the joint that its turning shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.grounding import Joint, JointPrior
+from quest.grounding.hinge import HingeEstimator, Plane
+
+_TURN_PER_FRAME_RAD = 0.05
+_MOST_TURN_RAD = 0.35
+_CONTRADICTED = 20
+
+
+class Front:
+    """What is known of the plane around a query.
+
+    Args:
+        sigma: standard deviation of a seen point per coordinate, reference units.
+    """
+
+    def __init__(self, sigma: float) -> None:
+        self._hinge = HingeEstimator(sigma)
+        self._plane: Plane | None = None
+        self._normal: np.ndarray | None = None
+        self._unseen = 0.0
+        self._contradicted = 0
+
+    @property
+    def joint(self) -> Joint | None:
+        """The joint about which it was seen turning; None where it was not."""
+        return self._hinge.joint
+
+    @property
+    def belief(self) -> JointPrior | None:
+        """What that says of the joint to one who has more to go by."""
+        return self._hinge.belief
+
+    def expected(self, place: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"] | None, float]:
+        """The normal that it should have now, and the least cosine to it; None before it was seen.
+
+        Args:
+            place: where the query was last.
+        """
+        joint = self._hinge.joint
+        if joint is not None:
+            return self._hinge.facing(float(joint.locate(place[None])[0])), float(np.cos(_MOST_TURN_RAD))
+        return self._normal, float(np.cos(min(_TURN_PER_FRAME_RAD * (3 + self._unseen), _MOST_TURN_RAD)))
+
+    def see(self, plane: Plane | None, *, elapsed: float) -> bool:
+        """Take how it stands in the newest frame; None where it is not seen.
+
+        What cannot be the front is not taken for it, unless nothing else has been seen for long: then the joint was
+        wrong.
+
+        Args:
+            plane: what is seen around the query.
+            elapsed: frames since the one before.
+
+        Returns:
+            Whether the joint was given up.
+        """
+        given_up = False
+        if plane is not None:
+            agrees = self._hinge.agrees(plane)
+            self._contradicted = 0 if agrees else self._contradicted + 1
+            plane = plane if agrees else None
+            if self._contradicted > _CONTRADICTED:
+                self._hinge, self._contradicted, given_up = self._hinge.anew(), 0, True
+        self._plane = plane
+        self._unseen = self._unseen + elapsed if plane is None else 0.0
+        self._normal = self._normal if plane is None else plane.normal
+        return given_up
+
+    def learn(self, point: Float[np.ndarray, "3"]) -> None:
+        """The query is seen at a point, and trusted, in the newest frame."""
+        if self._plane is not None and not self._plane.behind:
+            self._hinge.add(point, self._plane)
+
+    def turned(self, joint: Joint) -> float | None:
+        """Where on a joint the query is by how the front stands in the newest frame; None where that is not known."""
+        own = self._hinge.joint
+        if own is None or self._plane is None:
+            return None
+        turned = self._hinge.turned(self._plane.normal)
+        return float(joint.locate(own.rest[None])[0] + np.sign(joint.axis @ own.axis) * turned)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """What the next frame depends on, as numeric arrays."""
+        found = {f"hinge.{key}": value for key, value in self._hinge.state().items()}
+        found["counts"] = np.array([self._unseen, self._contradicted])
+        return found if self._normal is None else {**found, "normal": self._normal}
+
+    def restore(self, state: Mapping[str, np.ndarray]) -> None:
+        """Go on where :meth:`state` was taken."""
+        prefix = "hinge."
+        self._hinge.restore({key.removeprefix(prefix): v for key, v in state.items() if key.startswith(prefix)})
+        unseen, contradicted = state["counts"].tolist()
+        self._unseen, self._contradicted, self._normal = unseen, int(contradicted), state.get("normal")
+        self._plane = None
