@@ -84,6 +84,18 @@ def test_a_drawer_has_no_hinge():
     assert estimator.joint is None
 
 
+def test_nonsense_makes_no_joint():
+    """Planes that turn about the point itself, and planes at random, with points at random."""
+    estimator, rng = HingeEstimator(SIGMA), np.random.default_rng(0)
+    for angle in np.linspace(0, 1, 20):
+        estimator.add(HANDLE, Plane(turned(FRONT, angle), HANDLE, behind=False))
+    assert estimator.joint is None
+    for _ in range(200):
+        normal = rng.normal(size=3)
+        estimator.add(rng.normal(size=3), Plane(normal / np.linalg.norm(normal), rng.normal(size=3), behind=False))
+    assert estimator.joint is None
+
+
 def test_what_cannot_be_the_front_is_told():
     estimator, rng = opened(0.8), np.random.default_rng(1)
     _, plane = sight(1.1, rng)

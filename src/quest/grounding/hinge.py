@@ -40,6 +40,7 @@ _THICKNESS = 0.08
 _OFF_AXIS = 0.1
 _ROUNDS = 4
 _DIFFERENCE = 1e-5
+_MOST_CONDITION = 1e12
 
 
 @dataclass(frozen=True)
@@ -188,10 +189,13 @@ class HingeEstimator:
             rows = self._misfits(x, axis, rest, seen, q)
             near = x + _DIFFERENCE * np.eye(4)
             slopes = np.stack([self._misfits(each, axis, rest, seen, q) - rows for each in near]) / _DIFFERENCE
-            x = x - np.linalg.solve(slopes @ slopes.T, slopes @ rows)
+            information = slopes @ slopes.T
+            if not np.isfinite(information).all() or np.linalg.cond(information) > _MOST_CONDITION:
+                return None
+            x = x - np.linalg.solve(information, slopes @ rows)
         rows = self._misfits(x, axis, rest, seen, q)
         planes, points = np.abs(rows[: len(q) + 1]), np.hypot(*rows[len(q) + 1 : -2].reshape(2, -1))
-        shift = float(np.sqrt(np.linalg.inv(slopes @ slopes.T)[:2, :2].trace() / 2))
+        shift = float(np.sqrt(np.linalg.inv(information)[:2, :2].trace() / 2))
         sigma = _POINT_SIGMAS * self._sigma
         way = np.linalg.norm(x[:2]) * 2 * np.sin(np.abs(q) / 2) / sigma
         missed = points * self._point_sigma(len(q)) / sigma
