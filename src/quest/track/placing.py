@@ -141,15 +141,16 @@ class Placer:
         query, seen = self._following[i], float(self._seen[i])
         if query.place is None:
             return seen
-        turns = query.ground.front.joint is not None
-        if turns and not query.buried and residual > _OFF_TURN_SIGMAS and query.refused < _LONG_INSISTING:
+        leapt = not np.linalg.norm(own - query.place) < _LEAP
+        looked = leapt or query.buried
+        covered = looked and query.ground.covered(query.place, self._evidence[i], self._elapsed) > _COVERED
+        query.buried |= covered and leapt
+        off_turn = query.ground.front.joint is not None and residual > _OFF_TURN_SIGMAS
+        if off_turn and not query.buried and query.refused < _LONG_INSISTING:
             query.refused += 1
             return min(seen, _AFTER_ALL)
-        leapt = not np.linalg.norm(own - query.place) < _LEAP
-        if not (leapt or query.buried):
+        if not looked:
             return seen
-        covered = query.ground.covered(query.place, self._evidence[i], self._elapsed) > _COVERED
-        query.buried |= covered and leapt
         on_joint = residual < _OFF_JOINT_SIGMAS
         if not leapt:
             query.refused = 0

@@ -1,0 +1,49 @@
+"""Whether a query is seen where the network sees it, once its link was seen turning."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quest.track import TrackerConfig
+from quest.track.following import Following
+from quest.track.grounded import Ground
+from quest.track.placing import Placer
+from tests.track.test_grounded import BLIND, COVERED, Sight
+from tests.track.test_surface import DOOR_ORIGIN, door, seen
+
+FAR = DOOR_ORIGIN + np.array([0.0, 0.5, -0.6])
+
+
+def handle_on_a_door() -> Following:
+    """Followed while the door opened by 0.8 radians."""
+    ground, point = Ground(TrackerConfig()), door(0.0)[0]
+    for t, angle in enumerate((*np.zeros(8), *np.arange(0.0, 0.8, 0.03))):
+        point, plane = door(angle)
+        ground.face(plane, elapsed=1.0)
+        ground.see(point, seen(angle), now=t)
+    return Following(0, "handle", None, None, ground, place=point)
+
+
+def seen_at(query: Following, place: np.ndarray, frame: Sight) -> float:
+    placer = object.__new__(Placer)
+    placer._following, placer._evidence, placer._config = [query], [frame], TrackerConfig()
+    placer._elapsed, placer._now, placer._seen = 1.0, 40.0, np.array([0.9])
+    return placer._seen_at(0, place, query.ground.residual(place))
+
+
+def test_what_the_hinge_cannot_bring_somewhere_is_not_seen_there_unless_the_network_insists():
+    query = handle_on_a_door()
+    assert query.place is not None
+    assert seen_at(query, query.place, BLIND) == pytest.approx(0.9)
+    said = [seen_at(query, FAR, BLIND) for _ in range(31)]
+    assert max(said[:30]) <= 0.2
+    assert said[30] == pytest.approx(0.9)
+    assert not query.buried
+
+
+def test_what_comes_before_the_places_of_a_hinge_buries_the_query():
+    """So that it moves on as it moved, instead of being held as hidden by its own link."""
+    query = handle_on_a_door()
+    assert seen_at(query, FAR, COVERED) <= 0.2
+    assert query.buried
