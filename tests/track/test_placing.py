@@ -27,8 +27,8 @@ def handle_on_a_door() -> Following:
 
 def seen_at(query: Following, place: np.ndarray, frame: Sight) -> float:
     placer = object.__new__(Placer)
-    placer._following, placer._evidence, placer._config = [query], [frame], TrackerConfig()
-    placer._elapsed, placer._now, placer._seen = 1.0, 40.0, np.array([0.9])
+    vars(placer).update(_following=[query], _evidence=[frame], _config=TrackerConfig(), _elapsed=1.0, _now=40.0)
+    placer._seen = np.array([0.9])
     return placer._seen_at(0, place, query.ground.residual(place))
 
 
