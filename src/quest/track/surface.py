@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 import torch
@@ -19,8 +20,7 @@ _TOLERANCE = 0.012
 _LEAST_POINTS = 30
 _MOST_POINTS = 225
 _LEAST_SHARE = 0.3
-_PICKS = np.random.default_rng(0).random((96, 3))
-"""Which of the points around a place the tried planes go through, as shares of their number."""
+_PLANES = 96
 
 
 def face(frames: FrameBatch, following: Sequence[Following], *, elapsed: float) -> None:
@@ -77,7 +77,7 @@ def plane_at(
         return None
     if len(points) > _MOST_POINTS:
         points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)]
-    a, b, c = points[(_PICKS * len(points)).astype(int)].swapaxes(0, 1)
+    a, b, c = points[(_picks() * len(points)).astype(int)].swapaxes(0, 1)
     normal = cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)
     keep = length > 1e-5
@@ -100,3 +100,9 @@ def plane_at(
     if near is not None and found @ near < least_cosine:
         return None
     return Plane(found, middle, bool(found @ (camera - middle) < 0))
+
+
+@cache
+def _picks() -> Float[np.ndarray, "N 3"]:
+    """Which of the points around a place the tried planes go through, as shares of their number."""
+    return np.random.default_rng(0).random((_PLANES, 3))
