@@ -154,10 +154,6 @@ class HingeEstimator:
             return None
         return _rotated(self._rest[3:6], self._found.joint.axis, q - self._found.bias)
 
-    def anew(self) -> HingeEstimator:
-        """One that has learned nothing yet."""
-        return HingeEstimator(self._sigma)
-
     def state(self) -> dict[str, np.ndarray]:
         """All that was learned, as numeric arrays: what is restored from it goes on to the same bytes."""
         found = {"rows": self._rows.copy(), "at_rest": np.array(self._at_rest)}

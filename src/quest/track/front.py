@@ -23,6 +23,7 @@ class Front:
     """
 
     def __init__(self, sigma: float) -> None:
+        self._sigma = sigma
         self._hinge = HingeEstimator(sigma)
         self._plane: Plane | None = None
         self._normal: np.ndarray | None = None
@@ -69,7 +70,7 @@ class Front:
             self._contradicted = 0 if agrees else self._contradicted + 1
             plane = plane if agrees else None
             if self._contradicted > _CONTRADICTED:
-                self._hinge, self._contradicted, given_up = self._hinge.anew(), 0, True
+                self._hinge, self._contradicted, given_up = HingeEstimator(self._sigma), 0, True
         self._plane = plane
         self._unseen = self._unseen + elapsed if plane is None else 0.0
         self._normal = self._normal if plane is None else plane.normal
