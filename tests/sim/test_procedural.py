@@ -13,6 +13,7 @@ from quest.errors import ConfigError
 from quest.sim.objects import load_object
 from quest.sim.procedural import CATEGORIES, MIXES, category_for_seed, make_object
 from quest.sim.procedural.catalogue import build_model
+from quest.sim.procedural.clutter import with_clutter
 from quest.sim.procedural.handles import HANDLE_KINDS, HandleStyle, handle_part
 from quest.sim.procedural.model import Link, Mesh, ObjectModel
 
@@ -158,8 +159,8 @@ def test_mix_knows_every_category_and_is_stable() -> None:
 
 
 def test_broad_mix_has_everything() -> None:
-    with_handles = {name for name in CATEGORIES if not name.startswith("bare_")}
-    assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == with_handles
+    drawn = {name for name in CATEGORIES if not name.startswith(("bare_", "long_", "busy_"))}
+    assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == drawn
     with pytest.raises(ConfigError, match="unknown mix 'wide'; expected one of usual, broad"):
         category_for_seed(0, mix="wide")
 
@@ -170,6 +171,43 @@ def test_bare_furniture_has_no_handles(category: str) -> None:
         model = build_model(category, seed)
         assert len(model.links) >= 1
         assert not any(link.has_handle for link in model.links)
+
+
+@pytest.mark.parametrize("category", [name for name in CATEGORIES if name.startswith("long_")])
+def test_long_handles_run_along_their_fronts(category: str) -> None:
+    models = [build_model(category, seed) for seed in range(6)]
+    assert sum(link.has_handle for model in models for link in model.links) >= 6
+    for link in (link for model in models for link in model.links if link.has_handle):
+        (handle,) = [part.mesh.bounds for part in link.parts if part.role in HANDLES]
+        fronts = np.stack([part.mesh.bounds for part in link.parts if part.role not in HANDLES])
+        low, high = fronts[:, 0].min(axis=0), fronts[:, 1].max(axis=0)
+        along = 2 if link.kind == "revolute" and abs(link.axis[2]) > 0.5 else 0
+        if high[along] - low[along] < 0.12:
+            continue  # a strip may keep its own
+        assert 0.4 < np.ptp(handle[:, along]) / (high[along] - low[along]) < 1.0
+        assert handle[:, along].mean() == pytest.approx((low[along] + high[along]) / 2, abs=1e-3)
+
+
+@pytest.mark.parametrize("category", ["chest", "cabinet", "long_refrigerator", "range"])
+def test_clutter_adds_nothing_to_take_hold_of(category: str) -> None:
+    added: set[str] = set()
+    for seed in range(12):
+        plain = build_model(category, seed)
+        busy = with_clutter(plain, np.random.default_rng(seed))
+        raised = busy.links[0].origin[2] - plain.links[0].origin[2]
+        assert raised >= 0
+        for link, other in zip(plain.links, busy.links, strict=True):
+            assert (link.kind, link.axis, link.upper) == (other.kind, other.axis, other.upper)
+            np.testing.assert_allclose(np.asarray(other.origin) - link.origin, (0, 0, raised), atol=1e-9)
+            assert other.parts[: len(link.parts)] == link.parts
+            grips = [part.mesh.bounds[:, [0, 2]] for part in link.parts if part.role in HANDLES]
+            for part in other.parts[len(link.parts) :]:
+                added.add(part.role)
+                if part.role != "moulding":
+                    low, high = part.mesh.bounds[:, [0, 2]]
+                    assert all((high < a).any() or (low > b).any() for a, b in grips), part.role
+        added |= {part.role for part in busy.body[len(plain.body) :]}
+    assert added == {"vent", "keypad", "display", "badge", "moulding", "thing", "shelf_case", "leg"}
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,10 @@ import numpy as np
 
 from quest.errors import ConfigError
 from quest.sim.procedural.appliances import APPLIANCES
+from quest.sim.procedural.clutter import with_clutter
 from quest.sim.procedural.laptop import build_laptop, build_trunk
 from quest.sim.procedural.layouts import FURNITURE
+from quest.sim.procedural.long_handles import with_long_handles
 from quest.sim.procedural.model import HANDLE_ROLES, ObjectModel
 from quest.sim.procedural.room_door import build_room_door
 from quest.sim.procedural.storage import STORAGE
@@ -27,11 +29,31 @@ _OFTEN_BARE = (
 )  # fmt: skip
 
 
+_OFTEN_LONG = (
+    "chest", "cabinet", "wardrobe", "sideboard", "wall_unit", "base_cabinet", "wall_cabinet", "refrigerator",
+    "french_refrigerator", "microwave", "range", "dishwasher", "rack_dishwasher", "drawer_oven",
+)  # fmt: skip
+_OFTEN_BUSY = (
+    "chest", "cabinet", "sideboard", "wall_unit", "desk", "base_cabinet", "refrigerator", "long_refrigerator",
+    "bare_microwave", "microwave", "long_microwave", "range", "dishwasher", "long_drawer_oven",
+)  # fmt: skip
+
+
 def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
     model = _BUILDERS[category](rng)
     links = [replace(link, parts=tuple(p for p in link.parts if p.role not in HANDLE_ROLES)) for link in model.links]
     return replace(model, links=tuple(links))
+
+
+def _build_long(category: str, rng: np.random.Generator) -> ObjectModel:
+    """Furniture and appliances with handles as long as their fronts."""
+    return with_long_handles(_BUILDERS[category](rng), rng)
+
+
+def _build_busy(category: str, rng: np.random.Generator) -> ObjectModel:
+    """Furniture and appliances with what is no handle on and around them."""
+    return with_clutter(_BUILDERS[category](rng), rng)
 
 
 _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
@@ -44,6 +66,8 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **THINGS,
     "room_door": build_room_door,
     **{f"bare_{name}": partial(_build_bare, name) for name in _OFTEN_BARE},
+    **{f"long_{name}": partial(_build_long, name) for name in _OFTEN_LONG},
+    **{f"busy_{name}": partial(_build_busy, name) for name in _OFTEN_BUSY},
 }
 
 _WEIGHTS = {
@@ -59,7 +83,8 @@ _MORE_WEIGHTS = {
 }  # fmt: skip
 
 MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
-"""How often each category comes: the usual mix, and one of everything but furniture without handles (``bare_``)."""
+"""How often each category comes: the usual mix, and one of everything but what has no handles (``bare_``), long ones
+(``long_``), or what is no handle beside its own (``busy_``)."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""
