@@ -168,7 +168,7 @@ class TuneWeights:
     objects: tuple[str, ...] = ()
     """Objects to use; all by default."""
     discovery_only: bool = False
-    """Leave all settings but the threshold of discovery as they are, as after training with --stage map."""
+    """Leave all settings but those of discovery as they are, as after training with --stage map."""
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""

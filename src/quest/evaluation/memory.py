@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 
 from torch import Tensor
 
@@ -15,18 +16,23 @@ def remember_frames(network: QuestNetwork, *, capacity: int) -> None:
 
     Args:
         network: changed in place.
-        capacity: frames to remember, 1.6 MB each; the oldest is forgotten first.
+        capacity: frames to remember, 1.6 MB each and 1.2 MB where the affordance map is read; the oldest is forgotten
+            first.
     """
-    encode, observe = network.encode, network.observe
-    features: dict[bytes, Tensor] = {}
+    observe = network.observe
     observations: dict[bytes, Observation] = {}
 
-    def remembered_encode(rgb: Tensor) -> Tensor:
-        key = _digest(rgb)
-        if key not in features:
-            _make_room(features, capacity)
-            features[key] = encode(rgb)
-        return features[key]
+    def remembering(encode: Callable[[Tensor], Tensor]) -> Callable[[Tensor], Tensor]:
+        features: dict[bytes, Tensor] = {}
+
+        def remembered(rgb: Tensor) -> Tensor:
+            key = _digest(rgb)
+            if key not in features:
+                _make_room(features, capacity)
+                features[key] = encode(rgb)
+            return features[key]
+
+        return remembered
 
     def remembered_observe(frames: FrameBatch) -> Observation:
         key = _digest(frames.rgb, frames.depth_m, frames.ref_from_cam, frames.intrinsics, frames.center, frames.scale)
@@ -35,7 +41,9 @@ def remember_frames(network: QuestNetwork, *, capacity: int) -> None:
             observations[key] = observe(frames)
         return observations[key]
 
-    network.encode, network.observe = remembered_encode, remembered_observe  # type: ignore[method-assign]
+    network.encode = remembering(network.encode)  # type: ignore[method-assign]
+    network.enlarge = remembering(network.enlarge)  # type: ignore[method-assign]
+    network.observe = remembered_observe  # type: ignore[method-assign]
 
 
 def _make_room(known: dict, capacity: int) -> None:

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from quest.model.bars import ALIKE, find_ridges
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
 from quest.types import LABELS
@@ -19,10 +20,8 @@ FOUND_WITHIN = 0.1
 
 _PURPOSES_APART_PX = 3.0
 
-_ALIKE = 2.0
-"""Cells along a rim whose logit is at most so much below the best one's are a part of it ..."""
 _VOTES_WITHIN_PX = 40.0
-"""... if they point so near to where the best one points."""
+"""Cells along a rim are a part of it if they point so near to where the best one points."""
 
 
 @dataclass(frozen=True)
@@ -78,19 +77,27 @@ class Candidates:
 
 
 def find_candidates(
-    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+    network: QuestNetwork,
+    frames: FrameBatch,
+    observed: Observation,
+    *,
+    radius_cells: float,
+    prominence: float = 0.0,
+    mirror: bool = True,
 ) -> Candidates:
     """Peaks of one frame (B = 1, T = 1).
 
     A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
-    places look alike, where its cells point to in the mean. Peaks clash that are closer than ``radius_cells``. The
-    same label for another intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
+    places look alike, where its cells point to in the mean. So does a handle that has several peaks, if those are to
+    be one (see :mod:`quest.model.bars`). Peaks clash that are closer than ``radius_cells``. The same label for another
+    intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
 
     Args:
         network: whose map is read.
         frames: the frame.
         observed: the frame as observed.
         radius_cells: how far peaks are apart.
+        prominence: by how much the logit falls between two peaks of one handle at least; 0 lets it have several.
         mirror: whether the map is the mean of the frame's and of its mirror image's, which finds more and costs the
             encoding of another image.
     """
@@ -103,11 +110,15 @@ def find_candidates(
     scores = found.logits[0, 0].flatten(1).T.reshape(-1, side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
     flat = torch.where(is_peak, scores, -torch.inf).flatten()
-    value, index = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
+    pointed = cell_centres(network.config, device=flat.device)[:, None] + cell * found.offset[0, 0]
+    peaks = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
+    index, bars = _one_per_bar(network, frames, scores, pointed, peaks, prominence=prominence)
+    value = flat[index]
     channel, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
     label, purpose = channel.div(purposes, rounding_mode="floor"), channel % purposes
-    pointed = cell_centres(network.config, device=place.device)[:, None] + cell * found.offset[0, 0]
     uv_px = pointed[place, purpose]
+    for n, cells in bars.items():
+        uv_px[n] = pointed[cells, purpose[n]].mean(dim=0)
     rim = torch.nonzero(label == LABELS.index("rim"))[:, 0]
     votes, likeness = pointed[:, purpose[rim]].transpose(0, 1), scores.flatten(1)[channel[rim]] - value[rim, None]
     uv_px[rim] = _agreed(uv_px[rim], votes, likeness)
@@ -123,11 +134,61 @@ def find_candidates(
 
 
 def find_peaks(
-    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+    network: QuestNetwork,
+    frames: FrameBatch,
+    observed: Observation,
+    *,
+    radius_cells: float,
+    prominence: float = 0.0,
+    mirror: bool = True,
 ) -> Peaks:
     """Those of :func:`find_candidates` that do not clash, at most as many as the network has slots."""
-    found = find_candidates(network, frames, observed, radius_cells=radius_cells, mirror=mirror)
+    found = find_candidates(network, frames, observed, radius_cells=radius_cells, prominence=prominence, mirror=mirror)
     return found.peaks.select(found.apart()[: network.config.slots])
+
+
+def _one_per_bar(
+    network: QuestNetwork,
+    frames: FrameBatch,
+    scores: Float[Tensor, "N S S"],
+    pointed_px: Float[Tensor, "C P 2"],
+    peaks: torch.return_types.topk,
+    *,
+    prominence: float,
+) -> tuple[Int[Tensor, " K"], dict[int, list[int]]]:
+    """Peaks without those that are on the same handle as a better one.
+
+    Args:
+        network: whose map it is.
+        frames: the frame.
+        scores: logits of every label and purpose.
+        pointed_px: where cells point to for every purpose.
+        peaks: values and flat indices into the scores, best first.
+        prominence: by how much the logit falls between two of them on one handle at least.
+
+    Returns:
+        Indices of those that are left, and for those of them that had company the cells of their handle.
+    """
+    cells, purposes = scores[0].numel(), pointed_px.shape[1]
+    needless: set[int] = set()
+    cells_of: dict[int, list[int]] = {}
+    if prominence > 0 and len(peaks.values):
+        floor, depth_m, scale = float(peaks.values[-1]), frames.depth_m[0, 0].float(), frames.scale[0].float()
+        for purpose in range(purposes):
+            channel = LABELS.index("handle") * purposes + purpose
+            aims, score = pointed_px[:, purpose], scores[channel]
+            for ridge in find_ridges(
+                score, aims, floor, prominence=prominence, depth_m=depth_m, scale=scale, config=network.config
+            ):
+                best, *others = ridge.tops
+                needless |= {channel * cells + top for top in others}
+                if others:
+                    likeness = score.flatten()[ridge.cells] - score.flatten()[best]
+                    alike = torch.nonzero(likeness > -ALIKE)[:, 0].tolist()
+                    cells_of[channel * cells + best] = [ridge.cells[n] for n in alike]
+    kept = [i for i in peaks.indices.tolist() if i not in needless]
+    company = {n: cells_of[i] for n, i in enumerate(kept) if i in cells_of}
+    return peaks.indices.new_tensor(kept), company
 
 
 def _agreed(
@@ -141,7 +202,7 @@ def _agreed(
         likeness: their logits less the peak's.
     """
     near = (votes - uv_px[:, None]).norm(dim=-1) < _VOTES_WITHIN_PX
-    agree = (near & (likeness > -_ALIKE)).unsqueeze(-1)
+    agree = (near & (likeness > -ALIKE)).unsqueeze(-1)
     return (votes * agree).sum(dim=1) / agree.sum(dim=1)
 
 
