@@ -24,6 +24,7 @@ import tyro
 import quest
 from quest.cli.main import main
 from quest.model.weights import DEFAULTS, load_network, shipped_weights
+from quest.sim.procedural import CATEGORIES
 from quest.train.dataset import licence_after
 
 ROOT = Path(__file__).parents[1]
@@ -86,6 +87,11 @@ PROCEDURAL = (
 )
 
 
+def _kinds(prefix: str) -> tuple[str, ...]:
+    """Categories of procedural objects that come by name only."""
+    return tuple(name for name in CATEGORIES if name.startswith(prefix))
+
+
 _WIDE = "--level 1 --frames-per-joint 24 --every 8"
 MAP_PARTNET = (
     TrainingTakes("wide_partnet", f"--mix broad {_WIDE} --views 5 --takes-per-object 4 --seed 100"),
@@ -96,25 +102,9 @@ MAP_PROCEDURAL = (
     TrainingTakes("wide_broad", f"--mix broad {_WIDE} --views 4", 310, 21_000),
     TrainingTakes("wide_usual", f"{_WIDE} --views 4", 150, 1_000),
     # No mix has these, but PartNet-Mobility has many.
-    TrainingTakes(
-        "wide_bare",
-        f"{_WIDE} --views 4",
-        12,
-        23_000,
-        (
-            "bare_chest",
-            "bare_night_stand",
-            "bare_cabinet",
-            "bare_wardrobe",
-            "bare_sideboard",
-            "bare_desk",
-            "bare_drawer_desk",
-            "bare_wall_unit",
-            "bare_refrigerator",
-            "bare_french_refrigerator",
-            "bare_microwave",
-        ),
-    ),
+    TrainingTakes("wide_bare", f"{_WIDE} --views 4", 12, 23_000, _kinds("bare_")),
+    TrainingTakes("wide_long", f"{_WIDE} --views 2", 14, 71_000, _kinds("long_")),
+    TrainingTakes("wide_busy", f"{_WIDE} --views 2", 8, 73_000, _kinds("busy_")),
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 
