@@ -29,7 +29,7 @@ from quest.train.dataset import licence_after
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
-Stage = Literal["takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship"]
+Stage = Literal["takes", "train", "map", "flow", "pieces", "tune", "calibrate", "evaluate", "ship"]
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,14 @@ MAP_PROCEDURAL = (
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 
+PIECES = (
+    TrainingTakes("pieces", f"--mix broad {_WIDE} --views 2", 150, 76_000),
+    TrainingTakes("pieces", f"{_WIDE} --views 2", 3, 76_200, (*_kinds("bare_"), *_kinds("long_"), *_kinds("busy_"))),
+    TrainingTakes("pieces_sensor", f"--mix broad --sensor stereo {_WIDE} --views 2", 50, 77_000),
+    TrainingTakes("pieces_sensor", f"--mix broad --sensor structured-light {_WIDE} --views 2", 50, 77_100),
+)
+"""What the ranking of pieces that stand out learns from: objects that the map has not seen."""
+
 MAP_CHOICE = f"{_WIDE} --views 4"
 """The same of validation objects, by which the map's checkpoint and the threshold of discovery are chosen."""
 
@@ -125,7 +133,9 @@ class Release:
     lie in a folder of that name."""
     beside: str | None = None
     """Name of shipped weights with the same encoder, which the file then leaves out."""
-    stages: tuple[Stage, ...] = ("takes", "train", "map", "flow", "tune", "calibrate", "evaluate", "ship")
+    stages: tuple[Stage, ...] = (
+        "takes", "train", "map", "flow", "pieces", "tune", "calibrate", "evaluate", "ship",
+    )  # fmt: skip
     """Which stages to run; each needs what those before it made."""
     partnet: bool = True
     """Whether PartNet-Mobility objects teach, which makes the weights for research use only."""
@@ -197,7 +207,7 @@ class Release:
 
     def _takes(self) -> None:
         """Takes that teach, thinned, and takes that choose, whole."""
-        for takes in (*self._recipe(), *self._map_recipe()):
+        for takes in (*self._recipe(), *self._map_recipe(), *PIECES):
             which: list[object] = ["--split", "train", "--no-partnet" if takes.objects else "--partnet"]
             count = max(1, round(self.procedural_share * takes.objects))
             seeds = range(takes.first_seed, takes.first_seed + count)
@@ -240,10 +250,16 @@ class Release:
                *self._taught_by(self._recipe(), "validation"), "--out", self.work / "flow",
                "--training.steps", self.flow_steps)  # fmt: skip
 
+    def _pieces(self) -> None:
+        """What of all that stands out is a handle, in a copy."""
+        copy = self.work / "pieces.safetensors"
+        shutil.copyfile(self.work / "flow" / "weights.safetensors", copy)
+        _quest("weights", "pieces", copy, "--takes", *self._stores(PIECES))
+
     def _tune(self) -> None:
         """The tracker's settings, in a copy that gets its name when they are chosen."""
         untuned = self.work / "untuned.safetensors"
-        shutil.copyfile(self.work / "flow" / "weights.safetensors", untuned)
+        shutil.copyfile(self.work / "pieces.safetensors", untuned)
         choose = (self._takes_of("validation"), self._takes_of("suites_validation"))
         _quest("weights", "tune", untuned, "--takes", *choose, "--level", 1, 4)
         _quest("weights", "tune", untuned, "--takes", self._takes_of("wide_validation"), "--discovery-only")

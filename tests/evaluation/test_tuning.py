@@ -14,7 +14,7 @@ from quest.errors import ConfigError
 from quest.evaluation import tuning
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.selection import SplitPart
-from quest.evaluation.tuning import Trial, Tuned, discovery_bias, tune
+from quest.evaluation.tuning import Trial, discovery_bias, tune
 from quest.model.discovery import Peaks
 from quest.track import Tracker
 from quest.types import LABELS, Query
@@ -113,11 +113,3 @@ def test_remembering_changes_nothing(store: TakeStore, tmp_path: Path, capacity:
         again = tracker.track(clip, queries)
         np.testing.assert_allclose(again.uv_px, plain.uv_px, atol=1e-4)
         np.testing.assert_allclose(again.point_world, plain.point_world, atol=1e-5)
-
-
-def test_peaks_along_one_handle_are_one_where_that_gives_the_best_f2(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
-    found = {0.0: (0.1, 0.4, 0.8), 0.75: (0.2, 0.6, 0.8), 1.5: (0.3, 0.9, 0.6)}
-    monkeypatch.setattr(tuning, "discovery_bias", lambda tracker, _: found[tracker.config.slot_prominence])
-    tracker = make_tracker()
-    tuned = tune(tracker, [(store, {NAME: "validation"})], report=print, discovery_only=True)
-    assert tuned == Tuned(replace(tracker.config, slot_prominence=0.75, slot_bias=0.2), (), 0.6, 0.8)

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from dataclasses import fields
 
-import numpy as np
 import pytest
 import torch
 
 from quest.baselines.clip_frames import ClipFrames
 from quest.data.mirror import mirror_take
 from quest.model.affordance import AffordanceMap
-from quest.model.bars import find_ridges
 from quest.model.discovery import Candidates, Peaks, _mirrored, find_peaks, match_peaks
-from quest.model.observation import FrameBatch, Observation, cell_centres
+from quest.model.observation import FrameBatch, Observation
 from quest.types import LABELS, Take
 from tests.synthetic import make_take
 from tests.tiny import make_frames, make_network
@@ -100,47 +98,3 @@ def test_nothing_seen_is_nothing_found():
     nothing = torch.zeros(0, 3), torch.zeros(0, dtype=torch.long)
     assert match_peaks(*some, *nothing, half_diagonal_m=1.0).tolist() == [-1, -1]
     assert match_peaks(*nothing, *some, half_diagonal_m=1.0).tolist() == []
-
-
-@pytest.mark.parametrize(
-    ("gap_px", "aims", "saddle", "tops"),
-    [(0, 0.5, 2.5, 1), (6, 0.5, 2.5, 2), (0, 1.0, 2.5, 2), (0, 0.5, 1.0, 2)],
-    ids=["one bar", "a gap in between", "each points to itself", "the score falls in between"],
-)
-def test_tops_on_one_bar_are_one_thing(gap_px: int, aims: float, saddle: float, tops: int):
-    network = make_network()
-    side, size = network.config.cells, network.config.encoder.image_size
-    depth = torch.full((size, size), 1.0)
-    depth[26:30, 6:58] = 0.9
-    depth[:, 32 - gap_px // 2 : 32 + gap_px // 2] = 1.0
-    score = torch.full((side, side), -9.0)
-    score[3, 1:7] = torch.tensor([3.0, 2.6, saddle, 2.6, 2.9, 2.7])
-    centres = cell_centres(network.config, device=depth.device)
-    pointed = torch.tensor([32.0, 28.0]) + aims * (centres - torch.tensor([32.0, 28.0]))
-    ridges = find_ridges(
-        score, pointed, 2.0, prominence=1.0, depth_m=depth, scale=torch.tensor(1.0), config=network.config
-    )
-    assert len(ridges) == tops
-    assert sorted(top for ridge in ridges for top in ridge.tops) == [3 * side + 1, 3 * side + 5]
-    flat = find_ridges(
-        score, pointed, 2.0, prominence=1.0, depth_m=0 * depth, scale=torch.tensor(1.0), config=network.config
-    )
-    assert len(flat) == 2, "without depth"
-
-
-def test_a_handle_with_two_tops_is_found_once_where_its_cells_point_to_in_the_mean():
-    network, frames = make_network(), make_frames(batch=1, frames=1)
-    frames.depth_m[:] = 1.0
-    frames.depth_m[..., 26:30, 6:58] = 0.9
-    frames.scale[:] = 1.0
-    logits, offset = torch.full((1, 1, 64, len(LABELS), 2), -9.0), torch.zeros(1, 1, 64, 2, 2)
-    for cell, score, x in ((25, 3.0, 1.0), (26, 2.6, 0.5), (27, 2.5, 0.0), (28, 2.6, -0.5), (29, 2.9, -1.0)):
-        logits[..., cell, LABELS.index("handle"), 0] = score
-        offset[..., cell, 0, 0] = x
-    with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr(network, "afford", lambda *_: AffordanceMap(logits, offset))
-        observed = network.observe(frames)
-        every = find_peaks(network, frames, observed, radius_cells=0.1, mirror=False)
-        peaks = find_peaks(network, frames, observed, radius_cells=0.1, prominence=1.0, mirror=False)
-    np.testing.assert_allclose(every.uv[every.logit > 0], [[20 / 64, 28 / 64], [36 / 64, 28 / 64]])
-    np.testing.assert_allclose(peaks.uv[peaks.logit > 0], [[28 / 64, 28 / 64]])

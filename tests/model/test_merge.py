@@ -60,6 +60,18 @@ def test_a_flow_head_comes_along_by_the_command_line(tmp_path: Path, capsys: pyt
         assert torch.equal(merged.flow.state_dict()[name], tensor)
 
 
+def test_what_ranks_pieces_goes_with_one_map_and_not_with_a_mean(tmp_path: Path):
+    base = write(tmp_path / "base.safetensors")
+    ranking = write(tmp_path / "pieces.safetensors", replace(DEFAULT, pieces=True), add=1.0)
+    one, mean = merge(base, maps=[ranking]).network, merge(ranking, maps=[ranking, base]).network
+    assert one.affordance_pieces is not None
+    assert ranking.network.affordance_pieces is not None
+    assert torch.equal(one.affordance_pieces.gain, ranking.network.affordance_pieces.gain)
+    assert mean.affordance_pieces is None
+    assert merge(ranking).network.affordance_pieces is not None
+    assert merge(ranking, maps=[base]).network.affordance_pieces is None
+
+
 def test_what_does_not_fit_is_refused(tmp_path: Path):
     base = write(tmp_path / "base.safetensors")
     moved = write(tmp_path / "moved.safetensors", add=1.0, to="observer.")

@@ -52,7 +52,6 @@ class Detector:
         device: where it runs.
         min_logit: least score of a detection.
         radius_cells: of peaks closer than this the best stays.
-        prominence: by how much the score falls between two peaks of one handle at least; 0 lets it have several.
         depth_window_px: odd side of the window whose median depth lifts a pixel.
         autocast: whether the network computes in bfloat16.
         weights_hash: SHA-256 of the file that the network came from, for result files.
@@ -68,7 +67,6 @@ class Detector:
         device: torch.device,
         min_logit: float = 0.0,
         radius_cells: float = 1.5,
-        prominence: float = 0.0,
         depth_window_px: int = 3,
         autocast: bool = False,
         weights_hash: str | None = None,
@@ -82,7 +80,6 @@ class Detector:
         self.device = device
         self.min_logit = min_logit
         self.radius_cells = radius_cells
-        self.prominence = prominence
         self.depth_window_px = depth_window_px
         self.autocast = autocast
         self.weights_hash = weights_hash
@@ -95,9 +92,7 @@ class Detector:
         """What is seen in frame ``t``."""
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
             batch, observed = frames.see(t)
-            peaks = find_peaks(
-                self.network, batch, observed, radius_cells=self.radius_cells, prominence=self.prominence
-            )
+            peaks = find_peaks(self.network, batch, observed, radius_cells=self.radius_cells)
         kept = torch.nonzero(peaks.logit > self.min_logit)[:, 0]
         uv_px = frames.to_source(peaks.uv[kept])
         score = (peaks.logit[kept] - self.min_logit).sigmoid().float().cpu().numpy()

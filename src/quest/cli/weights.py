@@ -1,4 +1,4 @@
-"""``quest weights``: list, show, push to the hub, merge, make the encoder's initial weights, tune, calibrate."""
+"""``quest weights``: list, show, push, merge, make the encoder's first weights, rank pieces, tune, calibrate."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ class TuneWeights:
     objects: tuple[str, ...] = ()
     """Objects to use; all by default."""
     discovery_only: bool = False
-    """Leave all settings but those of discovery as they are, as after training with --stage map."""
+    """Leave all settings but the threshold of discovery as they are, as after training with --stage map."""
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
@@ -196,6 +196,47 @@ class TuneWeights:
             console.print("other settings make other signals: the monitor is dropped; run `quest weights calibrate`")
             found = replace(found, monitor=None)
         found.save(self.weights)
+        return 0
+
+
+@dataclass(frozen=True)
+class PiecesWeights:
+    """Teach discovery which pieces that stand out of planes are handles and knobs, and store it with the weights.
+
+    After training the affordance map, on takes of training objects that the map did not learn from, or of your own.
+    Tune the threshold afterwards (`quest weights tune --discovery-only`).
+    """
+
+    weights: tyro.conf.Positional[Path]
+    """File of trained weights; it is rewritten."""
+    takes: tuple[str, ...]
+    """Stores with takes of training objects, of which the first frames are used."""
+    seed: int = 0
+    """Seed of the first weights."""
+
+    def run(self) -> int:
+        """Learn, print what from, rewrite the file."""
+        from quest.data.store import TakeStore
+        from quest.evaluation.piece_learning import learn_pieces
+        from quest.evaluation.selection import select_takes
+        from quest.model.weights import load_network
+        from quest.track import load
+
+        _must_be_a_file(self.weights)
+        console = Console(highlight=False)
+        stores = [TakeStore(url) for url in self.takes]
+        takes = [(store, select_takes(store.infos(), split=("train", "unlisted"))) for store in stores]
+        learned = learn_pieces(
+            load(self.weights, monitor=False),
+            takes,
+            seed=self.seed,
+            progress=lambda name, done, total: console.print(f"{done + 1}/{total} {escape(name)}"),
+        )
+        console.print(
+            f"learned from {learned.pieces} pieces, {learned.right} of them handles or knobs, "
+            f"and {learned.peaks} peaks of the map; loss {learned.loss:.3f}"
+        )
+        replace(load_network(self.weights), network=learned.network).save(self.weights)
         return 0
 
 
@@ -271,6 +312,7 @@ class Weights:
         | Annotated[PushWeights, tyro.conf.subcommand("push")]
         | Annotated[MergeWeights, tyro.conf.subcommand("merge")]
         | Annotated[ImportEncoder, tyro.conf.subcommand("import-encoder")]
+        | Annotated[PiecesWeights, tyro.conf.subcommand("pieces")]
         | Annotated[TuneWeights, tyro.conf.subcommand("tune")]
         | Annotated[CalibrateWeights, tyro.conf.subcommand("calibrate")]
     )

@@ -85,7 +85,7 @@ def variant(tracker: Tracker, name: str, *, unit_m: Callable[[Clip], float], see
 
 
 def detector_of(tracker: Tracker) -> Detector:
-    """What finds the slots that a tracker would discover: the same map, threshold and rules for peaks.
+    """What finds the slots that a tracker would discover: the same map, threshold and radius.
 
     Raises:
         WeightsError: the network has no affordance map.
@@ -97,7 +97,6 @@ def detector_of(tracker: Tracker) -> Detector:
         device=tracker.device,
         min_logit=odds / config.slot_gain - config.slot_bias,
         radius_cells=config.slot_radius_cells,
-        prominence=config.slot_prominence,
         autocast=fast_bfloat16(tracker.device),
         weights_hash=tracker.weights_hash,
     )

@@ -33,8 +33,6 @@ GRID: dict[str, tuple[float, ...]] = {
 }
 """Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
 
-PROMINENCES = (0.0, 0.75, 1.5)
-"""Values of ``slot_prominence`` that are tried."""
 _BETA = 2.0
 
 
@@ -83,8 +81,8 @@ def tune(
         tracker: network and settings to start from.
         takes: stores with takes of validation objects.
         report: told of every trial.
-        discovery_only: leave all settings but those of discovery as they are, as after training the affordance map
-            alone.
+        discovery_only: leave all settings but the threshold of discovery as they are, as after training the affordance
+            map alone.
 
     Raises:
         ConfigError: a take is not of a validation object, or nothing moves in them.
@@ -95,7 +93,8 @@ def tune(
         raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
     config, trials = tracker.config, []
     remember_frames(tracker.network, capacity=10_000)
-    config, precision, recall = _discovery(tracker, takes)
+    bias, precision, recall = discovery_bias(tracker, takes)
+    config = replace(config, slot_bias=bias)
     known: dict[TrackerConfig, float] = {}
     for name, values in () if discovery_only else GRID.items():
         configs = [replace(config, **{name: v}) for v in values]
@@ -107,17 +106,6 @@ def tune(
         trials += tried
         config = replace(config, **{name: min(tried, key=lambda t: t.ape).value})
     return Tuned(config, tuple(trials), precision, recall)
-
-
-def _discovery(tracker: Tracker, takes: Chosen) -> tuple[TrackerConfig, float, float]:
-    """Settings with prominence and bias of the best F2 (the smallest of equals), its precision and recall."""
-    trials: list[tuple[float, TrackerConfig, float, float]] = []
-    for prominence in PROMINENCES:
-        config = replace(tracker.config, slot_prominence=prominence)
-        bias, precision, recall = discovery_bias(tracker.with_config(config, name=tracker.name), takes)
-        f2 = (1 + _BETA**2) * precision * recall / max(_BETA**2 * precision + recall, 1e-9)
-        trials.append((f2, replace(config, slot_bias=bias), precision, recall))
-    return max(trials, key=lambda trial: trial[0])[1:]
 
 
 def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float]:

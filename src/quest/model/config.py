@@ -34,6 +34,7 @@ class NetworkConfig:
         intents: whether queries and the affordance map tell entities to open from entities to lift.
         map_layers: transformer layers of the affordance map's own trunk, over tokens of the image at twice its size;
             0 reads the map off what the decoder looks at.
+        pieces: whether discovery ranks what stands out of planes, which `quest weights pieces` teaches.
         flow: whether there is a flow head, which stage 2 trains.
     """
 
@@ -51,6 +52,7 @@ class NetworkConfig:
     cell_px: int = 8
     intents: bool = False
     map_layers: int = 0
+    pieces: bool = False
     flow: bool = False
 
     def __post_init__(self) -> None:

@@ -1,18 +1,19 @@
-"""Discovery: peaks of the dense affordance map, which seed the slots."""
+"""Discovery: peaks of the dense affordance map, and pieces that stand out of planes, which seed the slots."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from quest.model.bars import ALIKE, find_ridges
+from quest.model.affordance import AffordanceMap
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
+from quest.model.pieces import PIECE_LABELS, PIECES_APART_PX, Pieces, find_pieces, groups
 from quest.types import LABELS
 
 FOUND_WITHIN = 0.1
@@ -20,8 +21,10 @@ FOUND_WITHIN = 0.1
 
 _PURPOSES_APART_PX = 3.0
 
+_ALIKE = 2.0
+"""Cells along a rim whose logit is at most so much below the best one's are a part of it ..."""
 _VOTES_WITHIN_PX = 40.0
-"""Cells along a rim are a part of it if they point so near to where the best one points."""
+"""... if they point so near to where the best one points."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class Peaks:
         uv: coordinates in [0, 1]^2 of the network's input.
         point_m: what is seen there, lifted by the nearest depth around: camera axes, metres; NaN without depth.
         label: index into LABELS.
-        logit: score of the affordance map.
+        logit: score of the affordance map; log odds of being right where the network ranks pieces.
         intent: index into INTENTS, or UNKNOWN_INTENT if the network does not know.
     """
 
@@ -76,49 +79,81 @@ class Candidates:
         return keep
 
 
+@dataclass(frozen=True)
+class Sighted:
+    """What a frame has to choose from, before it is ranked.
+
+    Attributes:
+        peaks: of the affordance map, with its scores.
+        pieces: what stands out of planes.
+        on_piece: which peaks of handles and knobs are on which piece.
+        group: of each peak, see :func:`quest.model.pieces.groups`.
+    """
+
+    peaks: Candidates
+    pieces: Pieces
+    on_piece: Bool[Tensor, "K P"]
+    group: Int[Tensor, " K"]
+
+
 def find_candidates(
-    network: QuestNetwork,
-    frames: FrameBatch,
-    observed: Observation,
-    *,
-    radius_cells: float,
-    prominence: float = 0.0,
-    mirror: bool = True,
+    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
 ) -> Candidates:
-    """Peaks of one frame (B = 1, T = 1).
+    """What may be an entity in one frame (B = 1, T = 1): peaks of the map, and pieces if the network ranks them.
 
     A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
-    places look alike, where its cells point to in the mean. So does a handle that has several peaks, if those are to
-    be one (see :mod:`quest.model.bars`). Peaks clash that are closer than ``radius_cells``. The same label for another
-    intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
+    places look alike, where its cells point to in the mean. Peaks clash that are closer than ``radius_cells``. The
+    same label for another intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
+    A piece lies in its own middle, once for every label that it may have; handles and knobs on it clash with it
+    however far they are from there.
 
     Args:
         network: whose map is read.
         frames: the frame.
         observed: the frame as observed.
         radius_cells: how far peaks are apart.
-        prominence: by how much the logit falls between two peaks of one handle at least; 0 lets it have several.
         mirror: whether the map is the mean of the frame's and of its mirror image's, which finds more and costs the
             encoding of another image.
     """
-    side, cell = network.config.cells, network.config.cell_px
+    if network.affordance_pieces is None:
+        return _peaks(network, frames, _map(network, frames, observed, mirror=mirror), radius_cells=radius_cells)
+    sighted = sight(network, frames, observed, radius_cells=radius_cells, mirror=mirror)
+    return _ranked(network, frames, sighted, radius_px=radius_cells * network.config.cell_px)
+
+
+def sight(
+    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+) -> Sighted:
+    """Peaks and pieces of one frame; the arguments are those of :func:`find_candidates`."""
+    found = _map(network, frames, observed, mirror=mirror)
+    peaks = _peaks(network, frames, found, radius_cells=radius_cells)
+    side = network.config.cells
+    pieces = find_pieces(frames, found.logits[0, 0].permute(1, 2, 0).unflatten(-1, (side, side)), network.config)
+    uv_px, label = peaks.peaks.uv * network.config.encoder.image_size, peaks.peaks.label
+    pieces_may_be = torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=label.device)
+    on_piece = pieces.under(uv_px).to(label.device) & torch.isin(label, pieces_may_be)[:, None]
+    return Sighted(peaks, pieces, on_piece, groups(frames, uv_px, label, on_piece.any(dim=1)))
+
+
+def _map(network: QuestNetwork, frames: FrameBatch, observed: Observation, *, mirror: bool) -> AffordanceMap:
     found = network.afford(frames, observed)
-    if mirror:
-        other = _mirrored(network, frames)
-        found = found.mean(network.afford(other, network.observe(other)).mirrored())
+    if not mirror:
+        return found
+    other = _mirrored(network, frames)
+    return found.mean(network.afford(other, network.observe(other)).mirrored())
+
+
+def _peaks(network: QuestNetwork, frames: FrameBatch, found: AffordanceMap, *, radius_cells: float) -> Candidates:
+    side, cell = network.config.cells, network.config.cell_px
     purposes = found.logits.shape[-1]
     scores = found.logits[0, 0].flatten(1).T.reshape(-1, side, side)
     is_peak = scores == F.max_pool2d(scores.unsqueeze(0), 3, 1, 1).squeeze(0)
     flat = torch.where(is_peak, scores, -torch.inf).flatten()
-    pointed = cell_centres(network.config, device=flat.device)[:, None] + cell * found.offset[0, 0]
-    peaks = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
-    index, bars = _one_per_bar(network, frames, scores, pointed, peaks, prominence=prominence)
-    value = flat[index]
+    value, index = flat.topk(min(4 * network.config.slots, int(is_peak.sum())))
     channel, place = index.div(side * side, rounding_mode="floor"), index % (side * side)
     label, purpose = channel.div(purposes, rounding_mode="floor"), channel % purposes
+    pointed = cell_centres(network.config, device=place.device)[:, None] + cell * found.offset[0, 0]
     uv_px = pointed[place, purpose]
-    for n, cells in bars.items():
-        uv_px[n] = pointed[cells, purpose[n]].mean(dim=0)
     rim = torch.nonzero(label == LABELS.index("rim"))[:, 0]
     votes, likeness = pointed[:, purpose[rim]].transpose(0, 1), scores.flatten(1)[channel[rim]] - value[rim, None]
     uv_px[rim] = _agreed(uv_px[rim], votes, likeness)
@@ -126,69 +161,51 @@ def find_candidates(
     apart_px = torch.where(other_purpose, _PURPOSES_APART_PX, radius_cells * cell)
     apart_px[rim] = torch.where(other_purpose[rim], 0.0, apart_px[rim])
     clash = torch.cdist(uv_px, uv_px) < apart_px
+    intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
+    return Candidates(_lifted(network, frames, uv_px, label, value, intent), clash)
+
+
+def _lifted(
+    network: QuestNetwork,
+    frames: FrameBatch,
+    uv_px: Float[Tensor, "K 2"],
+    label: Int[Tensor, " K"],
+    logit: Float[Tensor, " K"],
+    intent: Int[Tensor, " K"],
+) -> Peaks:
     size = network.config.encoder.image_size
     uv_px = uv_px.clamp(0, size)
-    point = frames.near_point_at(uv_px[None, None])
-    intent = purpose if purposes > 1 else torch.full_like(purpose, UNKNOWN_INTENT)
-    return Candidates(Peaks(uv_px / size, frames.to_camera(point)[0, 0], label, value, intent), clash)
+    return Peaks(uv_px / size, frames.to_camera(frames.near_point_at(uv_px[None, None]))[0, 0], label, logit, intent)
+
+
+def _ranked(network: QuestNetwork, frames: FrameBatch, sighted: Sighted, *, radius_px: float) -> Candidates:
+    """Peaks and pieces by their log odds of being right."""
+    head = network.affordance_pieces
+    assert head is not None
+    peaks, pieces, size = sighted.peaks.peaks, sighted.pieces, network.config.encoder.image_size
+    device, kinds, count = peaks.uv.device, len(PIECE_LABELS), len(sighted.pieces.shapes)
+    label = torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=device).repeat(count)
+    purpose = pieces.purpose.flatten().to(device)
+    intent = purpose if network.config.intents else torch.full_like(purpose, UNKNOWN_INTENT)
+    logit = head(pieces.inputs.to(device)).flatten()
+    uv_px = pieces.uv_px.to(device).repeat_interleave(kinds, dim=0)
+    stand_out = _lifted(network, frames, uv_px, label, logit, intent)
+    trusted = replace(peaks, logit=head.trust(peaks.logit.float(), sighted.group))
+    between = torch.cdist(peaks.uv * size, uv_px) < radius_px
+    between |= sighted.on_piece.repeat_interleave(kinds, dim=1)
+    among = torch.cdist(uv_px, uv_px) < PIECES_APART_PX
+    clash = torch.cat((torch.cat((sighted.peaks.clash, between), 1), torch.cat((between.T, among), 1)))
+    every = Peaks(*(torch.cat((getattr(trusted, f.name), getattr(stand_out, f.name))) for f in fields(Peaks)))
+    order = every.logit.argsort(descending=True, stable=True)
+    return Candidates(every.select(order.tolist()), clash[order][:, order])
 
 
 def find_peaks(
-    network: QuestNetwork,
-    frames: FrameBatch,
-    observed: Observation,
-    *,
-    radius_cells: float,
-    prominence: float = 0.0,
-    mirror: bool = True,
+    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
 ) -> Peaks:
     """Those of :func:`find_candidates` that do not clash, at most as many as the network has slots."""
-    found = find_candidates(network, frames, observed, radius_cells=radius_cells, prominence=prominence, mirror=mirror)
+    found = find_candidates(network, frames, observed, radius_cells=radius_cells, mirror=mirror)
     return found.peaks.select(found.apart()[: network.config.slots])
-
-
-def _one_per_bar(
-    network: QuestNetwork,
-    frames: FrameBatch,
-    scores: Float[Tensor, "N S S"],
-    pointed_px: Float[Tensor, "C P 2"],
-    peaks: torch.return_types.topk,
-    *,
-    prominence: float,
-) -> tuple[Int[Tensor, " K"], dict[int, list[int]]]:
-    """Peaks without those that are on the same handle as a better one.
-
-    Args:
-        network: whose map it is.
-        frames: the frame.
-        scores: logits of every label and purpose.
-        pointed_px: where cells point to for every purpose.
-        peaks: values and flat indices into the scores, best first.
-        prominence: by how much the logit falls between two of them on one handle at least.
-
-    Returns:
-        Indices of those that are left, and for those of them that had company the cells of their handle.
-    """
-    cells, purposes = scores[0].numel(), pointed_px.shape[1]
-    needless: set[int] = set()
-    cells_of: dict[int, list[int]] = {}
-    if prominence > 0 and len(peaks.values):
-        floor, depth_m, scale = float(peaks.values[-1]), frames.depth_m[0, 0].float(), frames.scale[0].float()
-        for purpose in range(purposes):
-            channel = LABELS.index("handle") * purposes + purpose
-            aims, score = pointed_px[:, purpose], scores[channel]
-            for ridge in find_ridges(
-                score, aims, floor, prominence=prominence, depth_m=depth_m, scale=scale, config=network.config
-            ):
-                best, *others = ridge.tops
-                needless |= {channel * cells + top for top in others}
-                if others:
-                    likeness = score.flatten()[ridge.cells] - score.flatten()[best]
-                    alike = torch.nonzero(likeness > -ALIKE)[:, 0].tolist()
-                    cells_of[channel * cells + best] = [ridge.cells[n] for n in alike]
-    kept = [i for i in peaks.indices.tolist() if i not in needless]
-    company = {n: cells_of[i] for n, i in enumerate(kept) if i in cells_of}
-    return peaks.indices.new_tensor(kept), company
 
 
 def _agreed(
@@ -202,7 +219,7 @@ def _agreed(
         likeness: their logits less the peak's.
     """
     near = (votes - uv_px[:, None]).norm(dim=-1) < _VOTES_WITHIN_PX
-    agree = (near & (likeness > -ALIKE)).unsqueeze(-1)
+    agree = (near & (likeness > -_ALIKE)).unsqueeze(-1)
     return (votes * agree).sum(dim=1) / agree.sum(dim=1)
 
 

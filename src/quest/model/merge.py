@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from quest.errors import WeightsError
+from quest.model.config import NetworkConfig
 from quest.model.network import QuestNetwork
 from quest.model.weights import LoadedNetwork
 
-_MAP, _FLOW = "affordance", "flow."
+_MAP, _PIECES, _FLOW = "affordance", "affordance_pieces.", "flow."
 _UNSAID = "not said for a part of it"
 """What is free in one part does not make the whole free."""
 
@@ -26,7 +27,8 @@ def merge(
 
     Neither takes part in following what a query is bound to, so settings and the monitor's calibration stay good, but
     for the threshold of discovery (``quest weights tune --discovery-only``). The mean of the maps of one training's
-    checkpoints, or of trainings that began with the same map, is often better than each.
+    checkpoints, or of trainings that began with the same map, is often better than each. What ranks pieces goes with
+    one map; the mean of several has to learn it anew (``quest weights pieces``).
 
     Reference: Wortsman et al., Model soups, ICML 2022, section 2, for the mean.
 
@@ -46,7 +48,11 @@ def merge(
         for other in maps:
             _check(base, other, apart=lambda name: not name.startswith("encoder."), what="map")
         states = [other.network.state_dict() for other in maps]
+        config = replace(config, pieces=len(maps) == 1 and maps[0].network.config.pieces)
+        state = {name: tensor for name, tensor in state.items() if not name.startswith(_PIECES)}
         state |= {name: _mean([s[name] for s in states]) for name in state if name.startswith(_MAP)}
+        if config.pieces:
+            state |= {name: tensor for name, tensor in states[0].items() if name.startswith(_PIECES)}
     if flow is not None:
         if flow.network.flow is None:
             raise WeightsError(f"{flow.name}: expected weights with a flow head (quest train --stage 2), it has none")
@@ -68,9 +74,14 @@ def _mean(tensors: list[Tensor]) -> Tensor:
 
 def _check(base: LoadedNetwork, other: LoadedNetwork, *, apart: Callable[[str], bool], what: str) -> None:
     """Refuse a network of another shape, or with other weights outside what may differ."""
-    if replace(other.network.config, flow=False) != replace(base.network.config, flow=False):
+    if _shape(other) != _shape(base):
         raise WeightsError(f"{other.name}: its network has another shape than that of {base.name}; use weights of one")
     own, theirs = base.network.state_dict(), other.network.state_dict()
     for name, tensor in own.items():
-        if not apart(name) and not torch.equal(tensor, theirs[name]):
+        if not name.startswith(_PIECES) and not apart(name) and not torch.equal(tensor, theirs[name]):
             raise WeightsError(f"{other.name}: its {what} was trained behind another {name} than that of {base.name}")
+
+
+def _shape(weights: LoadedNetwork) -> NetworkConfig:
+    """The configuration without what may differ."""
+    return replace(weights.network.config, flow=False, pieces=False)

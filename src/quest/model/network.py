@@ -16,6 +16,7 @@ from quest.model.encoder import Encoder
 from quest.model.flow_head import FlowHead
 from quest.model.joint_head import JointHead
 from quest.model.observation import FrameBatch, Observation, Observer
+from quest.model.pieces import PieceHead
 from quest.types import INTENTS, LABELS
 
 UNKNOWN_LABEL = len(LABELS)
@@ -55,6 +56,7 @@ class QuestNetwork(nn.Module):
             self.head = RegressionHead(config)
             # As large as what they read from the tokens: small ones would drown in it and all answer alike.
             self.learned = nn.Parameter(torch.randn(config.slots, config.width))
+        self.affordance_pieces = PieceHead() if config.pieces else None
         self.flow = FlowHead(config) if config.flow else None
 
     def encode(self, rgb: UInt8[Tensor, "B H W 3"]) -> Float[Tensor, "B N E"]:
@@ -172,6 +174,6 @@ class QuestNetwork(nn.Module):
         return self.flow(prediction.embedding, prediction.point)
 
     def trainable(self) -> list[nn.Parameter]:
-        """Parameters of stage 1: all outside the encoder, the flow head, and a map with a trunk of its own."""
-        others = ("encoder.", "flow.") if self.config.map_layers == 0 else ("encoder.", "flow.", "affordance")
-        return [p for name, p in self.named_parameters() if not name.startswith(others)]
+        """Parameters of stage 1: all but the encoder, the flow head, what ranks pieces, and a map with a trunk."""
+        others = "affordance_pieces" if self.config.map_layers == 0 else "affordance"
+        return [p for name, p in self.named_parameters() if not name.startswith(("encoder.", "flow.", others))]

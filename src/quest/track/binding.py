@@ -183,13 +183,7 @@ class Binding:
         if not (looking or self.discover):
             return []
         config = self._config
-        candidates = find_candidates(
-            self._network,
-            frames,
-            observed,
-            radius_cells=config.slot_radius_cells,
-            prominence=config.slot_prominence,
-        )
+        candidates = find_candidates(self._network, frames, observed, radius_cells=config.slot_radius_cells)
         peaks, clash = candidates.peaks, candidates.clash.tolist()
         existence = (config.slot_gain * (peaks.logit + config.slot_bias)).sigmoid().tolist()
         label, intent = [LABELS[int(n)] for n in peaks.label], _intents(peaks)

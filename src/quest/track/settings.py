@@ -36,8 +36,6 @@ class TrackerConfig:
         slot_threshold: probability above which discovery takes a slot.
         prompt_threshold: probability above which a prompt takes a slot; lower, because the user says it is there.
         slot_radius_cells: peaks of one label closer than this are one slot.
-        slot_prominence: peaks along one handle, between which the affordance logit falls by less than this below the
-            lower one, are one slot (:mod:`quest.model.bars`); 0 keeps all.
     """
 
     move_sigma: float = 0.1
@@ -58,7 +56,6 @@ class TrackerConfig:
     slot_threshold: float = 0.5
     prompt_threshold: float = 0.2
     slot_radius_cells: float = 1.5
-    slot_prominence: float = 0.0
 
     def __post_init__(self) -> None:
         widths = (self.move_sigma, self.point_sigma, self.joint_sigma, self.along_sigma, self.temperature)

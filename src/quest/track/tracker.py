@@ -120,8 +120,7 @@ class Tracker:
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._autocast):
             frames, _ = intake.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
             observed = self.network.observe(frames)
-            radius, prominence = self.config.slot_radius_cells, self.config.slot_prominence
-            return find_peaks(self.network, frames, observed, radius_cells=radius, prominence=prominence)
+            return find_peaks(self.network, frames, observed, radius_cells=self.config.slot_radius_cells)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
