@@ -13,7 +13,7 @@ from torch import Tensor
 from quest.model.affordance import AffordanceMap
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
-from quest.model.pieces import PIECE_LABELS, PIECES_APART_PX, Pieces, find_pieces, groups
+from quest.model.pieces import PIECE_LABELS, PIECES_APART_PX, Pieces, find_pieces, groups, may_be_piece
 from quest.types import LABELS
 
 FOUND_WITHIN = 0.1
@@ -130,8 +130,7 @@ def sight(
     side = network.config.cells
     pieces = find_pieces(frames, found.logits[0, 0].permute(1, 2, 0).unflatten(-1, (side, side)), network.config)
     uv_px, label = peaks.peaks.uv * network.config.encoder.image_size, peaks.peaks.label
-    pieces_may_be = torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=label.device)
-    on_piece = pieces.under(uv_px).to(label.device) & torch.isin(label, pieces_may_be)[:, None]
+    on_piece = pieces.under(uv_px).to(label.device) & may_be_piece(label)[:, None]
     return Sighted(peaks, pieces, on_piece, groups(frames, uv_px, label, on_piece.any(dim=1)))
 
 

@@ -96,14 +96,18 @@ def groups(
         frames: the frame (B = T = 1).
         uv_px: the peaks.
         label: their labels.
-        on_piece: whether they are on a piece.
+        on_piece: which handles and knobs among them are on a piece.
     """
     known = F.avg_pool2d((frames.depth_m[0] > 0).float(), _AROUND_PX, 1, _AROUND_PX // 2)[0]
     column, row = (uv_px[:, i].long().clamp(0, known.shape[1 - i] - 1) for i in (0, 1))
     blind = known[row, column] < 0.5
-    may_be_piece = (label[:, None] == torch.tensor([LABELS.index(name) for name in PIECE_LABELS])).any(dim=1)
-    group = torch.where(may_be_piece & on_piece, _GROUPS.index("on a piece"), label)
-    return torch.where(may_be_piece & blind, _GROUPS.index("blind"), group)
+    group = torch.where(on_piece, _GROUPS.index("on a piece"), label)
+    return torch.where(may_be_piece(label) & blind, _GROUPS.index("blind"), group)
+
+
+def may_be_piece(label: Int[Tensor, " K"]) -> Bool[Tensor, " K"]:
+    """Which labels are those of pieces."""
+    return torch.isin(label, torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=label.device))
 
 
 class PieceHead(nn.Module):
