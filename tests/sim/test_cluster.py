@@ -166,7 +166,8 @@ def test_a_cluster_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 INTERRUPTED = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
 from quest.data.store import TakeStore
 from quest.sim.cluster import ClusterSettings, produce_on_cluster
 from tests.sim.small_objects import write_cabinet
