@@ -15,10 +15,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from quest.geometry import lift_depth
 from quest.model.config import NetworkConfig
 from quest.model.observation import FrameBatch
 from quest.model.protrusions import MEASURES, Protrusion, find_protrusions
-from quest.types import LABELS
+from quest.types import LABELS, Camera
 
 PIECE_LABELS = ("handle", "knob")
 """What a piece may be."""
@@ -144,8 +145,6 @@ class PieceHead(nn.Module):
 
 def _image(frames: FrameBatch) -> Float[np.ndarray, "H W 3"]:
     """What every pixel of the frame shows: camera axes, units of the reference frame, 0 where depth is missing."""
-    depth = frames.depth_m[0, 0].double().cpu().numpy() / float(frames.scale[0])
-    fx, fy, cx, cy = frames.intrinsics[0].double().tolist()
-    h, w = depth.shape
-    x, y = (np.arange(w) + 0.5 - cx) / fx, (np.arange(h) + 0.5 - cy) / fy
-    return np.stack((x * depth, y[:, None] * depth, depth), axis=-1)
+    depth = frames.depth_m[0, 0].double().cpu() / float(frames.scale[0])
+    camera = Camera(*frames.intrinsics[0].tolist(), width=depth.shape[1], height=depth.shape[0])
+    return lift_depth(depth, camera).nan_to_num().numpy()

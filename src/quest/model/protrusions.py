@@ -2,7 +2,7 @@
 
 Fronts of furniture and appliances are planes. A handle before one is a piece of the image of its own, whose middle,
 length and height are measured, not guessed, whatever it looks like. Which of the pieces are handles is another
-question (see :mod:`quest.model.protrusion_head`).
+question (see :mod:`quest.model.pieces`).
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ from jaxtyping import Bool, Float, Int
 from scipy import ndimage
 
 MEASURES = (
-    "pixels", "length", "width", "thinness", "height", "middle_height", "ring", "before_gap", "behind_more", "plane_px",
+    "pixels", "length", "width", "thinness", "height", "middle_height", "ring", "behind", "before", "plane_px",
     "facing", "upward", "spread", "fill", "front_length", "front_width", "of_length", "of_width", "edge_along",
     "edge_across",
 )  # fmt: skip
 """What is measured of each piece: pixels of it and of its plane as logarithms, lengths along the plane in units of the
 reference frame and as shares of the front's, heights before the plane, shares of the pixels around it that are on the
-plane, behind it, or before it too, which way the plane looks, and how noisy its depth is."""
+plane, behind it, or farther before it than a handle, which way the plane looks, and how noisy its depth is."""
 
 _TOLERANCE = 0.006
+"""What is nearer to a plane is in it, units of the reference frame, as all lengths here."""
 _LOW = 0.008
 _HIGH = 0.12
+"""What is between these before a plane stands out of it."""
 _PLANES = 14
 _TRIES = 300
 _SPREADS = 3.0
+"""Where depth is noisy, what stands out is so many standard deviations before the plane."""
 _NEAR_PX = 10
 _SAMPLE = 1500
 _LEAST_PLANE_PX = 150
