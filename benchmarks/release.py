@@ -105,12 +105,14 @@ MAP_PROCEDURAL = (
     TrainingTakes("wide_bare", f"{_WIDE} --views 4", 12, 23_000, _kinds("bare_")),
     TrainingTakes("wide_long", f"{_WIDE} --views 2", 14, 71_000, _kinds("long_")),
     TrainingTakes("wide_busy", f"{_WIDE} --views 2", 8, 73_000, _kinds("busy_")),
+    TrainingTakes("wide_dial", f"{_WIDE} --views 2", 12, 78_000, _kinds("dial_")),
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 
 PIECES = (
     TrainingTakes("pieces", f"--mix broad {_WIDE} --views 2", 150, 76_000),
     TrainingTakes("pieces", f"{_WIDE} --views 2", 3, 76_200, (*_kinds("bare_"), *_kinds("long_"), *_kinds("busy_"))),
+    TrainingTakes("pieces_dial", f"{_WIDE} --views 2", 5, 78_100, _kinds("dial_")),
     TrainingTakes("pieces_sensor", f"--mix broad --sensor stereo {_WIDE} --views 2", 50, 77_000),
     TrainingTakes("pieces_sensor", f"--mix broad --sensor structured-light {_WIDE} --views 2", 50, 77_100),
 )

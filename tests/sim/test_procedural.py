@@ -14,6 +14,7 @@ from quest.sim.objects import load_object
 from quest.sim.procedural import CATEGORIES, MIXES, category_for_seed, make_object
 from quest.sim.procedural.catalogue import build_model
 from quest.sim.procedural.clutter import with_clutter
+from quest.sim.procedural.dials import with_dials
 from quest.sim.procedural.handles import HANDLE_KINDS, HandleStyle, handle_part
 from quest.sim.procedural.model import Link, Mesh, ObjectModel
 
@@ -38,6 +39,11 @@ def is_closed(mesh: Mesh) -> bool:
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     count = len(mesh.vertices)
     return bool(np.array_equal(np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])))
+
+
+def with_fronts(model: ObjectModel) -> list[Link]:
+    """Links that are more than a dial."""
+    return [link for link in model.links if any(part.role not in HANDLES for part in link.parts)]
 
 
 def all_meshes(model: ObjectModel) -> list[tuple[str, Mesh]]:
@@ -81,7 +87,7 @@ def test_sizes_are_those_of_furniture(category: str, seed: int) -> None:
     body = np.concatenate([part.mesh.vertices for part in model.body])
     assert body[:, 2].min() == pytest.approx(0.0, abs=0.02)
     assert 0.2 < np.ptp(body, axis=0).max() < 2.7
-    for link in model.links:
+    for link in with_fronts(model):
         assert np.linalg.norm(link.axis) == pytest.approx(1.0)
         if link.kind == "revolute":
             assert np.deg2rad(79) < link.upper < np.deg2rad(131)
@@ -93,7 +99,7 @@ def test_sizes_are_those_of_furniture(category: str, seed: int) -> None:
 def test_opening_moves_every_link_out_of_the_closed_object(category: str, seed: int) -> None:
     model = build_model(category, seed)
     front = min(part.mesh.bounds[0, 1] for part in model.body)
-    for link in model.links:
+    for link in with_fronts(model):
         top = max(float(in_object(link, part.mesh)[:, 2].max()) for part in link.parts)
         opened = np.concatenate([in_object(link, part.mesh, link.upper) for part in link.parts])
         assert opened[:, 1].min() < front - 0.05 or opened[:, 2].max() > top + 0.1
@@ -103,7 +109,7 @@ def test_opening_moves_every_link_out_of_the_closed_object(category: str, seed: 
     ("category", "seed"), [(c, s) for c, s in FURNITURE if c not in ("room_door", "toolbox", "washing_machine")]
 )
 def test_handles_stand_out_of_the_closed_front_and_touch_it(category: str, seed: int) -> None:
-    for link in build_model(category, seed).links:
+    for link in with_fronts(build_model(category, seed)):
         board = np.concatenate([part.mesh.vertices for part in link.parts if part.role not in HANDLES])
         for part in link.parts:
             if part.role in HANDLES:
@@ -159,7 +165,7 @@ def test_mix_knows_every_category_and_is_stable() -> None:
 
 
 def test_broad_mix_has_everything() -> None:
-    drawn = {name for name in CATEGORIES if not name.startswith(("bare_", "long_", "busy_"))}
+    drawn = {name for name in CATEGORIES if not name.startswith(("bare_", "long_", "busy_", "dial_"))}
     assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == drawn
     with pytest.raises(ConfigError, match="unknown mix 'wide'; expected one of usual, broad"):
         category_for_seed(0, mix="wide")
@@ -208,6 +214,38 @@ def test_clutter_adds_nothing_to_take_hold_of(category: str) -> None:
                     assert all((high < a).any() or (low > b).any() for a, b in grips), part.role
         added |= {part.role for part in busy.body[len(plain.body) :]}
     assert added == {"vent", "keypad", "display", "badge", "moulding", "thing", "shelf_case", "leg"}
+
+
+@pytest.mark.parametrize("category", ["range", "drawer_oven", "microwave", "bare_microwave", "washing_machine"])
+def test_dials_turn_in_place_on_a_panel_that_is_free(category: str) -> None:
+    for seed in range(12):
+        plain = build_model(category, seed)
+        model = with_dials(plain, np.random.default_rng(seed))
+        assert model.links[: len(plain.links)] == plain.links
+        assert not any(part.role == "dial" for part in model.body)
+        panel = [part.mesh for part in model.body if part.role == "control_panel"][-1]
+        dials = model.links[len(plain.links) :]
+        assert 1 <= len(dials) <= 7
+        closed = [in_object(link, part.mesh) for link in plain.links for part in link.parts if part.role not in HANDLES]
+        for dial in dials:
+            assert (dial.kind, dial.parts[0].role) == ("revolute", "knob")
+            shown, turned = (in_object(dial, dial.parts[0].mesh, angle) for angle in (0.0, dial.upper))
+            middle, out = np.asarray(dial.origin), np.asarray(dial.axis)
+            np.testing.assert_allclose((shown - middle) @ out, (turned - middle) @ out, atol=1e-9)
+            height = (shown - middle) @ out
+            assert -0.002 < height.min() <= 0 < 0.007 < height.max() < 0.05
+            radius = np.linalg.norm(shown - middle - np.outer(height, out), axis=1).max()
+            assert 0.009 < radius < 0.05
+            low, high = panel.bounds[:, 0]
+            assert low - 1e-6 <= middle[0] - radius
+            assert middle[0] + radius <= high + 1e-6
+            for front in closed:
+                # Fronts and dials do not share a place on the front.
+                low, high = shown[:, [0, 2]].min(axis=0), shown[:, [0, 2]].max(axis=0)
+                assert not ((front[:, [0, 2]] > low) & (front[:, [0, 2]] < high)).all(axis=1).any()
+        at = np.array([dial.origin for dial in dials])
+        apart = np.linalg.norm(at[:, None] - at, axis=-1) + 10 * np.eye(len(at))
+        assert apart.min() > 2 * 0.009
 
 
 @pytest.mark.parametrize(

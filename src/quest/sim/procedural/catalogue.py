@@ -13,6 +13,7 @@ import numpy as np
 from quest.errors import ConfigError
 from quest.sim.procedural.appliances import APPLIANCES
 from quest.sim.procedural.clutter import with_clutter
+from quest.sim.procedural.dials import with_dials
 from quest.sim.procedural.laptop import build_laptop, build_trunk
 from quest.sim.procedural.layouts import FURNITURE
 from quest.sim.procedural.long_handles import with_long_handles
@@ -38,6 +39,11 @@ _OFTEN_BUSY = (
     "bare_microwave", "microwave", "long_microwave", "range", "dishwasher", "long_drawer_oven",
 )  # fmt: skip
 
+_OFTEN_DIALS = (
+    "range", "long_range", "drawer_oven", "long_drawer_oven", "microwave", "bare_microwave", "long_microwave",
+    "dishwasher", "rack_dishwasher", "washing_machine",
+)  # fmt: skip
+
 
 def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
@@ -56,6 +62,11 @@ def _build_busy(category: str, rng: np.random.Generator) -> ObjectModel:
     return with_clutter(_BUILDERS[category](rng), rng)
 
 
+def _build_dials(category: str, rng: np.random.Generator) -> ObjectModel:
+    """Appliances with dials that turn."""
+    return with_dials(_BUILDERS[category](rng), rng)
+
+
 _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **FURNITURE,
     **{name: partial(build_kitchen, name) for name in KITCHEN},
@@ -68,6 +79,7 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **{f"bare_{name}": partial(_build_bare, name) for name in _OFTEN_BARE},
     **{f"long_{name}": partial(_build_long, name) for name in _OFTEN_LONG},
     **{f"busy_{name}": partial(_build_busy, name) for name in _OFTEN_BUSY},
+    **{f"dial_{name}": partial(_build_dials, name) for name in _OFTEN_DIALS},
 }
 
 _WEIGHTS = {
@@ -84,7 +96,7 @@ _MORE_WEIGHTS = {
 
 MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
 """How often each category comes: the usual mix, and one of everything but what has no handles (``bare_``), long ones
-(``long_``), or what is no handle beside its own (``busy_``)."""
+(``long_``), what is no handle beside its own (``busy_``), or dials that turn (``dial_``)."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""
