@@ -103,6 +103,21 @@ def test_depth_under_pixels():
     assert (frames.near_depth_at(uv) == 0).all()
 
 
+def test_depth_of_thin_parts_and_of_slopes():
+    frames = make_frames(batch=1, frames=1)
+    frames.depth_m[:] = 3.0
+    frames.depth_m[0, 0, :, 21] = 2.0  # a wire
+    frames.depth_m[0, 0, 40:] = 3.0 - 0.1 * torch.arange(24)[:, None]  # a slope
+    frames.depth_m[0, 0, 5, 40] = 0.0
+    uv = torch.tensor(
+        [[[[22.2, 11.5], [21.5, 11.5], [24.5, 11.5], [50.5, 50.5], [40.5, 5.5], [64.0, 3.0], [66.0, 3.0]]]]
+    )
+    expected = torch.tensor([2.0, 2.0, 3.0, 2.0, 3.0, 3.0, 0.0])
+    torch.testing.assert_close(frames.edge_depth_at(uv)[0, 0], expected)
+    frames.depth_m[:] = 0
+    assert (frames.edge_depth_at(uv) == 0).all()
+
+
 def test_cells_are_counted_row_by_row():
     centres = cell_centres(DEFAULT)
     assert centres.shape == (64, 2)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 from quest.grounding.fit import joint_from_prior
 from quest.grounding.joint import Joint, JointKind
 from quest.grounding.prior import JointPrior
-from quest.grounding.vectors import cross, perpendicular
+from quest.grounding.vectors import cross, perpendicular, rotated
 
 _STILL_RAD = 0.08
 _STEP_RAD = 0.03
@@ -152,7 +152,7 @@ class HingeEstimator:
         """The front's normal at a turn; None while the axis is not known."""
         if self._found is None or self._rest is None:
             return None
-        return _rotated(self._rest[3:6], self._found.joint.axis, q - self._found.bias)
+        return rotated(self._rest[3:6], self._found.joint.axis, q - self._found.bias)
 
     def state(self) -> dict[str, np.ndarray]:
         """All that was learned, as numeric arrays: what is restored from it goes on to the same bytes."""
@@ -220,7 +220,7 @@ class HingeEstimator:
             q: turns by the normals.
         """
         basis, at = perpendicular(axis), rest.point[0]
-        faces = np.vstack((_rotated(rest.normal[0], axis, -x[3]), seen.normal))
+        faces = np.vstack((rotated(rest.normal[0], axis, -x[3]), seen.normal))
         arm = basis @ x[:2] - (np.vstack((rest.middle, seen.middle)) - at)
         sigma = np.hypot(_PLANE_SIGMA, 0.5 * _NORMAL_SIGMA_RAD * np.linalg.norm(arm, axis=1))
         planes = ((faces * arm).sum(axis=1) - x[2]) / sigma
@@ -243,11 +243,6 @@ def _mixed(old: np.ndarray, new: np.ndarray, share: float) -> np.ndarray:
 
 def _angle(normals: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return np.arccos(np.clip(normals @ normal, -1, 1))
-
-
-def _rotated(vector: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    along = (vector @ axis) * axis
-    return along + np.cos(angle) * (vector - along) + np.sin(angle) * cross(axis, vector)
 
 
 def _turns(front: np.ndarray, normals: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -19,6 +19,11 @@ from quest.model.config import NetworkConfig
 from quest.model.layers import DetailStem, PointCode, TokenLayer
 from quest.model.relief import relief
 
+_EDGE = 0.02
+"""Smallest step in depth that is an edge, reference units ..."""
+_BENT = 0.5
+"""... if the surface bends there by at least this share of it."""
+
 
 @dataclass(frozen=True)
 class FrameBatch:
@@ -135,6 +140,28 @@ class FrameBatch:
         depth = self.depth_at((uv_px.unsqueeze(-2) + around).reshape(b, t, q * 9, 2)).reshape(b, t, q, 9)
         near = torch.where(depth > 0, depth, torch.inf).amin(dim=-1)
         return torch.where(torch.isfinite(near), near, torch.zeros_like(near))
+
+    def edge_depth_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q"]:
+        """Depth of the pixel that each position falls in, or of a neighbour that stands free before it; 0 if missing.
+
+        The pixel of a position on a thin part may show what is behind that part. On a slope a neighbour is nearer too,
+        but there the one opposite is as much farther.
+        """
+        step = torch.tensor([-1.0, 0.0, 1.0], device=uv_px.device)
+        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(9, 2)
+        around = around[around.abs().sum(dim=-1) > 0]
+        at, own = uv_px.unsqueeze(-2), self.depth_at(uv_px).unsqueeze(-1)
+
+        def depth_beside(pixels: Float[Tensor, "B T Q 8 2"]) -> Float[Tensor, "B T Q 8"]:
+            return self.depth_at(pixels.flatten(2, 3)).unflatten(2, (-1, 8))
+
+        near, far = depth_beside(at + around), depth_beside(at - around)
+        jump, bend = own - near, 2 * own - near - torch.where(far > 0, far, own)
+        edge = (jump > _EDGE * self.scale[:, None, None, None]) & (bend > _BENT * jump)
+        free = (near > 0) & (edge | (own <= 0))
+        gap = torch.where(free, (at.floor() + 0.5 + around - at).norm(dim=-1), torch.inf)
+        nearest = gap.argmin(dim=-1, keepdim=True)
+        return torch.where(free.any(dim=-1, keepdim=True), near.gather(-1, nearest), own).squeeze(-1)
 
     def near_point_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q 3"]:
         """What is seen at each position, lifted by :meth:`near_depth_at`: reference frame, NaN without depth."""

@@ -149,8 +149,12 @@ class Binding:
         if due:
             label = [LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due]
             intent = [INTENTS.index(w.query.intent) if w.query.intent else UNKNOWN_INTENT for w in due]
-            self._join(observed, frames, self._canvas(due), torch.tensor(label), torch.tensor(intent))
-            found += [self._begin(w, w.query.name or f"point {w.number}", w.query.label) for w in due]
+            uv = self._canvas(due)
+            self._join(observed, frames, uv, torch.tensor(label), torch.tensor(intent))
+            for w, asked_px in zip(due, uv * self._network.config.encoder.image_size, strict=True):
+                begun = self._begin(w, w.query.name or f"point {w.number}", w.query.label)
+                begun.asked_px = asked_px
+                found.append(begun)
         return found
 
     def wait(self) -> None:

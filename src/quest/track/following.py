@@ -68,6 +68,8 @@ class Following:
         doubted: whether it was seen in a wrong place when an alarm was raised, so that it is held and searched.
         good: frames in a row, with an alarm open, in which what is seen matches the anchor.
         answer: what was said of it in the newest frame.
+        asked_px: the user's pixel in the network's input, until the first answer.
+        mark: from where it was first to the point under the user's pixel, reference frame; None if there was none.
     """
 
     query: int
@@ -87,11 +89,13 @@ class Following:
     doubted: bool = False
     good: int = 0
     answer: Answer | None = None
+    asked_px: Float[Tensor, "2"] | None = None
+    mark: Float[np.ndarray, "3"] | None = None
 
     def forget_places(self, config: TrackerConfig) -> None:
         """Begin anew in another reference frame."""
         self.ground = Ground(config, fixed=self.ground.fixed)
-        self.belief, self.place, self.home, self.held = None, None, None, False
+        self.belief, self.place, self.home, self.mark, self.held = None, None, None, None, False
         self.safe.clear()
         self.since_safe = self.refused = 0
         self.buried = False
@@ -139,6 +143,8 @@ class Following:
             found["place"] = self.place
         if self.home is not None:
             found["home"] = self.home
+        if self.mark is not None:
+            found["mark"] = self.mark
         if self.born is not None:
             found["born"] = self.born.float().cpu().numpy()
         if self.answer is not None:
@@ -194,6 +200,7 @@ class Following:
             belief=belief,
             place=state.get("place"),
             home=state.get("home"),
+            mark=state.get("mark"),
             held=bool(held),
             buried=bool(buried),
             refused=refused,

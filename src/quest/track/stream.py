@@ -24,6 +24,7 @@ from quest.track.expectation import joint_rows
 from quest.track.following import Answer, Following, part
 from quest.track.intake import Arrival, Intake
 from quest.track.lifting import lift_near
+from quest.track.marks import marked
 from quest.track.matching import match
 from quest.track.measuring import measure, no_signals
 from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
@@ -264,7 +265,6 @@ class Stream:
         if slots is not None or not following or self._binding.anchor is None:
             return
         window = Observation.stack(list(self._ring))
-        newest = window.during(slice(-1, None))
         prediction = match(
             self._network, self._config, self._binding.anchor, window, frames, following, elapsed=self._intake.elapsed
         )
@@ -276,12 +276,12 @@ class Stream:
         placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:
             share(self._links, self._t, following, placed)
-        uv, judged_uv = (self._project(p, frames, prediction) for p in (placed.point, placed.judged))
-        signals = measure(self._network, self._binding.anchor, newest, prediction, placed, judged_uv, following)
+        shown = replace(placed, point=marked(following, placed.point, prediction, frames))
+        uv, judged_uv = (self._project(p, frames, prediction) for p in (shown.point, placed.judged))
+        signals = measure(self._network, self._binding.anchor, self._ring[-1], prediction, placed, judged_uv, following)
         for k, query in enumerate(following):
             query.move(placed.point[k], held=bool(placed.held[k]), embedding=prediction.embedding[0, 0, k])
-        right = as_array(prediction.right_logit[0, 0].sigmoid())
-        self._keep(uv, placed, right, signals)
+        self._keep(uv, shown, as_array(prediction.right_logit[0, 0].sigmoid()), signals)
 
     def _project(self, point: np.ndarray, frames: FrameBatch, prediction: Prediction) -> Float[Tensor, "K 2"]:
         """Points in [0, 1]^2 of the input; where they are unknown, what the network sees."""

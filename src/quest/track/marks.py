@@ -1,0 +1,67 @@
+"""The points that users ask for, carried along with what the network follows.
+
+A network has its own idea of where on a handle the point of a handle is: a few pixels from where the user put it, and
+on a front that is seen at a slant those pixels are a long way in depth. What lies between both is known in the first
+frame. From then on it turns with the link.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from quest.grounding import JointKind
+from quest.grounding.vectors import rotated
+from quest.model.decoder import Prediction
+from quest.model.observation import FrameBatch
+from quest.track.following import Following
+
+_SAME_THING_PX = 8.0
+"""Where the network sees a query farther from its pixel than that, it does not see what was asked for."""
+
+
+def marked(
+    following: Sequence[Following], point: Float[np.ndarray, "K 3"], prediction: Prediction, frames: FrameBatch
+) -> Float[np.ndarray, "K 3"]:
+    """Where the points that were asked for are, by where the network's own points of the same entities are.
+
+    Args:
+        following: the queries; those asked for as a pixel of this frame get their mark.
+        point: the network's own points, drawn to their joints or held on them, reference frame.
+        prediction: the network's answers for the frame (B = T = 1).
+        frames: the frame.
+    """
+    shown = point.copy()
+    for k, query in enumerate(following):
+        if query.asked_px is not None:
+            uv_px = prediction.uv[0, 0, k].float() * frames.depth_m.shape[-1]
+            query.mark = _mark(query.asked_px, uv_px, point[k], frames)
+            query.asked_px = None
+        if query.mark is not None:
+            shown[k] = point[k] + _turned(query, point[k])
+    return shown
+
+
+def _mark(
+    asked_px: Float[torch.Tensor, "2"], uv_px: Float[torch.Tensor, "2"], own: Float[np.ndarray, "3"], frames: FrameBatch
+) -> Float[np.ndarray, "3"] | None:
+    """From the network's own point to the one under the user's pixel; None where that is not known."""
+    asked_px = asked_px.to(uv_px)
+    if float((uv_px - asked_px).norm()) > _SAME_THING_PX:
+        return None
+    at = asked_px[None, None, None]
+    mark = frames.to_reference(at, frames.edge_depth_at(at))[0, 0, 0].double().cpu().numpy() - own
+    return mark if np.isfinite(mark).all() else None
+
+
+def _turned(query: Following, place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
+    """The mark of a query, turned as its link has turned by the time the query is at a place."""
+    assert query.mark is not None
+    joint = query.ground.joint
+    if joint is None or joint.kind is not JointKind.REVOLUTE or query.home is None or not np.isfinite(place).all():
+        return query.mark
+    before, now = joint.locate(np.stack((query.home, place)))
+    return rotated(query.mark, joint.axis, float(now - before))
