@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from quest.grounding import JointKind
 from quest.grounding.vectors import rotated
@@ -46,7 +46,7 @@ def marked(
 
 
 def _mark(
-    asked_px: Float[torch.Tensor, "2"], uv_px: Float[torch.Tensor, "2"], own: Float[np.ndarray, "3"], frames: FrameBatch
+    asked_px: Float[Tensor, "2"], uv_px: Float[Tensor, "2"], own: Float[np.ndarray, "3"], frames: FrameBatch
 ) -> Float[np.ndarray, "3"] | None:
     """From the network's own point to the one under the user's pixel; None where that is not known."""
     asked_px = asked_px.to(uv_px)

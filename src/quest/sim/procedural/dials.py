@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Literal
 
 import numpy as np
 
@@ -14,7 +15,9 @@ from quest.sim.procedural.shapes import box, lathe
 
 _MARGIN_M = 0.004
 _NARROWEST_M = 0.05
-_KNOBS: tuple[HandleKind, ...] = ("knob", "disc", "block")
+_SHAPES: tuple[HandleKind | Literal["cylinder", "turned"], ...] = (
+    "knob", "disc", "block", "cylinder", "turned", "turned",
+)  # fmt: skip
 _SURFACES = ("dark", "metal", "white", "body", "front")
 
 
@@ -147,16 +150,16 @@ def _displays(panel: _Panel, offsets: list[float], radius: float, *, row: bool) 
 def _dial(radius: float, rng: np.random.Generator) -> Mesh:
     """A dial on y = 0 that reaches towards -y: a knob, a cylinder, or a disc with a bar to turn it by."""
     reach = float(rng.uniform(0.6, 1.3)) * radius
-    kind = str(rng.choice([*_KNOBS, "cylinder", "bar", "bar"]))
+    kind = _SHAPES[int(rng.integers(len(_SHAPES)))]
     if kind == "cylinder":
         profile = [[1.0, -SUNK_M], [float(rng.uniform(0.8, 1.0)), 0.9 * reach], [0.8, reach]]
         return lathe(np.array([[radius * r, h] for r, h in profile]))
-    if kind == "bar":
+    if kind == "turned":
         foot = lathe(np.array([[radius, -SUNK_M], [radius, 0.25 * reach], [0.9 * radius, 0.4 * reach]]))
         half = radius * float(rng.uniform(0.15, 0.3))
         bar = box((-0.95 * radius, -reach, -half), (0.95 * radius, -0.2 * reach, half))
         angle = float(rng.choice([0.0, np.pi / 2, float(rng.uniform(0, np.pi))]))
         cos, sin = np.cos(angle), np.sin(angle)
         return join([foot, bar.rotated(np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]))])
-    style = HandleStyle(next(known for known in _KNOBS if known == kind), radius, radius, reach, 1.0, "dark")
+    style = HandleStyle(kind, radius, radius, reach, 1.0, "dark")
     return handle_part(style, at=(0.0, 0.0, 0.0), vertical=False, room_m=(4 * radius, 4 * radius)).mesh
