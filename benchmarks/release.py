@@ -225,6 +225,8 @@ class Release:
         if self.partnet:
             _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
         _quest("generate", *choice, "--no-partnet", "--seeds", "105000..105023", "--mix", "broad")
+        dials = [f"procedural:{kind}-105100" for kind in _kinds("dial_")]
+        _quest("generate", "--out", self._takes_of("wide_validation"), "--objects", *dials, *MAP_CHOICE.split())
         suites = ("--out", self._takes_of("suites_validation"), "--split", "validation")
         _quest("generate", *suites, self._partnet, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
         _quest("generate", *suites, "--suite", "lockers", "--seeds", "103000..103003")

@@ -134,10 +134,7 @@ class FrameBatch:
 
         An entity lies on an outer surface, so of a thin part and what is behind it the near one is meant.
         """
-        step = torch.tensor([-1.0, 0.0, 1.0], device=uv_px.device)
-        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(9, 2)
-        b, t, q, _ = uv_px.shape
-        depth = self.depth_at((uv_px.unsqueeze(-2) + around).reshape(b, t, q * 9, 2)).reshape(b, t, q, 9)
+        depth = self._depth_beside(uv_px, _steps_around(uv_px.device))
         near = torch.where(depth > 0, depth, torch.inf).amin(dim=-1)
         return torch.where(torch.isfinite(near), near, torch.zeros_like(near))
 
@@ -147,21 +144,21 @@ class FrameBatch:
         The pixel of a position on a thin part may show what is behind that part. On a slope a neighbour is nearer too,
         but there the one opposite is as much farther.
         """
-        step = torch.tensor([-1.0, 0.0, 1.0], device=uv_px.device)
-        around = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(9, 2)
+        around = _steps_around(uv_px.device)
         around = around[around.abs().sum(dim=-1) > 0]
         at, own = uv_px.unsqueeze(-2), self.depth_at(uv_px).unsqueeze(-1)
-
-        def depth_beside(pixels: Float[Tensor, "B T Q 8 2"]) -> Float[Tensor, "B T Q 8"]:
-            return self.depth_at(pixels.flatten(2, 3)).unflatten(2, (-1, 8))
-
-        near, far = depth_beside(at + around), depth_beside(at - around)
+        near, far = self._depth_beside(uv_px, around), self._depth_beside(uv_px, -around)
         jump, bend = own - near, 2 * own - near - torch.where(far > 0, far, own)
         edge = (jump > _EDGE * self.scale[:, None, None, None]) & (bend > _BENT * jump)
         free = (near > 0) & (edge | (own <= 0))
         gap = torch.where(free, (at.floor() + 0.5 + around - at).norm(dim=-1), torch.inf)
         nearest = gap.argmin(dim=-1, keepdim=True)
         return torch.where(free.any(dim=-1, keepdim=True), near.gather(-1, nearest), own).squeeze(-1)
+
+    def _depth_beside(self, uv_px: Float[Tensor, "B T Q 2"], step: Float[Tensor, "N 2"]) -> Float[Tensor, "B T Q N"]:
+        """Depth some steps beside each position."""
+        beside = uv_px.unsqueeze(-2) + step
+        return self.depth_at(beside.flatten(2, 3)).reshape(beside.shape[:-1])
 
     def near_point_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q 3"]:
         """What is seen at each position, lifted by :meth:`near_depth_at`: reference frame, NaN without depth."""
@@ -207,6 +204,12 @@ def gather_cells(cells: Float[Tensor, "B T C D"], index: Int[Tensor, "B T K M"])
     b, t, k, m = index.shape
     flat = index.reshape(b, t, k * m, 1).expand(-1, -1, -1, cells.shape[-1])
     return cells.gather(2, flat).reshape(b, t, k, m, -1)
+
+
+def _steps_around(device: torch.device) -> Float[Tensor, "9 2"]:
+    """From a pixel to itself and its neighbours."""
+    step = torch.tensor([-1.0, 0.0, 1.0], device=device)
+    return torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).reshape(9, 2)
 
 
 def cell_depth(depth_m: Float[Tensor, "B H W"], cell_px: int) -> Float[Tensor, "B Hc Wc"]:

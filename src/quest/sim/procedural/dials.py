@@ -118,7 +118,7 @@ def _free_panels(model: ObjectModel, rng: np.random.Generator) -> list[_Panel]:
 
 
 def _places(long: float, radius: float, rng: np.random.Generator) -> list[float]:
-    """Where along a panel dials sit, from its middle: evenly over all or half of it, or in two groups."""
+    """Where along a panel dials sit, from its middle: evenly over all of it, close together, or in two groups."""
     gap = radius * float(rng.uniform(2.6, 5.0))
     most = max(1, min(7, int((long - 2 * radius) / gap)))
     count = int(rng.integers(1, most + 1))
