@@ -93,6 +93,42 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
     assert discovery_bias(tracker, [(store, {NAME: "validation"})]) == (tracker.config.slot_bias, 0.0, 0.0)
 
 
+def test_every_source_counts_the_same_for_the_threshold_of_discovery(
+    store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of two procedural views each finds both entities at 2.0 and nothing else; of the one real view the entities are
+    at 1.0 and 0.0, behind two wrong ones."""
+    take = store.read(NAME)
+    real = TakeStore(tmp_path / "real")
+    real.write(replace(take, info=replace(take.info, name="44817-L1", source="partnet-mobility")))
+    more = TakeStore(tmp_path / "more")
+    more.write(replace(take, info=replace(take.info, name="panels-100002")))
+    entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
+    pose = take.views[0].clip.cam_from_world[0]
+    point_m = torch.from_numpy(take.point_world[0, entities] @ pose[:3, :3].T + pose[:3, 3]).float()
+    label = torch.tensor([LABELS.index(take.info.entities[e].label) for e in entities])
+
+    def peaks(logits: list[float], wrong: int) -> Peaks:
+        places = torch.cat((point_m[:1].expand(wrong, 3) + 9, point_m))
+        return Peaks(
+            torch.zeros(len(logits), 2), places, torch.cat((label[:1].expand(wrong), label)), torch.tensor(logits),
+            torch.zeros(len(logits), dtype=torch.long),
+        )  # fmt: skip
+
+    seen = {"procedural": peaks([2.0, 2.0], 0), "partnet-mobility": peaks([1.5, 1.5, 1.0, 0.0], 2)}
+
+    def discovered(*takes: tuple[TakeStore, str]) -> tuple[float, float, float]:
+        answers = iter([seen[store.infos()[name].source] for store, name in takes])
+        monkeypatch.setattr(Tracker, "candidates", lambda *_: next(answers))
+        return discovery_bias(make_tracker(), [(store, {name: "validation"}) for store, name in takes])
+
+    procedural = (store, NAME), (more, "panels-100002")
+    assert discovered(*procedural)[1:] == (1.0, 1.0)
+    one = discovered(procedural[0], (real, "44817-L1"))
+    assert one == (pytest.approx(0.0), pytest.approx(0.75), 1.0)
+    assert discovered(*procedural, (real, "44817-L1")) == one, "however many there are of either"
+
+
 def test_after_the_map_alone_only_discovery_is_tuned(store: TakeStore):
     tracker, told = make_tracker(), list[Trial]()
     tuned = tune(tracker, [(store, {NAME: "validation"})], report=told.append, discovery_only=True)

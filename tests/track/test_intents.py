@@ -94,7 +94,7 @@ def test_a_prompt_is_not_kept_from_its_entity_by_another_label(clip: Clip, monke
     monkeypatch.setattr("quest.track.binding.find_candidates", all_at_one_place)
     assert names_after(clip, [HANDLE, OPEN, LIFT]) == ["handle 0", "rim 1", "rim 2"]
     assert names_after(clip, [HANDLE, HANDLE, LIFT, LIFT]) == ["handle 0", "rim 2"]
-    assert len(make_tracker().track(clip).names) == 1, "who discovers has asked for nothing"
+    assert make_tracker().track(clip).names == ("handle 0", "rim 1 (or handle 0)", "rim 2 (lift) (or handle 0)")
 
 
 def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_purpose(

@@ -2,17 +2,18 @@
 
 One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``;
 PartNet-Mobility and procedural objects, ordinary takes and those of every suite alike); the threshold of discovery by
-its F2 in the first frame, in which recall counts twice as much as precision: a false entity costs one more track, a
-missed one is not followed at all.
+its F2 in the first frame, in which recall counts twice as much as precision (a false entity costs one more track, a
+missed one is not followed at all), in the mean over the sources of the objects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from quest.errors import ConfigError
 from quest.evaluation.memory import remember_frames
@@ -112,28 +113,59 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
     A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D. Where none is, no
-    threshold is best, and the bias stays what it is.
+    threshold is best, and the bias stays what it is. All three figures are means over the sources of the objects
+    (PartNet-Mobility, procedural, your own), each of which counts the same however many takes it has.
     """
-    logits: list[float] = []
-    hits: list[bool] = []
-    present = 0
+    seen: dict[str, _Found] = {}
     for store, name in ((store, name) for store, chosen in takes for name in chosen):
         take = store.read(name, frames=slice(0, 1))
+        found = seen.setdefault(take.info.source, _Found())
         for view in range(len(take.views)):
             clip = take.views[view].clip
-            peaks = tracker.candidates(clip.camera, clip.frame(0))
-            hit, count = _match(take, view, peaks)
-            logits += peaks.logit.tolist()
-            hits += hit
-            present += count
-    if not any(hits):
+            found.add(tracker.candidates(clip.camera, clip.frame(0)), take, view)
+    sources = [found for found in seen.values() if found.present]
+    if not any(any(found.hits) for found in sources):
         return tracker.config.slot_bias, 0.0, 0.0
-    order = np.argsort(-np.array(logits))
-    right = np.cumsum(np.array(hits)[order])
-    taken = np.arange(1, len(order) + 1)
-    best = int(((1 + _BETA**2) * right / (taken + _BETA**2 * max(present, 1))).argmax())
-    threshold = logits[order[best]] if best + 1 == len(order) else (logits[order[best]] + logits[order[best + 1]]) / 2
-    return -float(threshold), float(right[best] / taken[best]), float(right[best] / max(present, 1))
+    logits = np.unique([logit for found in sources for logit in found.logits])[::-1]
+    precision, recall = np.mean([found.at(logits) for found in sources], axis=0)
+    f_beta = np.mean([_f_beta(*found.at(logits)) for found in sources], axis=0)
+    best = int(f_beta.argmax())
+    threshold = logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2
+    return -float(threshold), float(precision[best]), float(recall[best])
+
+
+@dataclass
+class _Found:
+    """What was found in the first frames of takes of one source.
+
+    Attributes:
+        logits: of all candidates.
+        hits: which of them are right.
+        present: how many entities are seen.
+    """
+
+    logits: list[float] = field(default_factory=list)
+    hits: list[bool] = field(default_factory=list)
+    present: int = 0
+
+    def add(self, peaks: Peaks, take: Take, view: int) -> None:
+        """Candidates of one view."""
+        hits, present = _match(take, view, peaks)
+        self.logits += peaks.logit.tolist()
+        self.hits += hits
+        self.present += present
+
+    def at(self, thresholds: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+        """Precision and recall if what is not below a threshold counts; thresholds fall."""
+        order = np.argsort(-np.array(self.logits))
+        right = np.concatenate([[0], np.cumsum(np.array(self.hits, int)[order])])
+        taken = np.searchsorted(-np.array(self.logits)[order], -thresholds, side="right")
+        return right[taken] / np.maximum(taken, 1), right[taken] / self.present
+
+
+def _f_beta(precision: Float[np.ndarray, " N"], recall: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
+    total = _BETA**2 * precision + recall
+    return np.divide((1 + _BETA**2) * precision * recall, total, out=np.zeros_like(total), where=total > 0)
 
 
 def _match(take: Take, view: int, peaks: Peaks) -> tuple[list[bool], int]:

@@ -55,26 +55,29 @@ class Peaks:
 
 @dataclass(frozen=True)
 class Candidates:
-    """All peaks of a frame, of which those that are too close to each other cannot all be entities.
+    """All peaks of a frame, of which those of one label that are too close to each other cannot all be entities.
 
     Attributes:
         peaks: the peaks, best first.
-        clash: which are too close to each other.
+        clash: which are too close to each other, whatever their labels.
     """
 
     peaks: Peaks
     clash: Bool[Tensor, "K K"]
 
     def apart(self, among: Sequence[int] | None = None) -> list[int]:
-        """Of peaks that are too close to each other the best alone.
+        """Of peaks of one label that are too close to each other the best alone.
+
+        Where it cannot be told what something is, it stays under each label: as the front of a drawer and the handle
+        in its middle, say, of which only one may be there.
 
         Args:
-            among: indices of the peaks that count, best first; all by default. Who looks for one label does not mind
-                what is a better peak of another at the same place.
+            among: indices of the peaks that count, best first; all by default.
         """
+        clash = self.clash & (self.peaks.label[:, None] == self.peaks.label)
         keep: list[int] = []
         for i in range(len(self.peaks)) if among is None else among:
-            if not bool(self.clash[i, keep].any()):
+            if not bool(clash[i, keep].any()):
                 keep.append(i)
         return keep
 
@@ -202,7 +205,7 @@ def _ranked(network: QuestNetwork, frames: FrameBatch, sighted: Sighted, *, radi
 def find_peaks(
     network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
 ) -> Peaks:
-    """Those of :func:`find_candidates` that do not clash, at most as many as the network has slots."""
+    """Those of :func:`find_candidates` that are apart, at most as many as the network has slots."""
     found = find_candidates(network, frames, observed, radius_cells=radius_cells, mirror=mirror)
     return found.peaks.select(found.apart()[: network.config.slots])
 

@@ -199,8 +199,10 @@ class Binding:
             chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
             for i in chosen:
                 number = self._next_number()
-                lift = " (lift)" if intent[i] == "lift" else ""
-                name = f"{label[i]} {number}{lift}"
+                # What is followed at the same place is the same thing under another label, or a part of it.
+                others = [f"{label[j]} {f.query}" for f, j in zip(found, chosen, strict=False) if clash[i][j]]
+                notes = ["lift"] * (intent[i] == "lift") + [f"or {other}" for other in others[:1]]
+                name = " ".join([f"{label[i]} {number}", *(f"({note})" for note in notes)])
                 found.append(self._begin(Waiting(number, Query.slot(), frame), name, label[i]))
             self.discover = False
         for waiting in looking:
