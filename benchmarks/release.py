@@ -266,7 +266,8 @@ class Release:
         shutil.copyfile(self.work / "pieces.safetensors", untuned)
         choose = (self._takes_of("validation"), self._takes_of("suites_validation"))
         _quest("weights", "tune", untuned, "--takes", *choose, "--level", 1, 4)
-        _quest("weights", "tune", untuned, "--takes", self._takes_of("wide_validation"), "--discovery-only")
+        found = (self._takes_of("validation"), self._takes_of("wide_validation"))
+        _quest("weights", "tune", untuned, "--takes", *found, "--level", 1, "--discovery-only")
         untuned.rename(self._weights)
 
     def _calibrate(self) -> None:
