@@ -234,6 +234,19 @@ TABLES = (
         },
     ),
     Table(
+        "speed/tracking.json",
+        "A stream of the packaged clip with alarms on: milliseconds per frame",
+        "rows",
+        {
+            "queries": "queries",
+            "turns": "turns",
+            "frames": "frames",
+            "median": "median_ms",
+            "95 of 100 within": "p95_ms",
+            "frames/s": "frames_per_s",
+        },
+    ),
+    Table(
         "data/verify.json",
         "Takes of all suites, verified",
         "worst",

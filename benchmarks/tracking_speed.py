@@ -1,0 +1,121 @@
+"""Measure how long a frame takes, from picture to answers with monitor, by how many queries are followed.
+
+    python benchmarks/tracking_speed.py --out benchmarks/results/speed/tracking.json
+
+The packaged clip is played as a stream, in turn with each number of queries, which are points spread over what is
+nearest to the camera in its first frame. Frame 0, in which they bind, and the few after it are not timed. `discovery`
+is a first frame in which everything is to be found. Let nothing else run meanwhile.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import tyro
+from jaxtyping import Float
+from rich.console import Console
+
+import quest
+from quest.data.recording import read_recording
+from quest.data.sample import sample_folder
+from quest.evaluation.report import provenance, write_report
+from quest.track import Stream, Tracker
+from quest.types import Clip, Query
+
+NEAREST = 0.3
+"""Share of the first frame's pixels with depth that queries are asked for at: the nearest ones."""
+
+
+@dataclass(frozen=True)
+class TrackingSpeed:
+    """Milliseconds per frame of one stream."""
+
+    queries: tuple[int, ...] = (1, 4, 8, 16, 32)
+    """Numbers of queries."""
+    turns: int = 5
+    """How often each is played."""
+    settled: int = 8
+    """Frames of a turn that are not timed."""
+    weights: str = "quest-s16"
+    """Name or file of the weights."""
+    device: str = "auto"
+    """Where the network runs."""
+    out: Path | None = None
+    """Result file."""
+
+    def run(self) -> int:
+        """Play all turns and print medians, high quantiles and frames per second."""
+        clip = read_recording(sample_folder())
+        if min(self.queries, default=0) < 1 or self.turns < 1 or not 0 < self.settled < len(clip):
+            raise SystemExit(f"tracking_speed: expected queries, turns and 1 to {len(clip) - 1} settled, got {self}")
+        tracker = quest.load(self.weights, device=self.device)
+        self._discovery_ms(tracker, clip)  # warms up
+        frames_ms: dict[int, list[np.ndarray]] = {count: [] for count in self.queries}
+        discovery_ms: list[float] = []
+        for _ in range(self.turns):
+            discovery_ms.append(self._discovery_ms(tracker, clip))
+            for count in self.queries:
+                stream = tracker.stream(clip.camera, queries_on(clip, count))
+                frames_ms[count].append(played_ms(stream, clip)[self.settled :])
+        result = {
+            "rows": [{"queries": count, **_summary(np.array(turns))} for count, turns in frames_ms.items()],
+            "discovery_ms": {"median": float(np.median(discovery_ms)), "n": len(discovery_ms)},
+        }
+        Console(highlight=False).print_json(data=result)
+        if self.out is not None:
+            about = {"weights": self.weights, "weights_hash": tracker.weights_hash, "threads": torch.get_num_threads()}
+            about |= {"device": _device_name(tracker.device), "load": os.getloadavg()[0]}
+            about |= {"source_px": [clip.camera.width, clip.camera.height]}
+            write_report(provenance() | about | result, self.out)
+        return 0
+
+    def _discovery_ms(self, tracker: Tracker, clip: Clip) -> float:
+        return float(played_ms(tracker.stream(clip.camera), clip, frames=1)[0])
+
+
+def queries_on(clip: Clip, count: int) -> list[Query]:
+    """So many points, the same at every call, on what is nearest in a clip's first frame."""
+    depth_m = clip.frame(0).depth_m
+    assert depth_m is not None
+    known = depth_m > 0
+    rows, columns = np.nonzero(known & (depth_m <= np.quantile(depth_m[known], NEAREST)))
+    chosen = np.random.default_rng(0).choice(len(rows), size=count, replace=False)
+    return [Query.point(0, float(columns[i]) + 0.5, float(rows[i]) + 0.5, name=f"point {i}") for i in chosen]
+
+
+def played_ms(stream: Stream, clip: Clip, *, frames: int | None = None) -> Float[np.ndarray, " T"]:
+    """Milliseconds of each frame of a clip, played as a stream."""
+    took_ms = []
+    for t in range(len(clip) if frames is None else frames):
+        frame = clip.frame(t)
+        start_s = time.perf_counter()
+        stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)  # answers are on the CPU
+        took_ms.append(1e3 * (time.perf_counter() - start_s))
+    return np.array(took_ms)
+
+
+def _summary(turns_ms: Float[np.ndarray, "R T"]) -> dict[str, Any]:
+    """Median and 95 % quantile of a frame, and frames per second with a 95 % bootstrap interval over turns."""
+    drawn = turns_ms[np.random.default_rng(0).integers(len(turns_ms), size=(1000, len(turns_ms)))]
+    low, high = np.quantile(1e3 / drawn.mean(axis=(1, 2)), (0.025, 0.975))
+    return {
+        "turns": len(turns_ms),
+        "frames": turns_ms.size,
+        "median_ms": float(np.median(turns_ms)),
+        "p95_ms": float(np.quantile(turns_ms, 0.95)),
+        "frames_per_s": {"mean": float(1e3 / turns_ms.mean()), "low": float(low), "high": float(high)},
+    }
+
+
+def _device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
+
+
+if __name__ == "__main__":
+    raise SystemExit(tyro.cli(TrackingSpeed).run())
