@@ -247,6 +247,12 @@ TABLES = (
         },
     ),
     Table(
+        "speed/tracking.json",
+        "The first frame of such a stream, in which everything is discovered",
+        "",
+        {"device": "device", "threads": "threads", "times": "discovery_ms.n", "median, ms": "discovery_ms.median"},
+    ),
+    Table(
         "data/verify.json",
         "Takes of all suites, verified",
         "worst",
