@@ -24,7 +24,7 @@ from rich.console import Console
 import quest
 from quest.data.recording import read_recording
 from quest.data.sample import sample_folder
-from quest.evaluation.report import provenance, write_report
+from quest.evaluation.report import device_name, provenance, write_report
 from quest.track import Stream, Tracker
 from quest.types import Clip, Query
 
@@ -70,7 +70,7 @@ class TrackingSpeed:
         Console(highlight=False).print_json(data=result)
         if self.out is not None:
             about = {"weights": self.weights, "weights_hash": tracker.weights_hash, "threads": torch.get_num_threads()}
-            about |= {"device": _device_name(tracker.device), "load": os.getloadavg()[0]}
+            about |= {"device": device_name(tracker.device), "load": os.getloadavg()[0]}
             about |= {"source_px": [clip.camera.width, clip.camera.height]}
             write_report(provenance() | about | result, self.out)
         return 0
@@ -111,10 +111,6 @@ def _summary(turns_ms: Float[np.ndarray, "R T"]) -> dict[str, Any]:
         "p95_ms": float(np.quantile(turns_ms, 0.95)),
         "frames_per_s": {"mean": float(1e3 / turns_ms.mean()), "low": float(low), "high": float(high)},
     }
-
-
-def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ from rich.console import Console
 
 from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
-from quest.evaluation.report import provenance, write_report
+from quest.evaluation.report import device_name, provenance, write_report
 from quest.model.config import PRESETS
 from quest.model.network import QuestNetwork
 from quest.track.tracker import pick_device
@@ -77,7 +77,7 @@ class TrainingSpeed:
         Console(highlight=False).print_json(data=result)
         if self.out is not None:
             about = {"preset": self.preset, "batch": self.windows.batch, "precision": self.training.precision}
-            about |= {"device": _device_name(), "load": os.getloadavg()[0], "data_hash": data_hash}
+            about |= {"device": device_name(pick_device("auto")), "load": os.getloadavg()[0], "data_hash": data_hash}
             write_report(provenance() | about | result, self.out)
         return 0
 
@@ -159,10 +159,6 @@ class _Bare:
 def _finish(device: torch.device) -> None:
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-def _device_name() -> str:
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
 
 
 def _summary(turns: np.ndarray, frames: int) -> dict[str, Any]:

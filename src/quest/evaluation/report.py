@@ -12,6 +12,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from quest.data.provenance import code_commit, file_hash, machine, package_versions
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
@@ -79,6 +81,11 @@ def provenance() -> dict[str, Any]:
         "versions": package_versions(),
         "stamp": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+
+
+def device_name(device: torch.device) -> str:
+    """What a network ran on, as people call it."""
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
 def write_report(report: dict[str, Any], path: Path) -> None:

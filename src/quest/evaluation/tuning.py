@@ -113,7 +113,7 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
     A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D. Where none is, no
-    threshold is best, and the bias stays what it is. All three figures are means over the sources of the objects
+    threshold is best, and the bias stays what it is. F2, precision and recall are means over the sources of the objects
     (PartNet-Mobility, procedural, your own), each of which counts the same however many takes it has.
     """
     seen: dict[str, _Found] = {}
@@ -127,9 +127,9 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
     if not any(any(found.hits) for found in sources):
         return tracker.config.slot_bias, 0.0, 0.0
     logits = np.unique([logit for found in sources for logit in found.logits])[::-1]
-    precision, recall = np.mean([found.at(logits) for found in sources], axis=0)
-    f_beta = np.mean([_f_beta(*found.at(logits)) for found in sources], axis=0)
-    best = int(f_beta.argmax())
+    rates = np.array([found.at(logits) for found in sources])
+    precision, recall = rates.mean(axis=0)
+    best = int(np.mean([_f_beta(*each) for each in rates], axis=0).argmax())
     threshold = logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2
     return -float(threshold), float(precision[best]), float(recall[best])
 
