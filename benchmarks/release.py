@@ -106,6 +106,9 @@ MAP_PROCEDURAL = (
     TrainingTakes("wide_long", f"{_WIDE} --views 2", 14, 71_000, _kinds("long_")),
     TrainingTakes("wide_busy", f"{_WIDE} --views 2", 8, 73_000, _kinds("busy_")),
     TrainingTakes("wide_dial", f"{_WIDE} --views 2", 12, 78_000, _kinds("dial_")),
+    # The mixes have few of these.
+    TrainingTakes("wide_things", f"{_WIDE} --views 3", 36, 81_000, ("eyeglasses", "stapler")),
+    TrainingTakes("wide_things", f"{_WIDE} --views 3", 18, 81_000, ("bucket", "pot", "room_door", "laptop", "trunk")),
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 

@@ -47,14 +47,14 @@ def test_in_the_mirror_image_the_mirrored_peaks_are_found():
 def test_a_rim_is_where_the_cells_along_it_point_to_in_the_mean():
     network, frames = make_network(), make_frames(batch=1, frames=1)
     logits, offset = torch.full((1, 1, 64, len(LABELS), 2), -9.0), torch.zeros(1, 1, 64, 2, 2)
-    for cell, score, x in ((24, 3.0, 1.0), (25, 2.0, 0.3), (26, 1.1, 0.2), (27, 0.5, 0.0), (31, 2.5, 0.0)):
+    for cell, score, x in ((24, 3.0, 1.0), (25, 2.4, 0.3), (26, 2.1, 0.2), (27, 1.5, 0.0), (31, 2.5, 0.0)):
         logits[..., cell, [LABELS.index("rim"), LABELS.index("handle")], 0] = score
         offset[..., cell, 0, 0] = x
     with torch.no_grad(), pytest.MonkeyPatch.context() as patch:
         patch.setattr(network, "afford", lambda *_: AffordanceMap(logits, offset))
         peaks = find_peaks(network, frames, network.observe(frames), radius_cells=0.1, mirror=False)
     found = {LABELS[int(n)]: uv for n, uv in zip(peaks.label.flip(0), peaks.uv.flip(0), strict=True)}
-    # Row 3 of 8: cells 0, 1, 2 point to 12, 14.4 and 21.6 px; cell 3 is 2.5 below the best, cell 7 points 48 px away.
+    # Row 3 of 8: cells 0, 1, 2 point to 12, 14.4 and 21.6 px; cell 3 is 1.5 below the best, cell 7 points 48 px away.
     assert found["rim"].tolist() == pytest.approx([(12 + 14.4 + 21.6) / 3 / 64, 28 / 64])
     assert found["handle"].tolist() == pytest.approx([12 / 64, 28 / 64])
 

@@ -21,9 +21,9 @@ FOUND_WITHIN = 0.1
 
 _PURPOSES_APART_PX = 3.0
 
-_ALIKE = 2.0
+_ALIKE = 1.0
 """Cells along a rim whose logit is at most so much below the best one's are a part of it ..."""
-_VOTES_WITHIN_PX = 40.0
+_VOTES_WITHIN_PX = 12.0
 """... if they point so near to where the best one points."""
 
 
@@ -104,11 +104,11 @@ def find_candidates(
 ) -> Candidates:
     """What may be an entity in one frame (B = 1, T = 1): peaks of the map, and pieces if the network ranks them.
 
-    A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which all
-    places look alike, where its cells point to in the mean. Peaks clash that are closer than ``radius_cells``. The
-    same label for another intent may come closer, a rim as close as it likes: those of a closed laptop are two things.
-    A piece lies in its own middle, once for every label that it may have; handles and knobs on it clash with it
-    however far they are from there.
+    A peak is the best of its 3 x 3 cells, label and intent, and lies where its cell points to; a rim, along which
+    neighbouring places look alike, where the best cells around point to in the mean. Peaks clash that are closer than
+    ``radius_cells``. The same label for another intent may come closer, a rim as close as it likes: those of a closed
+    laptop are two things. A piece lies in its own middle, once for every label that it may have; handles and knobs on
+    it clash with it however far they are from there.
 
     Args:
         network: whose map is read.

@@ -149,12 +149,11 @@ class Binding:
         if due:
             label = [LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due]
             intent = [INTENTS.index(w.query.intent) if w.query.intent else UNKNOWN_INTENT for w in due]
-            uv = self._canvas(due)
-            self._join(observed, frames, uv, torch.tensor(label), torch.tensor(intent))
-            for w, asked_px in zip(due, uv * self._network.config.encoder.image_size, strict=True):
-                begun = self._begin(w, w.query.name or f"point {w.number}", w.query.label)
-                begun.asked_px = asked_px
-                found.append(begun)
+            begun = [self._begin(w, w.query.name or f"point {w.number}", w.query.label) for w in due]
+            self._join(observed, frames, begun, self._canvas(due), torch.tensor(label), torch.tensor(intent))
+            for query in begun:
+                query.asked_px = query.bound_px
+            found += begun
         return found
 
     def wait(self) -> None:
@@ -219,7 +218,7 @@ class Binding:
                 name = query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]]))
         if chosen:
-            self._join(observed, frames, peaks.uv[chosen], peaks.label[chosen], peaks.intent[chosen])
+            self._join(observed, frames, found, peaks.uv[chosen], peaks.label[chosen], peaks.intent[chosen])
         return found
 
     def _near(self, uv: Float[Tensor, "K 2"], frames: FrameBatch, following: Sequence[Following]) -> list[list[bool]]:
@@ -229,11 +228,21 @@ class Binding:
         gap_px = torch.cdist(uv * size, frames.from_reference(at[None, None])[0, 0])
         return (gap_px < self._config.slot_radius_cells * self._network.config.cell_px).tolist()
 
-    def _join(self, observed: Observation, frames: FrameBatch, uv: Tensor, label: Tensor, intent: Tensor) -> None:
+    def _join(
+        self,
+        observed: Observation,
+        frames: FrameBatch,
+        begun: Sequence[Following],
+        uv: Tensor,
+        label: Tensor,
+        intent: Tensor,
+    ) -> None:
         """Bind more queries; the anchors of the others stay as they are."""
         uv, label, intent = (values[None].to(frames.depth_m.device) for values in (uv, label, intent))
-        uv_px = uv[:, None] * self._network.config.encoder.image_size
-        point = frames.near_point_at(uv_px).squeeze(1)
+        uv_px = uv * self._network.config.encoder.image_size
+        for query, bound_px in zip(begun, uv_px[0], strict=True):
+            query.bound_px = bound_px
+        point = frames.near_point_at(uv_px[:, None]).squeeze(1)
         valid = torch.ones_like(label, dtype=torch.bool)
         anchor = self._network.bind(observed, uv, point, label, valid, intent)
         self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)

@@ -68,6 +68,7 @@ class Following:
         doubted: whether it was seen in a wrong place when an alarm was raised, so that it is held and searched.
         good: frames in a row, with an alarm open, in which what is seen matches the anchor.
         answer: what was said of it in the newest frame.
+        bound_px: the pixel of the network's input at which it was bound, until it is matched for the first time.
         asked_px: the user's pixel in the network's input, until the first answer.
         mark: from where it was first to the point under the user's pixel, reference frame; None if there was none.
     """
@@ -89,6 +90,7 @@ class Following:
     doubted: bool = False
     good: int = 0
     answer: Answer | None = None
+    bound_px: Float[Tensor, "2"] | None = None
     asked_px: Float[Tensor, "2"] | None = None
     mark: Float[np.ndarray, "3"] | None = None
 

@@ -18,6 +18,11 @@ from quest.track.placing import as_array
 from quest.track.settings import TrackerConfig
 from quest.track.surface import face
 
+_BOUND_PX = 16.0
+_BOUND_SIGMA_PX = 4.0
+"""In the frame in which a query is bound its entity is this near to the pixel it was bound at, give or take; the
+network may say where in there."""
+
 
 def match(
     network: QuestNetwork,
@@ -53,18 +58,30 @@ def match(
         place = cell_point.cpu().numpy()
         favour = torch.from_numpy(np.stack([f.ground.favour(place) for f in following])).to(logits)
     size = network.config.encoder.image_size
-    cell_uv = 2 * cell_centres(network.config, device=logits.device) / size - 1
+    cell_px = cell_centres(network.config, device=logits.device)
+    cell_uv = 2 * cell_px / size - 1
     posterior = torch.empty_like(logits[0, 0])
-    fresh = [k for k, f in enumerate(following) if f.belief is None or (f.doubted and not f.good)]
-    known = [k for k in range(len(following)) if k not in fresh]
+    bound = [k for k, f in enumerate(following) if f.bound_px is not None]
+    fresh = [k for k, f in enumerate(following) if k not in bound and (f.belief is None or (f.doubted and not f.good))]
+    known = [k for k in range(len(following)) if k not in bound and k not in fresh]
+    if bound:
+        prior = _around([following[k] for k in bound], cell_px)
+        posterior[bound] = update(prior, logits[0, 0, bound], seen[bound], favour[bound], config)
     if fresh:
         posterior[fresh] = update(None, logits[0, 0, fresh], seen[fresh], favour[fresh], config)
     if known:
         prior = _prior([following[k] for k in known], cell_point, cell_uv, config, elapsed)
         posterior[known] = update(prior, logits[0, 0, known], seen[known], favour[known], config)
     for query, probability in zip(following, posterior, strict=True):
-        query.belief = Belief(probability[None], cell_point)
+        query.belief, query.bound_px = Belief(probability[None], cell_point), None
     return head(x, anchor, newest, posterior.clamp(min=1e-12).log()[None, None])
+
+
+def _around(following: Sequence[Following], cell_px: Float[Tensor, "C 2"]) -> Float[Tensor, "K C"]:
+    """Where queries may be that were bound in this very frame: flat about their pixel, and hardly anywhere else."""
+    at = [f.bound_px for f in following if f.bound_px is not None]
+    beyond = (torch.cdist(torch.stack(at).to(cell_px), cell_px) - _BOUND_PX).clamp(min=0)
+    return (-0.5 * (beyond / _BOUND_SIGMA_PX) ** 2).softmax(dim=-1)
 
 
 def _prior(

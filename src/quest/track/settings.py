@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 
 from quest.errors import ConfigError, WeightsError
 
-REVISION = 7
+REVISION = 8
 """Grows when the same weights and settings give other answers, so that no monitor is fitted to streams of before."""
 
 
