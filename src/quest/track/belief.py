@@ -56,8 +56,8 @@ def update(
     """One step of the recursion: the probability of every cell.
 
     Args:
-        prior: where entities may be before the frame is looked at; None where anywhere, in their first frame and in a
-            search.
+        prior: where entities may be before the frame is looked at; None where anywhere, in a search and in a new
+            reference frame.
         logits: scores of the newest frame's cells.
         seen: probability that each entity is seen, by which the frame's scores are trusted.
         favour: log weights of the cells by what else is known, the joint.
