@@ -167,7 +167,8 @@ def test_mix_knows_every_category_and_is_stable() -> None:
 
 
 def test_broad_mix_has_everything() -> None:
-    drawn = {name for name in CATEGORIES if not name.startswith(("bare_", "long_", "busy_", "dial_"))}
+    by_name = ("bare_", "long_", "busy_", "dial_", "apron_table")
+    drawn = {name for name in CATEGORIES if not name.startswith(by_name)}
     assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == drawn
     with pytest.raises(ConfigError, match="unknown mix 'wide'; expected one of usual, broad"):
         category_for_seed(0, mix="wide")
@@ -179,6 +180,19 @@ def test_bare_furniture_has_no_handles(category: str) -> None:
         model = build_model(category, seed)
         assert len(model.links) >= 1
         assert not any(link.has_handle for link in model.links)
+
+
+def test_drawers_of_apron_tables_are_flat_and_between_the_legs() -> None:
+    for seed in range(12):
+        model = build_model("apron_table", seed)
+        (legs,) = (part.mesh.bounds for part in model.body if part.role == "leg")
+        (top,) = (part.mesh.bounds for part in model.body if part.role == "top")
+        for link in model.links:
+            front = np.stack([link.parts[0].mesh.moved(link.origin).bounds])[0]
+            assert link.kind == "prismatic"
+            assert legs[0, 0] < front[0, 0] < front[1, 0] < legs[1, 0]
+            assert front[1, 2] < top[0, 2] + 1e-9
+            assert front[0, 2] > 0.5 * top[0, 2]
 
 
 @pytest.mark.parametrize("category", [name for name in CATEGORIES if name.startswith("long_")])

@@ -21,12 +21,13 @@ from quest.sim.procedural.model import HANDLE_ROLES, ObjectModel
 from quest.sim.procedural.room_door import build_room_door
 from quest.sim.procedural.storage import STORAGE
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
+from quest.sim.procedural.tables import TABLES
 from quest.sim.procedural.things import THINGS
 from quest.sim.procedural.urdf import write_object
 
 _OFTEN_BARE = (
     "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
-    "french_refrigerator", "microwave",
+    "french_refrigerator", "microwave", "apron_table",
 )  # fmt: skip
 
 
@@ -76,6 +77,7 @@ _BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     **APPLIANCES,
     **THINGS,
     "room_door": build_room_door,
+    **TABLES,
     **{f"bare_{name}": partial(_build_bare, name) for name in _OFTEN_BARE},
     **{f"long_{name}": partial(_build_long, name) for name in _OFTEN_LONG},
     **{f"busy_{name}": partial(_build_busy, name) for name in _OFTEN_BUSY},
@@ -95,8 +97,9 @@ _MORE_WEIGHTS = {
 }  # fmt: skip
 
 MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
-"""How often each category comes: the usual mix, and one of everything but what has no handles (``bare_``), long ones
-(``long_``), what is no handle beside its own (``busy_``), or dials that turn (``dial_``)."""
+"""How often each category comes: the usual mix, and one of everything but tables with drawers in their apron, what has
+no handles (``bare_``), long ones (``long_``), what is no handle beside its own (``busy_``), or dials that turn
+(``dial_``)."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""
