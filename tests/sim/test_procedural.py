@@ -22,7 +22,7 @@ pytest.importorskip("scene_synthesizer", reason="scene-synthesizer is not instal
 
 HANDLES = ("handle", "knob")
 ALL = [(category, seed) for category in CATEGORIES for seed in (0, 1, 2)]
-THINGS = ("eyeglasses", "stapler", "bucket", "pot")
+THINGS = ("eyeglasses", "sunglasses", "stapler", "bucket", "pot")
 """What is no furniture: small, turned in other ways, or held by what is not on a front."""
 FURNITURE = [(category, seed) for category, seed in ALL if category not in THINGS]
 
@@ -167,7 +167,7 @@ def test_mix_knows_every_category_and_is_stable() -> None:
 
 
 def test_broad_mix_has_everything() -> None:
-    by_name = ("bare_", "long_", "busy_", "dial_", "apron_table")
+    by_name = ("bare_", "long_", "busy_", "dial_", "apron_table", "sunglasses")
     drawn = {name for name in CATEGORIES if not name.startswith(by_name)}
     assert {category_for_seed(seed, mix="broad") for seed in range(1000)} == drawn
     with pytest.raises(ConfigError, match="unknown mix 'wide'; expected one of usual, broad"):

@@ -97,9 +97,9 @@ _MORE_WEIGHTS = {
 }  # fmt: skip
 
 MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_MORE_WEIGHTS}}
-"""How often each category comes: the usual mix, and one of everything but tables with drawers in their apron, what has
-no handles (``bare_``), long ones (``long_``), what is no handle beside its own (``busy_``), or dials that turn
-(``dial_``)."""
+"""How often each category comes: the usual mix, and one of everything but tables with drawers in their apron,
+sunglasses, what has no handles (``bare_``), long ones (``long_``), what is no handle beside its own (``busy_``), or
+dials that turn (``dial_``)."""
 
 CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
 """Names that :func:`make_object` knows."""

@@ -1,4 +1,4 @@
-"""Things that are carried about or worn: eyeglasses, a stapler, a bucket, a pot with a lid."""
+"""Things that are carried about or worn: eyeglasses, sunglasses, a stapler, a bucket, a pot with a lid."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from quest.sim.procedural.handles import HandleStyle, handle_part
-from quest.sim.procedural.model import Link, ObjectModel, Part, join
+from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import UP, box, lathe, prism_between, tube
 
 _FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -68,6 +68,52 @@ def build_eyeglasses(rng: np.random.Generator) -> ObjectModel:
     ground = min(
         float(p.mesh.bounds[0, 2]) for p in (*body, replace(links[0].parts[0], mesh=temple.moved((0, 0, hinge_z))))
     )
+    return ObjectModel("Eyeglasses", body, tuple(links)).moved((0.0, -length / 2, -ground))
+
+
+def build_sunglasses(rng: np.random.Generator) -> ObjectModel:
+    """Eyeglasses one does not see through: a shield or two dark lenses, and flat temples as wide as a finger.
+
+    Args:
+        rng: source of randomness.
+    """
+    half, height = float(rng.uniform(0.062, 0.074)), float(rng.uniform(0.034, 0.056))
+    wrap = float(rng.uniform(0.0, 0.035))  # how far the ends of the front go back
+    thick = float(rng.uniform(0.002, 0.005))
+    gap = 0.0 if rng.random() < 0.4 else float(rng.uniform(0.006, 0.011))
+    one_colour = bool(rng.random() < 0.6)
+    brow = float(rng.uniform(0.004, 0.009))
+
+    def wall(x: np.ndarray, low: float, high: float) -> Mesh:
+        front = np.stack([x, wrap * (x / half) ** 2], axis=1)
+        return prism_between(front, front + np.array([0.0, thick]), low, high)
+
+    lenses = [wall(np.linspace(gap, half - 0.004, 9), 0.0, height - brow)]
+    lenses.append(wall(np.linspace(-half + 0.004, -gap, 9), 0.0, height - brow))
+    body = (
+        Part("lens", join(lenses), "front" if one_colour else "glass"),
+        Part("frame", wall(np.linspace(-half, half, 17), height - brow, height), "front"),
+    )
+    length, wide, tip = (
+        float(rng.uniform(0.11, 0.15)),
+        float(rng.uniform(0.008, 0.016)),
+        float(rng.uniform(0.004, 0.009)),
+    )
+    along = np.linspace(0.0, 1.0, 13)
+    bend = -float(rng.uniform(0.005, 0.03)) * np.clip((along - 0.7) / 0.3, 0.0, 1.0) ** 1.5
+    tall = wide + (tip - wide) * np.clip(along / float(rng.uniform(0.3, 0.9)), 0.0, 1.0)
+    lower = np.stack([length * along, bend - tall / 2], axis=1)
+    upper = np.stack([length * along, bend + tall / 2], axis=1)
+    board = float(rng.uniform(0.0025, 0.006))
+    temple = prism_between(lower, upper, -board / 2, board / 2).rotated(_SIDE)
+    hinge_z = height - wide / 2
+    links = []
+    for n, side in enumerate((-1.0, 1.0)):
+        origin = (side * (half + board / 2 - 0.002), wrap + thick + 0.001, hinge_z)
+        fold = float(np.deg2rad(rng.uniform(75, 90)))
+        part = Part("leg", temple, "front" if one_colour or rng.random() < 0.5 else "dark")
+        links.append(Link(f"link_{n}", (part,), "revolute", origin, (0.0, 0.0, side), fold))
+    ground = min(0.0, hinge_z + float(temple.bounds[0, 2]))
     return ObjectModel("Eyeglasses", body, tuple(links)).moved((0.0, -length / 2, -ground))
 
 
@@ -198,6 +244,7 @@ def build_pot(rng: np.random.Generator) -> ObjectModel:
 
 THINGS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
     "eyeglasses": build_eyeglasses,
+    "sunglasses": build_sunglasses,
     "stapler": build_stapler,
     "bucket": build_bucket,
     "pot": build_pot,
