@@ -109,6 +109,10 @@ MAP_PROCEDURAL = (
     # The mixes have few of these.
     TrainingTakes("wide_things", f"{_WIDE} --views 3", 36, 81_000, ("eyeglasses", "stapler")),
     TrainingTakes("wide_things", f"{_WIDE} --views 3", 18, 81_000, ("bucket", "pot", "room_door", "laptop", "trunk")),
+    # Nor any of these, which PartNet-Mobility has.
+    TrainingTakes("wide_tables", f"{_WIDE} --views 3", 60, 86_000, ("bare_apron_table",)),
+    TrainingTakes("wide_tables", f"{_WIDE} --views 3", 24, 86_000, ("apron_table",)),
+    TrainingTakes("wide_things", f"{_WIDE} --views 3", 48, 86_000, ("sunglasses",)),
 )
 """What the affordance map learns from: three frames of many views of many objects."""
 
@@ -228,8 +232,10 @@ class Release:
         if self.partnet:
             _quest("generate", *choice, "--takes-per-object", 2, "--seed", 300)
         _quest("generate", *choice, "--no-partnet", "--seeds", "105000..105023", "--mix", "broad")
-        dials = [f"procedural:{kind}-105100" for kind in _kinds("dial_")]
-        _quest("generate", "--out", self._takes_of("wide_validation"), "--objects", *dials, *MAP_CHOICE.split())
+        by_name = [f"procedural:{kind}-105100" for kind in _kinds("dial_")]
+        by_name += [f"procedural:{kind}-{seed}" for kind in ("bare_apron_table", "sunglasses")
+                    for seed in range(105_210, 105_220)]  # fmt: skip
+        _quest("generate", "--out", self._takes_of("wide_validation"), "--objects", *by_name, *MAP_CHOICE.split())
         suites = ("--out", self._takes_of("suites_validation"), "--split", "validation")
         _quest("generate", *suites, self._partnet, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
         _quest("generate", *suites, "--suite", "lockers", "--seeds", "103000..103003")
