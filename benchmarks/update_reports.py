@@ -317,10 +317,10 @@ def page(folder: Path) -> str:
         "# Results of ablations, monitor, grounding, suites and simulator",
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
         "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
-        "Validation objects chose settings; test objects did not. Every table names its commit. Tables of "
-        "commits before 69b1116 are of maps that learned from fewer objects and of a tracker whose queries may begin "
-        "in a look-alike of what they were bound to, those before 8ca5ac4 of one that does not carry the point along "
-        "either that was asked for, those before 3145cc6 of one that does not read how far the front of a link has "
+        "Validation objects chose settings; test objects did not. Every table names its commit. What commits "
+        "before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before 69b1116 "
+        "are of a tracker whose queries may begin in a look-alike of what they were bound to, those before 8ca5ac4 of "
+        "one that does not carry the point along either that was asked for, those before 3145cc6 of one that does not read how far the front of a link has "
         "turned. Commits 2b4179b and 6027663 are part of 47b90a7 now.",
     ]
     parts += [_section(table, folder / table.file) for table in TABLES if (folder / table.file).is_file()]
