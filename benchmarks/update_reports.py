@@ -320,8 +320,8 @@ def page(folder: Path) -> str:
         "Validation objects chose settings; test objects did not. Every table names its commit. What commits "
         "before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before 69b1116 "
         "are of a tracker whose queries may begin in a look-alike of what they were bound to, those before 8ca5ac4 of "
-        "one that does not carry the point along either that was asked for, those before 3145cc6 of one that does not read how far the front of a link has "
-        "turned. Commits 2b4179b and 6027663 are part of 47b90a7 now.",
+        "one that does not carry the point along either that was asked for, those before 3145cc6 of one that does not "
+        "read how far the front of a link has turned. Commits 2b4179b and 6027663 are part of 47b90a7 now.",
     ]
     parts += [_section(table, folder / table.file) for table in TABLES if (folder / table.file).is_file()]
     return "\n\n".join(parts) + "\n"
