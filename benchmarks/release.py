@@ -109,7 +109,7 @@ MAP_PROCEDURAL = (
     # The mixes have few of these.
     TrainingTakes("wide_things", f"{_WIDE} --views 3", 36, 81_000, ("eyeglasses", "stapler")),
     TrainingTakes("wide_things", f"{_WIDE} --views 3", 18, 81_000, ("bucket", "pot", "room_door", "laptop", "trunk")),
-    # Nor has any mix these, which are as in PartNet-Mobility.
+    # No mix has these either; they look as those of PartNet-Mobility do.
     TrainingTakes("wide_tables", f"{_WIDE} --views 3", 60, 86_000, ("bare_apron_table",)),
     TrainingTakes("wide_tables", f"{_WIDE} --views 3", 24, 86_000, ("apron_table",)),
     TrainingTakes("wide_things", f"{_WIDE} --views 3", 48, 86_000, ("sunglasses",)),
