@@ -188,7 +188,7 @@ def test_drawers_of_apron_tables_are_flat_and_between_the_legs() -> None:
         (legs,) = (part.mesh.bounds for part in model.body if part.role == "leg")
         (top,) = (part.mesh.bounds for part in model.body if part.role == "top")
         for link in model.links:
-            front = np.stack([link.parts[0].mesh.moved(link.origin).bounds])[0]
+            front = link.parts[0].mesh.moved(link.origin).bounds
             assert link.kind == "prismatic"
             assert legs[0, 0] < front[0, 0] < front[1, 0] < legs[1, 0]
             assert front[1, 2] < top[0, 2] + 1e-9

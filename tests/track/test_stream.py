@@ -396,15 +396,3 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.Monk
     monkeypatch.setattr("quest.track.tracker.REVISION", -1)
     with pytest.raises(InputError, match="another revision"):
         tracker.restore(data)
-
-
-def test_what_is_asked_for_is_first_answered_near_its_pixel():
-    clip = make_clip(frames=2, size=(224, 224))
-    pixels = [(x, y) for x in (20, 110, 200) for y in (24, 112, 190)]
-    tracker = make_tracker()
-    stream = tracker.stream(clip.camera, [Query.point(0, x, y, name=f"{x} {y}") for x, y in pixels])
-    answer = feed(stream, clip, range(1))[0]
-    # Untrained scores are best anywhere; 16 px are free, another two sigmas and half a cell may come on top.
-    scale = clip.camera.width / tracker.network.config.encoder.image_size
-    assert np.linalg.norm(answer.uv_px - np.array(pixels), axis=-1).max() < (16 + 8 + 8) * scale
-    assert all(query.bound_px is None for query in stream._following)

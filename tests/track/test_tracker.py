@@ -13,7 +13,6 @@ from quest.data.cut import cut_clip
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.decoder import HeatmapHead
-from quest.model.observation import Observation, cell_centres
 from quest.model.weights import save_network
 from quest.track import StreamState, Tracker, load
 from quest.track.settings import REVISION
@@ -106,32 +105,6 @@ def test_before_a_point_is_asked_there_is_no_answer(clip: Clip):
     assert not tracks.visible[:2].any()
     assert (tracks.state[:2] == State.LOST).all()
     assert np.isfinite(tracks.uv_px[2:]).all()
-
-
-def test_a_query_that_binds_counts_its_frame_once(clip: Clip):
-    """At the frame of binding the belief is that frame's heatmap about the pixel, whoever else is bound."""
-    tracker = make_tracker()
-    stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
-    with torch.inference_mode():
-        stream.step(frame.rgb, frame.depth_m, 0.0, frame.cam_from_world)
-        anchor = stream._binding.anchor
-        assert anchor is not None
-        window = Observation.stack(list(stream._ring))
-        x = tracker.network.embed(anchor, window)[:, -1:]
-        assert isinstance(tracker.network.head, HeatmapHead)
-        newest = window.during(slice(-1, None))
-        logits = tracker.network.head.logits(x, newest)
-        seen = tracker.network.head.confidences(x, logits, newest, logits.argmax(dim=-1))[0, 0, :, 0].sigmoid()
-        cell_px = cell_centres(tracker.network.config)
-        for k, one in enumerate(stream._following):
-            assert one.belief is not None
-            assert one.belief.probability.sum() == pytest.approx(1, abs=1e-5)
-            uv_px = torch.tensor(POINTS[k].uv_px)
-            near = (cell_px - uv_px).norm(dim=-1) < 16
-            got, scores = one.belief.probability[0, near], logits[0, 0, k, near]
-            expected = (seen[k] * scores / tracker.config.temperature).softmax(-1)
-            torch.testing.assert_close(got / got.sum(), expected, rtol=1e-3, atol=1e-6)
-            assert one.belief.probability[0, (cell_px - uv_px).norm(dim=-1) < 16 + 3 * 4].sum() > 0.95
 
 
 def test_hidden_entities_are_held_where_they_were_seen(clip: Clip):

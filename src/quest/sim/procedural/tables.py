@@ -43,9 +43,9 @@ def build_apron_table(rng: np.random.Generator) -> ObjectModel:
     )  # fmt: skip
     links = []
     for n, cell in enumerate(cells):
-        front, *rest = (made := drawer(f"link_{n}", cell, style, depth_m=depth, board_m=board, bare=False)).parts
-        surface = "body" if seamless else front.surface
-        links.append(replace(made, parts=(replace(front, surface=surface), *rest)))
+        link = drawer(f"link_{n}", cell, style, depth_m=depth, board_m=board, bare=False)
+        front, *rest = link.parts
+        links.append(replace(link, parts=(replace(front, surface="body"), *rest)) if seamless else link)
     # The fronts lie before the carcass; what is beside them is as far out.
     out, bottom = -style.board_m - 0.001, under - apron
     rails = [
