@@ -31,6 +31,7 @@ from rich.console import Console
 
 from quest.data.provenance import code_commit, machine, package_versions
 from quest.data.store import TakeStore
+from quest.evaluation.bootstrap import interval_over
 from quest.sim.cameras import PosedCamera
 from quest.sim.objects import SimObject
 from quest.sim.plan import ObjectShelf, plan_takes, procedural_objects
@@ -153,9 +154,8 @@ def _summary(timed: np.ndarray) -> dict[str, Any]:
 
 def _interval(timed: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
     """A statistic of the takes, and its 95 % bootstrap interval over takes."""
-    draws = np.random.default_rng(0).integers(len(timed), size=(1000, len(timed)))
-    low, high = np.quantile(statistic(timed[draws]), (0.025, 0.975))
-    return {"mean": float(statistic(timed)), "low": float(low), "high": float(high)}
+    low, high = interval_over(timed, statistic)
+    return {"mean": float(statistic(timed)), "low": low, "high": high}
 
 
 def _done() -> Future[None]:

@@ -27,6 +27,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import binomtest
 
 from quest.data.provenance import code_commit, machine, package_versions
+from quest.evaluation.bootstrap import interval_over
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, fit_joint
 from quest.grounding.vectors import perpendicular
 
@@ -269,10 +270,9 @@ def middle(value: np.ndarray) -> dict[str, Any]:
     """Median with its 95 % bootstrap interval."""
     if not len(value):
         return {"n": 0}
-    draws = np.random.default_rng(0).integers(len(value), size=(1000, len(value)))
-    low, high = np.quantile(np.median(value[draws], axis=1), (0.025, 0.975))
+    low, high = interval_over(value, lambda drawn: np.median(drawn, axis=-1))
     p95 = float(np.quantile(value, 0.95))
-    return {"median": float(np.median(value)), "low": float(low), "high": float(high), "p95": p95, "n": len(value)}
+    return {"median": float(np.median(value)), "low": low, "high": high, "p95": p95, "n": len(value)}
 
 
 def recorded(folder: Path, sigma_m: float | None, *, online: bool = False) -> dict[str, Any]:

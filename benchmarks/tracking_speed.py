@@ -24,6 +24,7 @@ from rich.console import Console
 import quest
 from quest.data.recording import read_recording
 from quest.data.sample import sample_folder
+from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import device_name, provenance, write_report
 from quest.track import Stream, Tracker
 from quest.types import Clip, Query
@@ -102,14 +103,13 @@ def played_ms(stream: Stream, clip: Clip, *, frames: int | None = None) -> Float
 
 def _summary(turns_ms: Float[np.ndarray, "R T"]) -> dict[str, Any]:
     """Median and 95 % quantile of a frame, and frames per second with a 95 % bootstrap interval over turns."""
-    drawn = turns_ms[np.random.default_rng(0).integers(len(turns_ms), size=(1000, len(turns_ms)))]
-    low, high = np.quantile(1e3 / drawn.mean(axis=(1, 2)), (0.025, 0.975))
+    low, high = interval_over(turns_ms, lambda drawn: 1e3 / drawn.mean(axis=(-2, -1)))
     return {
         "turns": len(turns_ms),
         "frames": turns_ms.size,
         "median_ms": float(np.median(turns_ms)),
         "p95_ms": float(np.quantile(turns_ms, 0.95)),
-        "frames_per_s": {"mean": float(1e3 / turns_ms.mean()), "low": float(low), "high": float(high)},
+        "frames_per_s": {"mean": float(1e3 / turns_ms.mean()), "low": low, "high": high},
     }
 
 

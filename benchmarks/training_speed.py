@@ -29,6 +29,7 @@ from rich.console import Console
 
 from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
+from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import device_name, provenance, write_report
 from quest.model.config import PRESETS
 from quest.model.network import QuestNetwork
@@ -162,11 +163,9 @@ def _finish(device: torch.device) -> None:
 
 
 def _summary(turns: np.ndarray, frames: int) -> dict[str, Any]:
-    draws = np.random.default_rng(0).integers(len(turns), size=(1000, len(turns)))
-
     def interval(statistic: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-        low, high = np.quantile(statistic(turns[draws]), (0.025, 0.975))
-        return {"mean": float(statistic(turns)), "low": float(low), "high": float(high)}
+        low, high = interval_over(turns, statistic)
+        return {"mean": float(statistic(turns)), "low": low, "high": high}
 
     size = frames * len(turns)
     return {

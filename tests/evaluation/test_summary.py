@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.stats
 from rich.console import Console
 
 from quest.errors import InputError
@@ -24,7 +25,7 @@ from quest.evaluation import (
     summarise,
     write_results,
 )
-from quest.evaluation.bootstrap import draw_objects, mean_value, median_value
+from quest.evaluation.bootstrap import draw_objects, interval_over, mean_value, median_value
 from quest.evaluation.metrics import Sums
 from quest.evaluation.results import records_path
 from tests.evaluation.answers import make_answer
@@ -143,6 +144,13 @@ def test_bootstrap_equals_resampling_the_objects_by_hand() -> None:
     np.testing.assert_allclose(np.array([mean.low, mean.high], dtype=float), np.quantile(means, [0.025, 0.975]))
     np.testing.assert_allclose(np.array([median.low, median.high], dtype=float), np.quantile(medians, [0.025, 0.975]))
     assert median.mean == np.median(value)
+
+
+def test_interval_over_turns_is_that_of_the_percentile_bootstrap() -> None:
+    turns = np.random.default_rng(0).exponential(size=(40, 3))
+    low, high = interval_over(turns, lambda drawn: drawn.mean(axis=(-2, -1)), resamples=20_000)
+    known = scipy.stats.bootstrap((turns.mean(axis=1),), np.mean, n_resamples=20_000, method="percentile", rng=1)
+    np.testing.assert_allclose((low, high), known.confidence_interval, atol=0.01)
 
 
 def test_one_object_has_no_interval() -> None:

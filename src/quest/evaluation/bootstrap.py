@@ -5,6 +5,7 @@ Reference: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float, Int
 from quest.evaluation.metrics import Sums
 
 LEVEL = 0.95
+_ENDS = ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,26 @@ def median_value(
     return Value(float(np.median(value)), low, high, len(value))
 
 
+def interval_over(
+    units: Float[np.ndarray, "N ..."],
+    statistic: Callable[[np.ndarray], np.ndarray],
+    *,
+    resamples: int = 1000,
+    seed: int = 0,
+) -> tuple[float, float]:
+    """The 95 % interval of a statistic over units that are alike, such as the turns of a timing.
+
+    Args:
+        units: what is drawn from, along the first axis.
+        statistic: of one resample, or of many along axes before.
+        resamples: how often as many units are drawn.
+        seed: of the draws.
+    """
+    draws = np.random.default_rng(seed).integers(len(units), size=(resamples, len(units)))
+    low, high = np.quantile(statistic(units[draws]), _ENDS)
+    return float(low), float(high)
+
+
 def objects_with_terms(sums: Sums, object_of: Int[np.ndarray, " N"]) -> int:
     """How many objects have anything that a metric counts."""
     return len(np.unique(object_of[sums.count > 0]))
@@ -82,6 +104,5 @@ def objects_with_terms(sums: Sums, object_of: Int[np.ndarray, " N"]) -> int:
 def _percentiles(samples: np.ndarray, *, objects: int) -> tuple[float | None, float | None]:
     if objects < 2 or not len(samples):
         return None, None
-    tail = (1.0 - LEVEL) / 2.0
-    low, high = np.quantile(samples, (tail, 1.0 - tail))
+    low, high = np.quantile(samples, _ENDS)
     return float(low), float(high)
