@@ -45,7 +45,7 @@ class WindowPlan:
 
     Attributes:
         picks: a view and its frames, per window.
-        following: the frame after the window at the window's own step; -1 where the view has none.
+        following: the frame after the window at the step of its newest frames; -1 where the view has none.
         entities: entities of the fullest view of the whole batch, to which all windows are padded.
         disturbance: None for windows as they are.
     """

@@ -122,7 +122,9 @@ class WindowSampler:
         stride = int(rng.integers(0, self.config.max_stride + 1)) * (1 if rng.random() < 0.5 else -1)
         end = int(rng.integers(len(view)))
         window = [int(np.clip(end - stride * back, 0, len(view) - 1)) for back in range(self.network.window)]
-        following = end + stride if 0 <= end + stride < len(view) else -1
+        # A window whose newest step is cut short by an end of the view says nothing of what its next step would be.
+        around = (end + stride,) if self.network.window == 1 else (end - stride, end + stride)
+        following = end + stride if all(0 <= t < len(view) for t in around) else -1
         return view, [anchor] if self.anchors_only else [anchor, *reversed(window)], following
 
     def _frames(self, picks: tuple[Pick, ...], disturbance: Disturbance | None) -> FrameBatch:
