@@ -173,6 +173,8 @@ class Release:
 
     def run(self) -> int:
         """The stages, in order."""
+        if self.beside is not None and self.beside not in shipped_weights():
+            raise SystemExit(f"release: --beside {self.beside}: expected one of {', '.join(shipped_weights())}")
         for stage in self.stages:
             getattr(self, f"_{stage}")()
         return 0

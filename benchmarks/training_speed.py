@@ -25,6 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import tyro
+from lightning_fabric import Fabric
 from rich.console import Console
 
 from quest.data.provenance import combined_hash
@@ -33,7 +34,6 @@ from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import device_name, provenance, write_report
 from quest.model.config import PRESETS
 from quest.model.network import QuestNetwork
-from quest.track.tracker import pick_device
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
@@ -70,36 +70,41 @@ class TrainingSpeed:
         """Time both in turn and print means with 95 % bootstrap intervals over turns."""
         torch.manual_seed(self.training.seed)
         network = QuestNetwork(PRESETS[self.preset])
+        fabric = launch(replace(self.training, devices=1))
         with tempfile.TemporaryDirectory() as scratch:
-            sampler, data_hash = self._sampler(network, self.cache or Path(scratch) / "cache")
-            turns = self._turns(network, sampler, Path(scratch))
+            sampler, data_hash = self._sampler(network, self.cache or Path(scratch) / "cache", fabric.device)
+            turns = self._turns(network, sampler, Path(scratch), fabric)
         frames = self.steps * self.windows.batch * (network.config.window + 1)
         result = _summary(np.array(turns), frames)
         Console(highlight=False).print_json(data=result)
         if self.out is not None:
-            about = {"preset": self.preset, "batch": self.windows.batch, "precision": self.training.precision}
-            about |= {"device": device_name(pick_device("auto")), "load": os.getloadavg()[0], "data_hash": data_hash}
+            about = {"preset": self.preset, "batch": self.windows.batch}
+            about |= {
+                name: getattr(self.training, name) for name in ("precision", "optimizer", "accumulate", "compile")
+            }
+            about |= {"device": device_name(fabric.device), "load": os.getloadavg()[0], "data_hash": data_hash}
             write_report(provenance() | about | result, self.out)
         return 0
 
-    def _sampler(self, network: QuestNetwork, cache: Path) -> tuple[WindowSampler, str]:
+    def _sampler(self, network: QuestNetwork, cache: Path, device: torch.device) -> tuple[WindowSampler, str]:
         stores = [TakeStore(folder) for folder in self.data]
         chosen = [(store, name) for store in stores for name in store.names()][: self.takes]
         features = FeatureCache(cache, network.config, network.encoder)
         for store, name in chosen:
-            list(features.build(store, [name], device=pick_device("auto")))
+            list(features.build(store, [name], device=device))
         views = features.views([name for _, name in chosen])
         data_hash = combined_hash((name, store.data_hash(name)) for store, name in chosen)
         return WindowSampler(views, network.config, self.windows), data_hash
 
-    def _turns(self, network: QuestNetwork, sampler: WindowSampler, scratch: Path) -> list[tuple[float, float]]:
+    def _turns(
+        self, network: QuestNetwork, sampler: WindowSampler, scratch: Path, fabric: Fabric
+    ) -> list[tuple[float, float]]:
         """Seconds of the timed steps of each turn, of the loop and bare."""
         block = self.steps + 1
         never = block * (self.blocks + 1) + 1
         config = replace(
             self.training, steps=never, warmup_steps=1, validate_every=never, checkpoint_every=never, devices=1
         )
-        fabric = launch(config)
         bare = _Bare(copy.deepcopy(network).to(fabric.device), sampler, config, fabric.autocast)
         turns, began = [], 0.0
 

@@ -40,7 +40,7 @@ class FineTune:
     steps: int = 300
     """Training steps of what follows entities, and as many of what discovers them."""
     learning_rate: float = 1e-4
-    """A quarter of what training anew takes: the weights are good already."""
+    """A twentieth of what training anew takes: the weights are good already."""
 
     @property
     def folder(self) -> Path:

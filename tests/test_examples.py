@@ -14,6 +14,7 @@ import pytest
 
 from quest.cli.main import parse
 from quest.errors import QuestError
+from quest.train.settings import TrainingConfig
 from tests.track.clips import make_clip, make_tracker
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
@@ -44,7 +45,7 @@ def test_fine_tuning_runs_commands_that_exist(tmp_path: Path, monkeypatch: pytes
         parse(words)
     train: Any = parse(commands[names.index("train")])
     assert len(train.data) == (2 if procedural else 1)
-    assert train.training.learning_rate < 4e-4
+    assert train.training.learning_rate < 0.1 * TrainingConfig().learning_rate
     held_out = str(tmp_path / "takes" / "held-out")
     assert held_out not in (*train.data, *train.validation)
     evaluated: list[Any] = [parse(words) for words in commands if words[0] == "eval"]

@@ -98,6 +98,7 @@ def test_training_goes_on_from_trained_weights(store: Path, weights: Path, tmp_p
     assert main(["train", "--data", str(store), "--out", str(tmp_path), "--weights", str(weights), *quick]) == 0
     loaded = load_network(tmp_path / "weights.safetensors")
     assert json.loads(loaded.settings)["slot_threshold"] == 0.0, "the tracker's settings stay with the weights"
+    assert loaded.about == f"{load_network(weights).about}; quest train --stage 1, 1 training takes"
 
 
 def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, capsys):

@@ -8,9 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from quest.errors import WeightsError
+from quest.model import tensor_file
 from quest.model.network import QuestNetwork
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, save_checkpoint
 from tests.tiny import DEFAULT, make_network
@@ -94,6 +96,15 @@ def test_a_torn_checkpoint(tmp_path: Path, name: str, keep: int | None):
     network, optimizer = trained(seed=1)
     with pytest.raises(WeightsError, match="start anew"):
         load_checkpoint(tmp_path / "last", network, optimizer)
+
+
+def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(*_: object, **__: object) -> None:
+        raise SafetensorError("No space left on device")
+
+    monkeypatch.setattr(tensor_file, "save_file", full)
+    with pytest.raises(WeightsError, match=r"weights\.safetensors: cannot be written \(No space left"):
+        saved(tmp_path / "last")
 
 
 def test_a_missing_checkpoint(tmp_path: Path):

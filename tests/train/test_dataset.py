@@ -45,14 +45,14 @@ def objects(dataset: Dataset) -> tuple[list[str], list[str]]:
 def test_one_store_is_divided_by_the_split(tmp_path: Path):
     dataset, told = opened(tmp_path, (TRAIN, VALIDATION, TEST, UNLISTED))
     assert objects(dataset) == (["panels-3"], ["panels-100003"])
-    assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
+    assert dataset.training_takes == 1
     assert told == [(1, 2, 4), (2, 2, 8)]
     assert dataset.training_sources == {"procedural"}
 
 
 def test_sources_are_those_of_takes_that_teach(tmp_path: Path):
     dataset, _ = opened(tmp_path / "one", (TRAIN, VALIDATION), sources=("procedural",))
-    assert (dataset.training_takes, dataset.validation_takes) == (1, 1)
+    assert dataset.training_takes == 1
     with pytest.raises(ConfigError, match="no train takes"):
         opened(tmp_path / "other", (TRAIN, VALIDATION), sources=("partnet-mobility",))
 
@@ -97,9 +97,9 @@ def test_mirror_images_teach_beside_the_takes_or_instead(tmp_path: Path):
         report=lambda *_: None,
     )
     both = open_mirrored(stores=[store, chosen])
-    assert (both.training_takes, both.validation_takes) == (2, 1)
+    assert both.training_takes == 2
     alone = open_mirrored(stores=[chosen])
-    assert (alone.training_takes, alone.validation_takes) == (1, 1)
+    assert alone.training_takes == 1
     mirrored = alone.training.views[0]
     view = next(v for v in both.training.views if v.name not in {m.name for m in alone.training.views})
     np.testing.assert_array_equal(mirrored.rgb[:, :, ::-1], view.rgb)

@@ -205,6 +205,26 @@ def test_a_finished_run_stays_as_it_is(run: Run, tmp_path: Path):
     assert (tmp_path / "run" / "last" / "weights.safetensors").read_bytes() == before
 
 
+def test_a_run_that_was_stopped_before_it_was_judged_is_judged_when_fewer_steps_are_asked_for(run: Run, tmp_path: Path):
+    config = replace(SHORT, validate_every=100, checkpoint_every=2)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop._Learner, "learn", killed_at(4))
+        with pytest.raises(KeyboardInterrupt):
+            run(config)
+    _, reports = run(replace(config, steps=2))
+    assert not reports
+    assert load_checkpoint(tmp_path / "run" / "best", make_network(), None).best_step == 2
+
+
+def test_what_is_set_anew_counts_when_a_run_goes_on(run: Run, monkeypatch: pytest.MonkeyPatch):
+    run(replace(SHORT, steps=2))
+    seen = []
+    make = loop.make_optimizer
+    monkeypatch.setattr(loop, "make_optimizer", lambda *given: seen.append(make(*given)) or seen[-1])
+    run(replace(SHORT, steps=4, weight_decay=0.3))
+    assert {group["weight_decay"] for group in seen[0].param_groups} == {0.3}
+
+
 def test_a_run_of_another_network_is_not_resumed(run: Run):
     run(replace(SHORT, steps=1))
     with pytest.raises(WeightsError):

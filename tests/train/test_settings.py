@@ -30,6 +30,7 @@ def test_presets_have_losses_of_their_own() -> None:
         (TrainingConfig(), "weight_decay", -0.01),
         (TrainingConfig(), "warmup_steps", -1),
         (TrainingConfig(), "seed", -1),
+        (TrainingConfig(), "seed", 2**64),
         (WindowConfig(), "batch", 0),
         (WindowConfig(), "max_stride", -1),
         (WindowConfig(), "point_jitter_px", -1.0),
@@ -43,6 +44,11 @@ def test_settings_out_of_range_are_refused_before_anything_is_prepared(
 ) -> None:
     with pytest.raises(ConfigError, match=f"{name} .*got {value}"):
         replace(settings, **{name: value})
+
+
+def test_an_unknown_accelerator_is_refused() -> None:
+    with pytest.raises(ConfigError, match="expected accelerator auto, cpu, cuda, mps, got 'abacus'"):
+        TrainingConfig(accelerator="abacus")  # type: ignore[arg-type]
 
 
 def test_options_that_would_do_nothing_are_refused() -> None:

@@ -136,12 +136,12 @@ class Train:
             if self.network != NetworkChanges():
                 raise ConfigError("train: trained weights have a network of their own; leave --network.* away")
             loaded = load_network(self.weights)
-            network = loaded.network.train()
+            network, before = loaded.network.train(), f"{loaded.about}; "
             if self.stage != 1:
                 # Tracking stays as it is, and so does what the monitor was calibrated on.
                 grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
-                return _Start(grown, loaded.settings, loaded.monitor, f"{loaded.about}; ", loaded.licence)
-            return _Start(without_flow_head(network), loaded.settings, licence=loaded.licence)
+                return _Start(grown, loaded.settings, loaded.monitor, before, loaded.licence)
+            return _Start(without_flow_head(network), loaded.settings, about=before, licence=loaded.licence)
         if self.stage != 1:
             raise ConfigError(f"train: stage {self.stage} needs --weights, a network that stage 1 has trained")
         if self.encoder is None:
@@ -185,7 +185,7 @@ class Train:
         network = start.network.cpu()
         load_checkpoint(best, network, None)
         file = self.out / "weights.safetensors"
-        how = f"--stage {self.stage}" if self.stage != 1 else f"--preset {network.config.preset}"
+        how = f"--preset {network.config.preset}" if self.weights is None else f"--stage {self.stage}"
         about = f"{start.about}quest train {how}, {dataset.training_takes} training takes"
         licence = licence_after(start.licence, dataset.training_sources)
         save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=licence)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,7 +26,7 @@ class ListWeights:
 
     def run(self) -> int:
         """Print name, size, licence and file of each."""
-        from quest.model.shared_parts import read_tensors
+        from quest.model.tensor_file import read_tensors
         from quest.model.weights import shipped_weights
 
         console = Console(highlight=False)
@@ -360,6 +361,8 @@ def _must_be_a_file(weights: Path) -> None:
             f"{weights}: expected the safetensors file itself, which is rewritten; `quest weights save` makes one of "
             "a folder, a shipped name or a hub id"
         )
+    if not os.access(weights.parent, os.W_OK):
+        raise ConfigError(f"{weights}: the file is written anew beside itself, and {weights.parent} cannot be written")
 
 
 def _monitor(calibration: str | None) -> str:

@@ -13,8 +13,8 @@ from quest.errors import ConfigError
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.pixels_only import PixelsOnly
 from quest.evaluation.protocols import ClipTracker
+from quest.model.precision import fast_bfloat16
 from quest.track import Tracker
-from quest.track.tracker import fast_bfloat16
 from quest.types import Clip
 
 _REMEMBERED_FRAMES = 1000

@@ -144,7 +144,7 @@ def _lesson(tracker: Tracker, frames: FrameBatch, full: FrameBatch, entities: _E
     """
     network, radius_cells = tracker.network, tracker.config.slot_radius_cells
     with torch.no_grad():
-        sighted = sight(network, frames, network.observe(frames), radius_cells=radius_cells)
+        sighted = sight(network, frames, None, radius_cells=radius_cells)
     pieces_m = _lifted(full, sighted.pieces.uv_px)
     kind = torch.zeros(len(pieces_m), dtype=torch.long)
     for number, name in enumerate(PIECE_LABELS, start=1):

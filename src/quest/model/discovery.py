@@ -19,6 +19,9 @@ from quest.types import LABELS
 FOUND_WITHIN = 0.1
 """A candidate this close to an entity of its label has found it, normalised units: the gate of protocol semantic."""
 
+RADIUS_CELLS = 1.5
+"""How far peaks of one label are apart, unless a tracker's settings say otherwise."""
+
 _PURPOSES_APART_PX = 3.0
 
 _ALIKE = 1.0
@@ -100,7 +103,7 @@ class Sighted:
 
 
 def find_candidates(
-    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+    network: QuestNetwork, frames: FrameBatch, observed: Observation | None, *, radius_cells: float, mirror: bool = True
 ) -> Candidates:
     """What may be an entity in one frame (B = 1, T = 1): peaks of the map, and pieces if the network ranks them.
 
@@ -113,7 +116,7 @@ def find_candidates(
     Args:
         network: whose map is read.
         frames: the frame.
-        observed: the frame as observed.
+        observed: the frame as observed, or None (see :meth:`QuestNetwork.afford`).
         radius_cells: how far peaks are apart.
         mirror: whether the map is the mean of the frame's and of its mirror image's, which finds more and costs the
             encoding of another image.
@@ -125,7 +128,7 @@ def find_candidates(
 
 
 def sight(
-    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+    network: QuestNetwork, frames: FrameBatch, observed: Observation | None, *, radius_cells: float, mirror: bool = True
 ) -> Sighted:
     """Peaks and pieces of one frame; the arguments are those of :func:`find_candidates`."""
     found = _map(network, frames, observed, mirror=mirror)
@@ -137,12 +140,11 @@ def sight(
     return Sighted(peaks, pieces, on_piece, groups(frames, uv_px, label, on_piece.any(dim=1)))
 
 
-def _map(network: QuestNetwork, frames: FrameBatch, observed: Observation, *, mirror: bool) -> AffordanceMap:
+def _map(network: QuestNetwork, frames: FrameBatch, observed: Observation | None, *, mirror: bool) -> AffordanceMap:
     found = network.afford(frames, observed)
     if not mirror:
         return found
-    other = _mirrored(network, frames)
-    return found.mean(network.afford(other, network.observe(other)).mirrored())
+    return found.mean(network.afford(_mirrored(network, frames)).mirrored())
 
 
 def _peaks(network: QuestNetwork, frames: FrameBatch, found: AffordanceMap, *, radius_cells: float) -> Candidates:
@@ -203,7 +205,7 @@ def _ranked(network: QuestNetwork, frames: FrameBatch, sighted: Sighted, *, radi
 
 
 def find_peaks(
-    network: QuestNetwork, frames: FrameBatch, observed: Observation, *, radius_cells: float, mirror: bool = True
+    network: QuestNetwork, frames: FrameBatch, observed: Observation | None, *, radius_cells: float, mirror: bool = True
 ) -> Peaks:
     """Those of :func:`find_candidates` that are apart, at most as many as the network has slots."""
     found = find_candidates(network, frames, observed, radius_cells=radius_cells, mirror=mirror)

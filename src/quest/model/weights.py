@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from huggingface_hub import ModelCard, PyTorchModelHubMixin
-from safetensors.torch import save_file
 from torch import nn
 
 from quest.errors import ConfigError, WeightsError
@@ -20,7 +19,8 @@ from quest.model.encoder import load_exactly
 from quest.model.hub import FILE, LIBRARY, HubId, download, explained
 from quest.model.model_card import TAGS, model_card
 from quest.model.network import QuestNetwork
-from quest.model.shared_parts import fetch_shared, leave_out, read_tensors
+from quest.model.shared_parts import fetch_shared, leave_out
+from quest.model.tensor_file import read_tensors, save_tensors
 
 FORMAT = "quest-network-2"
 
@@ -189,7 +189,7 @@ def save_network(
             encoder, are left out and read from there.
 
     Raises:
-        WeightsError: the other network has no part in common, or cannot be read.
+        WeightsError: the other network has no part in common or cannot be read, or the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
@@ -200,7 +200,7 @@ def save_network(
         metadata |= shared
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
-    save_file(tensors, partial, metadata=metadata)
+    save_tensors(tensors, partial, metadata=metadata)
     partial.chmod(0o644)  # safetensors makes files that only their owner can read
     partial.replace(path)
 

@@ -6,6 +6,7 @@ import json
 from dataclasses import asdict, dataclass
 
 from quest.errors import ConfigError, WeightsError
+from quest.model.discovery import RADIUS_CELLS
 
 REVISION = 8
 """Grows when the same weights and settings give other answers, so that no monitor is fitted to streams of before."""
@@ -55,7 +56,7 @@ class TrackerConfig:
     slot_gain: float = 1.0
     slot_threshold: float = 0.5
     prompt_threshold: float = 0.2
-    slot_radius_cells: float = 1.5
+    slot_radius_cells: float = RADIUS_CELLS
 
     def __post_init__(self) -> None:
         widths = (self.move_sigma, self.point_sigma, self.joint_sigma, self.along_sigma, self.temperature)

@@ -16,6 +16,7 @@ from quest.errors import ConfigError, InputError, WeightsError
 from quest.grounding import JointKind
 from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import QuestNetwork
+from quest.model.precision import fast_bfloat16
 from quest.model.weights import load_network
 from quest.monitor import Budget, Calibration, Monitor
 from quest.track.intake import Intake
@@ -196,7 +197,7 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: b
     Args:
         name: name of shipped weights; path of a safetensors file or of a folder of a run; or ``owner/name`` of a model
             repository on the hub, optionally ``owner/name@revision``. What was fetched once works without a network.
-        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto`` for the best there is.
+        device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto``: CUDA if there is any, else the CPU.
         monitor: whether to read the monitor's calibration, without which there are no alarms. One that is about to be
             made anew may be of signals that are no more.
 
@@ -235,15 +236,6 @@ def pick_device(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device {name!r} cannot be used ({error}); try cpu") from error
     return device
-
-
-def fast_bfloat16(device: torch.device) -> bool:
-    """Whether bfloat16 is faster than float32 there."""
-    if device.type == "cuda":
-        return torch.cuda.is_bf16_supported()
-    if device.type != "cpu" or not torch.backends.mkldnn.is_available():
-        return False
-    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> Tracks:

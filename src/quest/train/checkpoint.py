@@ -14,12 +14,13 @@ from pathlib import Path
 import torch
 from jaxtyping import UInt8
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import nn
 
 from quest.errors import WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
+from quest.model.tensor_file import save_tensors
 
 _GENERATOR = "generator."
 
@@ -30,7 +31,7 @@ class Progress:
 
     Attributes:
         step: optimiser steps done.
-        best: best validation score so far (mean 3D distance, normalised units).
+        best: best validation score so far, of the kind that the objective is judged by; less is better.
         best_step: step of the best score.
         stale: validations since the best.
         rng: state of the generator that draws windows, as JSON.
@@ -64,15 +65,18 @@ def save_checkpoint(
         optimizer: its state is needed to go on.
         progress: where the run stands.
         generators: states of torch's generators, by the kind of device, one row per process.
+
+    Raises:
+        WeightsError: it cannot be written; the one before stays.
     """
     partial = folder.with_name(f".partial-{folder.name}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    save_file(_trained(network), partial / "weights.safetensors")
+    save_tensors(_trained(network), partial / "weights.safetensors")
     state = optimizer.state_dict()
     tensors = {f"{i}.{key}": value.contiguous() for i, entry in state["state"].items() for key, value in entry.items()}
     tensors |= {f"{_GENERATOR}{kind}": rows.contiguous() for kind, rows in (generators or {}).items()}
-    save_file(tensors, partial / "optimizer.safetensors")
+    save_tensors(tensors, partial / "optimizer.safetensors")
     groups = [{k: v for k, v in group.items() if k != "params"} for group in state["param_groups"]]
     (partial / "progress.json").write_text(json.dumps({"progress": asdict(progress), "groups": groups}))
     old = folder.with_name(f".old-{folder.name}")
@@ -90,14 +94,14 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
     Raises:
         WeightsError: the checkpoint is missing, torn, or of another network.
     """
-    folder = _present(folder)
+    asked, folder = folder, _present(folder)
     try:
         text = json.loads((folder / "progress.json").read_text())
         progress, saved_groups = Progress(**text["progress"]), text["groups"]
         weights = load_file(folder / "weights.safetensors")
         tensors = load_file(folder / "optimizer.safetensors")
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
-        raise WeightsError(f"{folder}: checkpoint is missing or torn ({error}); remove it to start anew") from error
+        raise WeightsError(f"{asked}: checkpoint is missing or torn ({error}); remove it to start anew") from error
     own = {name: tensor for name, tensor in network.state_dict().items() if name.startswith("encoder.")}
     load_exactly(network, {**own, **weights}, what=f"checkpoint {folder}")
     if optimizer is not None:

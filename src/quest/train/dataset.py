@@ -29,14 +29,12 @@ class Dataset:
         training: of training objects.
         validation: of validation objects.
         training_takes: how many takes teach.
-        validation_takes: how many takes choose.
         training_sources: of the takes that teach.
     """
 
     training: WindowSampler
     validation: WindowSampler
     training_takes: int
-    validation_takes: int
     training_sources: frozenset[str]
 
 
@@ -132,7 +130,6 @@ def open_dataset(
         samplers["train"],
         samplers["validation"],
         len(takes["train"]),
-        len(takes["validation"]),
         frozenset(w.source for w in wanted if w.part == "train"),
     )
 

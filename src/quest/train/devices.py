@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 from jaxtyping import UInt8
 from torch import Tensor
@@ -50,7 +51,7 @@ def launch(config: TrainingConfig) -> Fabric:
             strategy=strategy,
             precision=config.precision,
         )
-    except (RuntimeError, MisconfigurationException) as error:
+    except (RuntimeError, ValueError, MisconfigurationException) as error:
         raise ConfigError(
             f"training: cannot use {devices} devices of accelerator {config.accelerator!r} ({error}); choose "
             "others with --training.accelerator and --training.devices"
@@ -97,6 +98,12 @@ def generator_states(fabric: Fabric) -> dict[str, UInt8[Tensor, "R N"]]:
         assert isinstance(gathered, Tensor)
         rows[kind] = gathered.reshape(fabric.world_size, -1).cpu()
     return rows
+
+
+def part_ways(fabric: Fabric, seed: int) -> None:
+    """Give every process but the first random numbers of its own: each drops other parts of what it learns from."""
+    if fabric.global_rank:
+        torch.manual_seed(int(np.random.SeedSequence((seed, fabric.global_rank)).generate_state(1)[0]))
 
 
 def restore_generators(fabric: Fabric, states: dict[str, UInt8[Tensor, "R N"]]) -> None:

@@ -28,11 +28,13 @@ from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder
 from quest.model.observation import cell_depth
+from quest.model.precision import fast_bfloat16
 from quest.model.weights import weights_digest
 from quest.types import LABELS, Camera, Take
 
 _VERSION = 1
-_DEPTH_UNIT_M = 1e-4
+DEPTH_UNIT_M = 1e-4
+"""What depth is stored in, metres."""
 _LEFT_AFTER_S = 3600.0
 """Age at which what is half made or half removed belongs to no process any more."""
 
@@ -218,7 +220,7 @@ class FeatureCache:
         arrays = {
             "features": encode_images(self.encoder, rgb, device=device),
             "rgb": rgb,
-            "depth": np.clip(np.rint(depth_m / _DEPTH_UNIT_M), 0, 65535).astype(np.uint16),
+            "depth": np.clip(np.rint(depth_m / DEPTH_UNIT_M), 0, 65535).astype(np.uint16),
             "cell_depth_m": cell_depth(torch.from_numpy(depth_m), self.config.cell_px).numpy(),
             "cam_from_world": clip.cam_from_world.astype(np.float32),
             "uv_px": box.to_canvas(truth.uv_px[:, tracked]).astype(np.float32),
@@ -321,7 +323,7 @@ def encode_images(
 ) -> Float16[np.ndarray, "T N E"]:
     """Features of many images, made ``enlarge`` times larger first, in bfloat16 arithmetic where that is fast."""
     out = []
-    with torch.inference_mode(), torch.autocast(device.type, dtype=torch.bfloat16):
+    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=fast_bfloat16(device)):
         for start in range(0, len(rgb), batch):
             images = torch.from_numpy(np.array(rgb[start : start + batch])).to(device)
             out.append(encoder(images, enlarge=enlarge).to(torch.float16).cpu().numpy())

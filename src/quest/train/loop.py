@@ -22,7 +22,14 @@ from quest.model.weights import weights_digest
 from quest.train.averaging import RunningMean
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
-from quest.train.devices import deterministic_algorithms, divide, generator_states, launch, restore_generators
+from quest.train.devices import (
+    deterministic_algorithms,
+    divide,
+    generator_states,
+    launch,
+    part_ways,
+    restore_generators,
+)
 from quest.train.optimizer import make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
@@ -110,6 +117,9 @@ def fit(
                     _log(writer, objective, values, scores, step)
                 if fabric.is_global_zero:
                     report(StepReport(step, float(values[0]), scores, progress.best))
+            if progress.best_step == 0:  # as many steps were done before, but the run was stopped before it was judged
+                progress = _judge(progress, learner.validate(validation))
+                learner.save(progress, out)
     fabric.barrier()
     return out / "best"
 
@@ -160,6 +170,8 @@ class _Learner:
         steps = torch.as_tensor(self.fabric.all_gather(torch.tensor(start.step, device=self.fabric.device)))
         if int(steps.min()) != int(steps.max()):
             raise ConfigError(f"training: not every process finds the checkpoint in {out}; all machines must share it")
+        if not generators:
+            part_ways(self.fabric, self.config.seed)
         restore_generators(self.fabric, generators)
         return start
 
@@ -171,6 +183,7 @@ class _Learner:
         """
         for group in self.optimizer.param_groups:
             group["lr"] = self.config.learning_rate * _schedule(step, self.config)
+            group["weight_decay"] = self.config.weight_decay
         self.optimizer.zero_grad(set_to_none=True)
         fabric, parts = self.fabric, [part.to(self.fabric.device) for part in batch.parts]
         tally = self._count(parts) if len(parts) > 1 else None

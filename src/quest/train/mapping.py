@@ -15,15 +15,13 @@ from torch import Tensor, nn
 
 from quest.errors import ConfigError
 from quest.model.config import PRESETS
-from quest.model.discovery import find_peaks
+from quest.model.discovery import RADIUS_CELLS, find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.train import losses
 from quest.train.validation import match_at_anchor
 from quest.train.windows import WindowSampler, WindowTruth
 from quest.types import INTENTS, LABELS
-
-_RADIUS_CELLS = 1.5
 
 
 @dataclass(frozen=True)
@@ -75,7 +73,7 @@ class StageMap:
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
         """Focal loss of the map, and its offsets."""
-        found = self.network.afford(frames, self.network.observe(frames))
+        found = self.network.afford(frames)
         visible = truth.visible & truth.exists[:, None]
         loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible, truth.owner)
         return loss, loss.detach()[None]
@@ -108,7 +106,7 @@ class StageMap:
     def _judge(self, frames: FrameBatch, truth: WindowTruth, b: int) -> list[tuple[float, bool, bool]]:
         """Score of every peak, whether it is right, and whether its intent is."""
         network, one = self.network, frames.of(slice(b, b + 1))
-        peaks = find_peaks(network, one, network.observe(one), radius_cells=_RADIUS_CELLS, mirror=False)
+        peaks = find_peaks(network, one, None, radius_cells=RADIUS_CELLS, mirror=False)
         found, seen = match_at_anchor(peaks, frames, truth, b)
         out = []
         for score, intent, e in zip(peaks.logit.tolist(), peaks.intent.tolist(), found.tolist(), strict=True):

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 from quest.errors import ConfigError
+
+Accelerator = Literal["auto", "cpu", "cuda", "mps"]
+
+_SEEDS = 2**64
+"""As many seeds torch's generators take."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,7 @@ class TrainingConfig:
     patience: int = 15
     seed: int = 0
     precision: str = "bf16-mixed"
-    accelerator: Literal["auto", "cpu", "cuda", "mps"] = "auto"
+    accelerator: Accelerator = "auto"
     devices: int | Literal["auto"] = 1
     accumulate: int = 1
     compile: bool = False
@@ -68,6 +73,11 @@ class TrainingConfig:
         for name in ("weight_decay", "warmup_steps", "seed"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"training: expected {name} to be at least 0, got {getattr(self, name)}")
+        if self.seed >= _SEEDS:
+            raise ConfigError(f"training: expected seed below 2**64, got {self.seed}")
+        if self.accelerator not in get_args(Accelerator):
+            known = ", ".join(get_args(Accelerator))
+            raise ConfigError(f"training: expected accelerator {known}, got {self.accelerator!r}")
         if self.optimizer not in ("muon", "adamw"):
             raise ConfigError(f"training: expected optimizer muon or adamw, got {self.optimizer!r}")
         if not 0 <= self.average_decay < 1:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from quest.model.discovery import Peaks, find_peaks, match_peaks
+from quest.model.discovery import RADIUS_CELLS, Peaks, find_peaks, match_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.train.objective import Rollout, has_moved, is_right, roll_out
@@ -111,7 +111,7 @@ def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation,
     counts = np.zeros(3)
     for b in range(len(truth.unit)):
         one = slice(b, b + 1)
-        peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=1.5, mirror=False)
+        peaks = find_peaks(network, frames.of(one), observed.of(one), radius_cells=RADIUS_CELLS, mirror=False)
         keep = peaks.logit > _PEAK_LOGIT
         found, present = match_at_anchor(peaks, frames, truth, b)
         counts += (int((found[keep] >= 0).sum()), int(keep.sum()), len(present))

@@ -14,11 +14,9 @@ from quest.geometry import transform
 from quest.model.config import NetworkConfig
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL
 from quest.model.observation import FrameBatch, reference_of
-from quest.train.feature_cache import CachedView
+from quest.train.feature_cache import DEPTH_UNIT_M, CachedView
 from quest.train.plan import Disturbance, Pick, WindowPlan, draw_disturbance
 from quest.train.settings import WindowConfig
-
-_DEPTH_UNIT_M = 1e-4
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class WindowSampler:
         def gather(name: str) -> np.ndarray:
             return np.stack([getattr(view, name)[index] for view, index in picks])
 
-        depth_m = torch.from_numpy(gather("depth").astype(np.float32) * _DEPTH_UNIT_M)
+        depth_m = torch.from_numpy(gather("depth").astype(np.float32) * DEPTH_UNIT_M)
         cell_depth_m = torch.from_numpy(gather("cell_depth_m"))
         rgb = gather("rgb")
         if disturbance is not None:
