@@ -26,6 +26,7 @@ def make_state(**changes: object) -> StreamState:
         has_depth=True,
         query=(4, 7),
         joint=(None, None),
+        q=np.full(2, np.nan, np.float32),
         lost_p=np.zeros(2, np.float32),
         alarm=(None, None),
         signals=Signals(np.zeros((2, len(SIGNALS)), np.float32)),

@@ -107,6 +107,10 @@ def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_pu
     assert names_after(clip, [HANDLE], [OPEN]) == ["handle 0", "rim 1"]
     assert names_after(clip, [OPEN], [Query.semantic("rim")]) == ["rim 0"]
     assert names_after(clip, [LIFT], [Query.slot()]) == ["rim 0"]
+    # What is taken hold of to lift stays so whoever found that out: nobody asked for it here.
+    assert names_after(clip, [HANDLE, Query.semantic("rim"), Query.semantic("rim")], [OPEN], [LIFT]) == [
+        "handle 0", "rim 1", "rim 2",
+    ]  # fmt: skip
 
 
 def test_weights_that_know_no_intents_say_so(clip: Clip):

@@ -76,7 +76,9 @@ def test_a_mark_turns_with_the_link(monkeypatch: pytest.MonkeyPatch):
 def test_marks_are_saved_and_end_with_their_reference_frame():
     query = make_query()
     marked([query], OWN, make_prediction(ASKED_PX), plain_frames())
-    again = Following.restored(0, "handle", None, query.state(), config=TrackerConfig(), device=torch.device("cpu"))
+    again = Following.restored(
+        [0, "handle", None, None], query.state(), config=TrackerConfig(), device=torch.device("cpu")
+    )
     assert query.mark is not None
     assert again.mark is not None
     np.testing.assert_array_equal(again.mark, query.mark)

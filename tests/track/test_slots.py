@@ -38,8 +38,8 @@ def make(config: TrackerConfig = EAGER, *, confidence: list[float] | None = None
     if confidence is not None:
         logit, forward = torch.tensor(confidence), head.forward
 
-        def confident(x: torch.Tensor, observed: Observation):
-            p = forward(x, observed)
+        def confident(x: torch.Tensor):
+            p = forward(x)
             return replace(
                 p, visible_logit=logit.expand_as(p.visible_logit), right_logit=logit.expand_as(p.right_logit)
             )
@@ -182,7 +182,7 @@ def test_a_window_is_decoded_as_it_was_trained(clip: Clip):
         assert len(stream._ring) == min(t + 1, PAPER.window)
         with torch.inference_mode():
             x = network.embed(network.slots(1), Observation.stack(list(stream._ring)))
-            uv = network.head(x, stream._ring[-1]).uv[0, -1]  # type: ignore[arg-type, call-arg]
+            uv = network.head(x).uv[0, -1]  # type: ignore[call-arg]
         slots = [f.slot for f in stream._following]
         np.testing.assert_allclose(state.uv_px, 64 * uv[slots].numpy(), atol=1e-3)
 

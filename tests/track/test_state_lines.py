@@ -44,7 +44,7 @@ def test_unknown_is_null():
 
 
 def test_joint():
-    left, right = queries(joint=(HINGE, HINGE))
+    left, right = queries(joint=(HINGE, HINGE), q=np.array([np.pi / 2, np.nan], np.float32))
     joint = left["joint"]
     assert joint["kind"] == "revolute"
     assert joint["axis"] == [0, 0, 1]

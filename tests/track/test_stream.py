@@ -13,6 +13,7 @@ from jaxtyping import TypeCheckError
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
+from quest.grounding import JointKind
 from quest.monitor import SIGNALS, Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
 from quest.track.events import Events
@@ -45,6 +46,39 @@ def watched(alarming: bool = False) -> Tracker:
     tracker = make_tracker()
     tracker.calibration = make_calibration(alarming=alarming)
     return tracker
+
+
+def test_a_camera_of_double_precision(clip: Clip):
+    numbers = {name: np.float64(getattr(clip.camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    stream = make_tracker().stream(replace(clip.camera, **numbers), POINTS)
+    assert_equal(feed(stream, clip, range(2))[-1], feed(make_tracker().stream(clip.camera, POINTS), clip, range(2))[-1])
+
+
+def test_where_on_its_joint_a_query_is(clip: Clip):
+    """By the network's own point: the joint was never told of the user's pixel beside it."""
+    stream = make_tracker().stream(clip.camera, POINTS)
+    state = feed(stream, clip, range(8))[-1]
+    for k, query in enumerate(stream._following):
+        joint = state.joint[k]
+        assert joint is not None
+        assert query.place is not None
+        moves = joint.kind is not JointKind.STATIC
+        own = stream._to_world(query.place[None]).astype(np.float64)
+        assert state.q[k] == pytest.approx(joint.locate(own)[0] if moves else np.nan, nan_ok=True)
+
+
+def test_who_still_looks(clip: Clip):
+    tracker = make_tracker()
+    blind = tracker.with_config(replace(tracker.config, prompt_threshold=1.0), name="blind")
+    stream = blind.stream(clip.camera, [Query.semantic("knob")])
+    asked = [stream.looking]
+    for t in range(8):
+        feed(stream, clip, range(t, t + 1))
+        asked.append(stream.looking)
+    assert asked == [True] * 8 + [False]
+    assert [q.label for q in stream.unbound] == ["knob"]
+    stream.add(Query.point(20, 9, 9))
+    assert stream.looking
 
 
 @pytest.mark.parametrize(("frame", "flag"), [(1, "late"), (3, "duplicate")])

@@ -41,17 +41,17 @@ def text_of(view: LiveView, width: int) -> str:
 
 
 @pytest.mark.parametrize(
-    ("joint", "point", "words"),
+    ("joint", "q", "words"),
     [
-        (None, [0, 0, 0], "?"),
-        (HINGE, [0, 0.5, 0], "revolute 90 deg (0 to 57)"),
-        (HINGE, [np.nan] * 3, "revolute ? deg (0 to 57)"),
-        (RAIL, [0.118, 0, 0], "prismatic 0.12 m (0.00 to 0.31)"),
-        (replace(RAIL, kind=JointKind.STATIC, covariance=np.eye(3)), [0, 0, 0], "static"),
+        (None, np.nan, "?"),
+        (HINGE, np.pi / 2, "revolute 90 deg (0 to 57)"),
+        (HINGE, np.nan, "revolute ? deg (0 to 57)"),
+        (RAIL, 0.118, "prismatic 0.12 m (0.00 to 0.31)"),
+        (replace(RAIL, kind=JointKind.STATIC, covariance=np.eye(3)), np.nan, "static"),
     ],
 )
-def test_joint_words(joint: Joint | None, point: list[float], words: str):
-    assert joint_words(joint, np.array(point, np.float32)) == words
+def test_joint_words(joint: Joint | None, q: float, words: str):
+    assert joint_words(joint, q) == words
 
 
 def test_query_words():
@@ -67,6 +67,7 @@ def test_picture():
         state = replace(
             DOOR,
             joint=(HINGE, None),
+            q=np.array([np.pi / 2, np.nan], np.float32),
             alarm=(ALARM, None),
             flags=("no depth",),
             lost_p=np.array([0.8, np.nan], np.float32),

@@ -74,7 +74,7 @@ class ClipFrames:
 
     def to_world(self, displacement: Float[Tensor, "K 3"]) -> Float[np.ndarray, "K 3"]:
         """Displacements of the reference frame in the world, metres."""
-        metric = displacement.double().cpu() * self.scale_m
+        metric = displacement.cpu().double() * self.scale_m
         # The transposed rotation, from the right.
         return (metric @ self._reference.cam_from_world[:3, :3]).numpy()
 

@@ -97,6 +97,8 @@ def _python() -> Iterator[Finding]:
 def _torch() -> Iterator[Finding]:
     try:
         import torch
+
+        from quest.model.precision import fast_bfloat16
     except (ImportError, OSError) as error:
         yield Finding("torch", "broken", str(error), "pip install --constraint constraints.txt quest-tracker")
         return
@@ -106,7 +108,7 @@ def _torch() -> Iterator[Finding]:
     yield Finding("cpu", "ok", f"{platform.processor() or platform.machine()}, {capability}, bfloat16 {fast}")
     for index in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(index)
-        bf16 = "yes" if torch.cuda.is_bf16_supported() else "no"
+        bf16 = "native" if fast_bfloat16(torch.device("cuda", index)) else "emulated"
         memory_gib = properties.total_memory / 2**30
         yield Finding(f"cuda:{index}", "ok", f"{properties.name}, {memory_gib:.0f} GiB, bfloat16 {bf16}")
     if torch.backends.mps.is_available():

@@ -83,7 +83,7 @@ class Monitor(Source):
                     if lines is not None:
                         lines.write(state, frame=t)
                     view.show(t, state, waiting=stream.unbound, behind_s=behind_s)
-                    if not (state.names or stream.unbound):
+                    if not (state.names or stream.looking):
                         break
         except KeyboardInterrupt:
             console.print(view.summary())

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
 from quest.grounding.joint import Joint, JointKind
-from quest.grounding.vectors import cross, perpendicular
+from quest.grounding.vectors import cross, perpendicular, rotated
 
 _OUTLIER_SIGMAS = 4.0
 _RELATIVE_SIGMA = 0.01
@@ -248,16 +248,12 @@ def _fit_turning(
         origin = start.origin + basis @ x[2:] + best.height[k] * axis
         arm = reference[k] - origin
         arm = arm - (arm @ axis) * axis
-        rest = origin + best.radius[k] * _rotated(arm / np.linalg.norm(arm), axis, float(best.phase[k] + first))
+        rest = origin + best.radius[k] * rotated(arm / np.linalg.norm(arm), axis, float(best.phase[k] + first))
         joints.append(
             replace(joint, kind=JointKind.REVOLUTE, axis=axis, origin=origin, rest=rest, lower=low, upper=high,
                     covariance=covariance, n=int(count[k]))
         )  # fmt: skip
     return tuple(joints), np.abs(best.rows.reshape(3, *valid.shape)[2])
-
-
-def _rotated(arm: np.ndarray, axis: np.ndarray, angle: float) -> np.ndarray:
-    return np.cos(angle) * arm + np.sin(angle) * cross(axis, arm)
 
 
 def _common(along: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

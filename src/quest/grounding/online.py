@@ -77,12 +77,6 @@ class JointEstimator:
         if len(self._points) > self._capacity:
             self._make_room()
 
-    def copy(self) -> JointEstimator:
-        """Another estimator that goes on from here by itself."""
-        other = JointEstimator(self._sigma, capacity=self._capacity)
-        other.restore(self.state())
-        return other
-
     def state(self) -> dict[str, np.ndarray]:
         """All that was learned and set, as numeric arrays: what is restored from it goes on to the same bytes."""
         state = {"points": self._points.copy(), "counts": self._counts.copy()}

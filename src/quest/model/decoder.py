@@ -224,7 +224,7 @@ class RegressionHead(nn.Module):
         self.mlp = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
         self.label = nn.Linear(d, len(LABELS))
 
-    def forward(self, x: Float[Tensor, "B T K D"], observed: Observation) -> Prediction:
+    def forward(self, x: Float[Tensor, "B T K D"]) -> Prediction:
         """Raw coordinates; the point is lifted by the network, which knows the depth."""
         out = self.mlp(x).float()
         empty = out.new_zeros(*out.shape[:-1], 0)

@@ -45,7 +45,9 @@ class Framer:
     def __init__(self, network: QuestNetwork, camera: Camera, *, device: torch.device) -> None:
         self._network = network
         self._device = device
-        self._intrinsics = torch.tensor([[camera.fx, camera.fy, camera.cx, camera.cy]], device=device)
+        self._intrinsics = torch.tensor(
+            [[camera.fx, camera.fy, camera.cx, camera.cy]], dtype=torch.float32, device=device
+        )
 
     def depth(self, depth_m: Float32[np.ndarray, "S S"] | None) -> Float[Tensor, "1 S S"]:
         """Letterboxed depth as a tensor; all 0, which is missing, for None."""

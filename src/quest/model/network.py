@@ -149,7 +149,7 @@ class QuestNetwork(nn.Module):
         """
         if isinstance(self.head, HeatmapHead):
             return self.head(x, anchor, observed)
-        prediction = self.head(x, observed)
+        prediction = self.head(x)
         uv_px = prediction.uv * self.config.encoder.image_size
         return replace(prediction, point=frames.to_reference(uv_px, frames.depth_at(uv_px)))
 

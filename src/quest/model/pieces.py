@@ -145,6 +145,6 @@ class PieceHead(nn.Module):
 
 def _image(frames: FrameBatch) -> Float[np.ndarray, "H W 3"]:
     """What every pixel of the frame shows: camera axes, units of the reference frame, 0 where depth is missing."""
-    depth = frames.depth_m[0, 0].double().cpu() / float(frames.scale[0])
+    depth = frames.depth_m[0, 0].cpu().double() / float(frames.scale[0])
     camera = Camera(*frames.intrinsics[0].tolist(), width=depth.shape[1], height=depth.shape[0])
     return lift_depth(depth, camera).nan_to_num().numpy()

@@ -30,7 +30,7 @@ MOST_AGE: Final = 60.0
 """Frames up to which a query's age is told: calibration streams may be as short, and nothing is learned beyond."""
 
 COUNT, LEVEL, FAST, MID, SLOW, HIGH, LOW, OFF, AGE = range(9)
-"""Rows: frames known (at most until the running means have settled), normal level, three running means, highest and
+"""Rows: frames known, normal level, three running means, highest and
 lowest value with a slow return, frames in a row that it is off, frames since the query was bound (at most
 :data:`MOST_AGE`)."""
 ROWS: Final = 9

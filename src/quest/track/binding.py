@@ -160,6 +160,10 @@ class Binding:
         """A frame is ignored: labels and slots look one frame longer."""
         self.waiting = [w if w.query.kind == "point" else replace(w, since=w.since + 1) for w in self.waiting]
 
+    def looking(self, frame: int) -> bool:
+        """Whether anything may still bind in a frame or after it."""
+        return self.discover or any(w.query.kind == "point" or frame < w.since + PATIENCE for w in self.waiting)
+
     def keep(self, rows: Sequence[int]) -> None:
         """Drop the anchors of all rows but these."""
         if self.anchor is not None:
@@ -170,10 +174,13 @@ class Binding:
         self.numbered += 1
         return self.numbered - 1
 
-    def _begin(self, waiting: Waiting, name: str, label: str | None, slot: int | None = None) -> Following:
+    def _begin(
+        self, waiting: Waiting, name: str, label: str | None, *, slot: int | None = None, intent: str | None = None
+    ) -> Following:
         self.waiting = [w for w in self.waiting if w is not waiting]
-        fixed = waiting.query.intent == "lift"
-        return Following(waiting.number, name, label, slot, Ground(self._config, fixed=fixed))
+        # Of what nobody asked for to lift by, the network only thinks so.
+        ground = Ground(self._config, fixed=waiting.query.intent == "lift")
+        return Following(waiting.number, name, label, slot, ground, waiting.query.intent or intent)
 
     def _canvas(self, due: Sequence[Waiting]) -> Float[Tensor, "K 2"]:
         uv_px = np.array([w.query.uv_px for w in due], np.float32)
@@ -202,7 +209,7 @@ class Binding:
                 others = [f"{label[j]} {f.query}" for f, j in zip(found, chosen, strict=False) if clash[i][j]]
                 notes = ["lift"] * (intent[i] == "lift") + [f"or {other}" for other in others[:1]]
                 name = " ".join([f"{label[i]} {number}", *(f"({note})" for note in notes)])
-                found.append(self._begin(Waiting(number, Query.slot(), frame), name, label[i]))
+                found.append(self._begin(Waiting(number, Query.slot(), frame), name, label[i], intent=intent[i]))
             self.discover = False
         for waiting in looking:
             query = waiting.query
@@ -216,7 +223,7 @@ class Binding:
             if fits and existence[fits[0]] > config.prompt_threshold:
                 chosen.append(fits[0])
                 name = query.name or f"{label[fits[0]]} {waiting.number}"
-                found.append(self._begin(waiting, name, label[fits[0]]))
+                found.append(self._begin(waiting, name, label[fits[0]], intent=intent[fits[0]]))
         if chosen:
             self._join(observed, frames, found, peaks.uv[chosen], peaks.label[chosen], peaks.intent[chosen])
         return found
@@ -257,21 +264,21 @@ class Binding:
             for i in [i for i in free if existence[i] > config.slot_threshold]:
                 number = self._next_number()
                 waiting = Waiting(number, Query.slot(), frame)
-                found.append(self._begin(waiting, f"{label[i]} {number}", label[i], i))
+                found.append(self._begin(waiting, f"{label[i]} {number}", label[i], slot=i))
                 free.remove(i)
             self.discover = False
         for waiting in [w for w in self.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]:
             fits = [i for i in free if waiting.query.label in (None, label[i])]
             if fits and existence[fits[0]] > config.prompt_threshold:
                 name = waiting.query.name or f"{label[fits[0]]} {waiting.number}"
-                found.append(self._begin(waiting, name, label[fits[0]], fits[0]))
+                found.append(self._begin(waiting, name, label[fits[0]], slot=fits[0]))
                 free.remove(fits[0])
         due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
             chosen = slots_at(slots, self._canvas(due), [w.query.label for w in due], [*following, *found])
             for waiting, slot in zip(due, chosen, strict=True):
                 name = waiting.query.name or f"point {waiting.number}"
-                found.append(self._begin(waiting, name, waiting.query.label, slot))
+                found.append(self._begin(waiting, name, waiting.query.label, slot=slot))
         return found
 
 
@@ -284,7 +291,7 @@ def _same(query: Query, following: Following) -> bool:
     """Whether what another query follows, at the place of a prompt's peak, may be what the prompt means."""
     if query.label is not None and following.label not in (None, query.label):
         return False
-    return query.intent is None or (query.intent == "lift") == following.ground.fixed
+    return query.intent in (None, following.intent or "open")
 
 
 def _intents(peaks: Peaks) -> list[str | None]:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
@@ -54,6 +55,7 @@ class Following:
         query: its number.
         name: what to call it.
         label: its label, if known.
+        intent: what it is taken hold of for, if known.
         slot: index of its learned query, for networks that have them.
         ground: its joint.
         belief: over the cells of the newest frame (K = 1).
@@ -78,6 +80,7 @@ class Following:
     label: str | None
     slot: int | None
     ground: Ground
+    intent: str | None = None
     belief: Belief | None = None
     place: Float[np.ndarray, "3"] | None = None
     home: Float[np.ndarray, "3"] | None = None
@@ -163,15 +166,14 @@ class Following:
     @classmethod
     def restored(
         cls,
-        query: int,
-        name: str,
-        label: str | None,
+        words: Sequence[Any],
         state: Mapping[str, np.ndarray],
         *,
         config: TrackerConfig,
         device: torch.device,
     ) -> Following:
-        """The query of which :meth:`state` was taken."""
+        """The query of which :meth:`state` was taken, and that had such a number, name, label and intent."""
+        query, name, label, intent = words
         slot, held, buried, refused, since_safe, doubted, good = state["counts"].tolist()
         belief = None
         if "belief" in state:
@@ -197,6 +199,7 @@ class Following:
             query=query,
             name=name,
             label=label,
+            intent=intent,
             slot=None if slot < 0 else slot,
             ground=Ground.restored(config, part(state, "ground.")),
             belief=belief,

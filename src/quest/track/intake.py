@@ -19,6 +19,8 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.types import Camera
 
+NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
+
 _FRAMES_PER_S = 30.0
 _MOST_FRAMES = 10.0
 _CLOCK_RESTART_S = 5.0
@@ -133,7 +135,7 @@ class Intake:
         depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
         pose = torch.from_numpy(self._pose_of(cam_from_world))
         if not (depth > 0).any():
-            self.flags += ("no depth: pixels only, world points are NaN",)
+            self.flags += (NO_DEPTH_FLAG,)
         renewed = self.reference is None or (not self.reference.has_depth and self._framer.shows_depth(depth))
         if renewed:
             self.reference = self._framer.reference(depth, pose)

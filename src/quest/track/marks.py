@@ -53,7 +53,7 @@ def _mark(
     if float((uv_px - asked_px).norm()) > _SAME_THING_PX:
         return None
     at = asked_px[None, None, None]
-    mark = frames.to_reference(at, frames.edge_depth_at(at))[0, 0, 0].double().cpu().numpy() - own
+    mark = frames.to_reference(at, frames.edge_depth_at(at))[0, 0, 0].cpu().double().numpy() - own
     return mark if np.isfinite(mark).all() else None
 
 

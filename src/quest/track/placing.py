@@ -83,8 +83,8 @@ class Placer:
         self._now = now
         log_p = prediction.logits[0, 0].log_softmax(dim=-1)
         self._evidence = [FrameEvidence(frames, log_p[k], network) for k in range(len(following))]
-        self._seen = prediction.visible_logit[0, 0].sigmoid().double().cpu().numpy()
-        self._right = prediction.right_logit[0, 0].sigmoid().double().cpu().numpy()
+        self._seen = as_array(prediction.visible_logit[0, 0].sigmoid())
+        self._right = as_array(prediction.right_logit[0, 0].sigmoid())
 
     def place(self, candidate: Float[np.ndarray, "K 3"], joints: Sequence[BeliefRow]) -> Placed:
         """Answers, grounded in joints unless the settings say otherwise.

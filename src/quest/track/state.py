@@ -29,6 +29,9 @@ class StreamState:
         query: the number of the query that each row answers; discovered slots count up.
         joint: the joint that explains each track so far, in the world, metres; None before the first seen point and
             without depth.
+        q: where on its joint each query is, radians or metres; NaN without a joint, on one that does not move, and
+            where the point is unknown. Of a query that was asked for by a pixel, it is that of the network's own point,
+            which may lie beside the pixel.
         lost_p: calibrated probability that the identity is lost; NaN where nothing is watched.
         alarm: the open alarm of each query, or None.
         signals: what the monitor judged by.
@@ -47,6 +50,7 @@ class StreamState:
     has_depth: bool
     query: tuple[int, ...]
     joint: tuple[Joint | None, ...]
+    q: Float32[np.ndarray, " K"]
     lost_p: Float32[np.ndarray, " K"]
     alarm: tuple[Alarm | None, ...]
     signals: Signals

@@ -40,7 +40,7 @@ def state_line(state: StreamState, *, frame: int) -> str:
             "point_world": _plain(state.point_world[k]),
             "confidence": _number(state.confidence[k]),
             "lost_p": _number(state.lost_p[k]),
-            "joint": _joint(state.joint[k], state.point_world[k]),
+            "joint": _joint(state.joint[k], state.q[k]),
             "alarm": None if (alarm := state.alarm[k]) is None else asdict(alarm),
         }
         for k, number in enumerate(state.query)
@@ -98,16 +98,15 @@ class StateLines:
             ) from error
 
 
-def _joint(joint: Joint | None, point: np.ndarray) -> dict[str, Any] | None:
+def _joint(joint: Joint | None, q: np.floating) -> dict[str, Any] | None:
     if joint is None:
         return None
     moves = joint.kind is not JointKind.STATIC
-    known = moves and np.isfinite(point).all()
     return {
         "kind": joint.kind.value,
         "axis": _plain(joint.axis) if moves else None,
         "origin_m": _plain(joint.origin),
-        "q": _number(joint.locate(point[None].astype(np.float64))[0]) if known else None,
+        "q": _number(q),
         "q_seen": [_number(joint.lower), _number(joint.upper)] if moves else None,
     }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from quest.errors import InputError
 from quest.geometry import invert, transform
-from quest.grounding import Joint, LinkGroups
+from quest.grounding import Joint, JointKind, LinkGroups
 from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
@@ -103,6 +103,11 @@ class Stream:
     def unbound(self) -> tuple[Query, ...]:
         """Queries that have not found their entity, and point queries whose frame has not come."""
         return tuple(w.query for w in self._binding.waiting)
+
+    @property
+    def looking(self) -> bool:
+        """Whether a query may still find its entity: labels and slots look for it in the first frames alone."""
+        return self._binding.looking(self._t)
 
     def add(self, query: Query) -> int:
         """Follow one more entity from the next frame on; returns the query's number.
@@ -229,7 +234,7 @@ class Stream:
             "discover": self._binding.discover,
             "numbered": self._binding.numbered,
             "waiting": [asdict(w) for w in self._binding.waiting],
-            "following": [[f.query, f.name, f.label] for f in self._following],
+            "following": [[f.query, f.name, f.label, f.intent] for f in self._following],
         }
         return arrays, words
 
@@ -251,8 +256,8 @@ class Stream:
         binding.discover, binding.numbered = words["discover"], words["numbered"]
         binding.waiting = [Waiting.from_json(waiting) for waiting in words["waiting"]]
         self._following = [
-            Following.restored(number, name, label, part(arrays, f"query{i}."), config=self._config, device=device)
-            for i, (number, name, label) in enumerate(words["following"])
+            Following.restored(words, part(arrays, f"query{i}."), config=self._config, device=device)
+            for i, words in enumerate(words["following"])
         ]
         if self._monitor is not None:
             self._monitor.restore(part(arrays, "monitor."))
@@ -298,15 +303,17 @@ class Stream:
     ) -> None:
         """Judge the answers and keep them; begin or end recoveries; note what alarms were raised."""
         size, following = self._network.config.encoder.image_size, self._following
-        inside = ((uv >= 0) & (uv <= 1)).all(-1).cpu().numpy()
         uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
+        inside = np.all((uv_px >= 0) & (uv_px <= (self.camera.width, self.camera.height)), axis=-1)
         world = self._to_world(placed.point)
         verdict = None
+        # Also of those that are found in this very frame: the answer is where they were held.
+        doubted = [query.doubted for query in following]
         if self._monitor is not None:
             verdict = self._monitor.step([f.query for f in following], signals, frame=self._t, stamp_s=self._stamp_s)
             self._recover(verdict, placed)
         for k, query in enumerate(following):
-            visible = bool(placed.seen[k] > 0.5 and inside[k] and not query.doubted)
+            visible = bool(placed.seen[k] > 0.5 and inside[k] and not (doubted[k] or query.doubted))
             lost_p = float("nan") if verdict is None else float(verdict.lost_p[k])
             # The network's belief in a single frame only counts where nothing is calibrated.
             lost = lost_p > _LOST_ABOVE or self._alarm(query) is not None or (verdict is None and right[k] < LOST_BELOW)
@@ -377,12 +384,20 @@ class Stream:
             stamp_s=self._stamp_s,
             has_depth=self._has_depth,
             query=tuple(f.query for f, _ in rows),
-            joint=tuple(self._world_joint(f) for f, _ in rows),
+            joint=(joints := tuple(self._world_joint(f) for f, _ in rows)),
+            q=np.array([self._along(f, joint) for (f, _), joint in zip(rows, joints, strict=True)], np.float32),
             lost_p=stacked("lost_p"),
             alarm=tuple(self._alarm(f) for f, _ in rows),
             signals=Signals(stacked("signals", len(SIGNALS))),
             flags=flags,
         )
+
+    def _along(self, query: Following, joint: Joint | None) -> float:
+        """Where on its joint a query is, by the network's own point, from which the joint was learned."""
+        answered = query.answer is not None and np.isfinite(query.answer.point_world).all()
+        if joint is None or joint.kind is JointKind.STATIC or query.place is None or not answered:
+            return float("nan")
+        return float(joint.locate(self._to_world(query.place[None]).astype(np.float64))[0])
 
     def _world_joint(self, query: Following) -> Joint | None:
         reference, joint = self._intake.reference, self._links.joint(query.query) or query.ground.joint

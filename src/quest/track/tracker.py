@@ -19,7 +19,7 @@ from quest.model.network import QuestNetwork
 from quest.model.precision import fast_bfloat16
 from quest.model.weights import load_network
 from quest.monitor import Budget, Calibration, Monitor
-from quest.track.intake import Intake
+from quest.track.intake import NO_DEPTH_FLAG, Intake
 from quest.track.saving import SavedStream
 from quest.track.settings import REVISION, TrackerConfig
 from quest.track.state import StreamState
@@ -28,7 +28,6 @@ from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
-NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
 PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are NaN"
 NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
 
@@ -268,8 +267,8 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
     lost = [names[i] for i in range(k) if i not in last.query]
     flags += [f"query {name!r} found no entity: lost in every frame" for name in lost]
     flags += [NOTHING_FOUND_FLAG] if queries is None and not k else []
-    told = Counter(flag.partition(":")[0] for s in states for flag in s.flags)
-    flags += [f"{what}: {count} of {t} frames" for what, count in told.items() if what != "no depth"]
+    told = Counter(flag.partition(":")[0] for s in states for flag in s.flags if flag != NO_DEPTH_FLAG)
+    flags += [f"{what}: {count} of {t} frames" for what, count in told.items()]
     stamps = np.array([s.stamp_s for s in states])
     return Tracks(
         names=tuple(names),

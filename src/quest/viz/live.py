@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from types import TracebackType
 
 import numpy as np
-from jaxtyping import Float32
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -200,7 +199,7 @@ def state_table(state: StreamState, frame: int, *, wide: bool) -> Table:
             Text(state.state[k].value, style=STATE_STYLE[state.state[k]]),
             *pixel,
             Text(_vector(state.point_world[k], 2)),
-            Text(joint_words(state.joint[k], state.point_world[k])),
+            Text(joint_words(state.joint[k], float(state.q[k]))),
             Text(f"{lost_p:.2f}" if known else "?"),
             ProgressBar(1.0, lost_p, width=_BAR_WIDTH, complete_style=colour, finished_style=colour) if known else "",
             Text("" if alarm is None else _frames(frame - alarm.frame), style="bold red"),
@@ -208,12 +207,12 @@ def state_table(state: StreamState, frame: int, *, wide: bool) -> Table:
     return table
 
 
-def joint_words(joint: Joint | None, point_world: Float32[np.ndarray, "3"]) -> str:
-    """Kind of a joint, where on it a point is, and in brackets the range that was seen, in metres or degrees.
+def joint_words(joint: Joint | None, q: float) -> str:
+    """Kind of a joint, where on it a query is, and in brackets the range that was seen, in metres or degrees.
 
     Args:
         joint: in the world, metres; None where it is unknown.
-        point_world: the point, metres; NaN where it is unknown.
+        q: where on it, metres or radians; NaN where it is unknown.
     """
     if joint is None:
         return "?"
@@ -222,8 +221,7 @@ def joint_words(joint: Joint | None, point_world: Float32[np.ndarray, "3"]) -> s
     turning = joint.kind is JointKind.REVOLUTE
     factor, digits, unit = (180 / np.pi, 0, "deg") if turning else (1.0, 2, "m")
     lower, upper = factor * joint.lower, factor * joint.upper
-    known = np.isfinite(point_world).all()
-    now = f"{factor * joint.locate(point_world[None].astype(np.float64))[0]:z.{digits}f}" if known else "?"
+    now = f"{factor * q:z.{digits}f}" if np.isfinite(q) else "?"
     return f"{joint.kind.value} {now} {unit} ({lower:z.{digits}f} to {upper:z.{digits}f})"
 
 
