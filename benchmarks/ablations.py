@@ -82,6 +82,8 @@ class Ablations:
     """Tables to rebuild."""
     presets: tuple[PresetName, ...] = ("default", "paper")
     """Presets whose variants take part."""
+    variants: tuple[str, ...] = ()
+    """Names of variants (folders of their runs) to make rows of; all by default."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of every variant."""
     steps: int = 1500
@@ -111,6 +113,10 @@ class Ablations:
         """Every run, every answer, every table."""
         console = Console(highlight=False)
         lines = {table: lines_of(table, self.presets) for table in self.tables}
+        known = {line.variant.name for each in lines.values() for line in each}
+        if unknown := sorted(set(self.variants) - known):
+            raise ConfigError(f"--variants {unknown[0]}: expected some of {', '.join(sorted(known))}")
+        lines = {table: self._chosen(each) for table, each in lines.items()}
         test = TestTakes.open(self)
         encoder = self._first_network().encoder.state_dict()
         cached = self._test_features(test, console)
@@ -125,6 +131,12 @@ class Ablations:
             self._write(table, each, test)
             console.print(f"wrote {self.out / f'{table}.json'}")
         return 0
+
+    def _chosen(self, lines: tuple[Line, ...]) -> tuple[Line, ...]:
+        """The rows that were asked for, and those that they are compared with."""
+        asked = [line for line in lines if not self.variants or line.variant.name in self.variants]
+        compared = {line.reference for line in asked}
+        return tuple(line for line in lines if line in asked or line.label in compared)
 
     # Training
 

@@ -87,6 +87,12 @@ PROCEDURAL = (
 )
 
 
+_WHOLE = "--mix broad --level 1 --views 1 --seed 60 --every 1"
+FLOW_PARTNET = (TrainingTakes("partnet_whole", f"{_WHOLE} --takes-per-object 2"),)
+FLOW_PROCEDURAL = (TrainingTakes("broad_whole", _WHOLE, 40, 24_000),)
+"""Takes with every frame, from which the flow head learns too: steps of a stream are shorter than of thinned takes."""
+
+
 def _kinds(prefix: str) -> tuple[str, ...]:
     """Categories of procedural objects that come by name only."""
     return tuple(name for name in CATEGORIES if name.startswith(prefix))
@@ -200,6 +206,9 @@ class Release:
     def _recipe(self) -> tuple[TrainingTakes, ...]:
         return (*(PARTNET if self.partnet else ()), *PROCEDURAL)
 
+    def _flow_recipe(self) -> tuple[TrainingTakes, ...]:
+        return (*self._recipe(), *(FLOW_PARTNET if self.partnet else ()), *FLOW_PROCEDURAL)
+
     def _map_recipe(self) -> tuple[TrainingTakes, ...]:
         return (*(MAP_PARTNET if self.partnet else ()), *MAP_PROCEDURAL)
 
@@ -218,7 +227,7 @@ class Release:
 
     def _takes(self) -> None:
         """Takes that teach, thinned, and takes that choose, whole."""
-        for takes in (*self._recipe(), *self._map_recipe(), *PIECES):
+        for takes in (*self._flow_recipe(), *self._map_recipe(), *PIECES):
             which: list[object] = ["--split", "train", "--no-partnet" if takes.objects else "--partnet"]
             count = max(1, round(self.procedural_share * takes.objects))
             seeds = range(takes.first_seed, takes.first_seed + count)
@@ -262,7 +271,7 @@ class Release:
 
     def _flow(self) -> None:
         _quest("train", "--stage", 2, "--weights", self.work / "map" / "weights.safetensors",
-               *self._taught_by(self._recipe(), "validation"), "--out", self.work / "flow",
+               *self._taught_by(self._flow_recipe(), "validation"), "--out", self.work / "flow",
                "--training.steps", self.flow_steps)  # fmt: skip
 
     def _pieces(self) -> None:

@@ -11,7 +11,7 @@ import torch
 from quest.cli.main import main
 from quest.model.config import NetworkConfig
 from quest.model.weights import load_network, save_network
-from quest.train.flow import FlowScores, StageTwo, with_flow_head, without_flow_head
+from quest.train.flow import FlowScores, StageTwo, leaping, with_flow_head, without_flow_head
 from quest.train.loop import StepReport, fit
 from quest.train.settings import TrainingConfig
 from tests.tiny import DEFAULT, PAPER, make_network
@@ -88,3 +88,16 @@ def test_stage_two_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert train("one.safetensors", "flow") != 0, "a folder of stage 2 is not gone on with by stage 1"
     assert main(["train", "--data", "x", "--out", str(tmp_path / "none"), "--stage", "2"]) != 0
     assert "--weights" in capsys.readouterr().err
+
+
+def test_some_points_leap_while_learning():
+    torch.manual_seed(0)
+    point = torch.zeros(50, 4, 20, 3)
+    point[0, 0, 0] = torch.nan
+    shift = (leaping(point) - point).norm(dim=-1)
+    assert not torch.isfinite(shift[0, 0, 0])
+    first, last = shift[1:, 0], shift[1:, -1]
+    assert float((first > 0).float().mean()) == pytest.approx(1 - 0.9**2, abs=0.03)
+    assert float((last > 0).float().mean()) == pytest.approx(1 - 0.9**5, abs=0.03)  # what leapt for good stays there
+    assert float(first[first > 0].min()) >= 0.01 - 1e-6
+    assert float(first.max()) <= 2

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
@@ -22,6 +23,10 @@ from quest.train.losses import masked_mean
 from quest.train.objective import Rollout, roll_out
 from quest.train.validation import mean_of
 from quest.train.windows import WindowSampler, WindowTruth
+
+_LEAPS = 0.1
+"""Probability that a point is somewhere else in one frame, and again that it is from a frame on, while learning: on
+objects that never taught answers leap more often than on those that did, and a leap is no motion to go on with."""
 
 _MOVING = 0.005
 """A displacement above this is motion rather than rest, normalised units per step."""
@@ -79,7 +84,7 @@ class StageTwo:
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
         """L1 of the displacement; what rests counts like what moves, or it would be said to move a little."""
-        roll, flow = self._answer(frames, truth)
+        roll, flow = self._answer(frames, truth, leaps=True)
         error = (flow - truth.flow.nan_to_num()).abs().sum(-1) / truth.unit[:, None]
         loss = masked_mean(error, _judged(roll, truth))
         return loss, loss.detach()[None]
@@ -110,10 +115,25 @@ class StageTwo:
             moving=int(moving.sum()),
         )
 
-    def _answer(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Rollout, Float[Tensor, "B K 3"]]:
+    def _answer(
+        self, frames: FrameBatch, truth: WindowTruth, *, leaps: bool = False
+    ) -> tuple[Rollout, Float[Tensor, "B K 3"]]:
         with torch.no_grad():
             roll = roll_out(self.network, frames, truth)
-        return roll, self.network.displace(roll.prediction)
+            seen = roll.prediction
+            seen = replace(seen, point=leaping(seen.point)) if leaps else seen
+        return roll, self.network.displace(seen)
+
+
+def leaping(point: Float[Tensor, "B T K 3"]) -> Float[Tensor, "B T K 3"]:
+    """Points of which some are somewhere else, for one frame or from one on, by a hundredth to one unit."""
+    once, ever = (
+        (torch.rand_like(point[..., :1]) < _LEAPS)
+        * 10 ** (-2 * torch.rand_like(point[..., :1]))
+        * F.normalize(torch.randn_like(point), dim=-1)
+        for _ in range(2)
+    )
+    return point + once + ever.cumsum(dim=1)
 
 
 def with_flow_head(network: QuestNetwork) -> QuestNetwork:
