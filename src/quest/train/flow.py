@@ -24,7 +24,7 @@ from quest.train.objective import Rollout, roll_out
 from quest.train.validation import mean_of
 from quest.train.windows import WindowSampler, WindowTruth
 
-_LEAPS = 0.1
+_LEAPS = 0.05
 """Probability that a point is somewhere else in one frame, and again that it is from a frame on, while learning: on
 objects that never taught answers leap more often than on those that did, and a leap is no motion to go on with."""
 
