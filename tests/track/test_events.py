@@ -77,7 +77,7 @@ def test_lost_and_found_without_an_alarm():
 def test_queries_come_and_go():
     one = make_state(
         **{n: getattr(make_state(), n)[1:] for n in ("names", "labels", "uv_px", "point_world", "confidence")},
-        **{n: getattr(make_state(), n)[1:] for n in ("visible", "state", "query", "joint", "lost_p", "alarm")},
+        **{n: getattr(make_state(), n)[1:] for n in ("visible", "state", "query", "joint", "q", "lost_p", "alarm")},
         signals=Signals(np.zeros((1, len(SIGNALS)), np.float32)),
     )
     events = Events()

@@ -13,8 +13,7 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from quest.errors import InputError
-from quest.geometry import invert, transform
-from quest.grounding import Joint, JointKind, LinkGroups
+from quest.grounding import LinkGroups
 from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
@@ -32,6 +31,7 @@ from quest.track.settings import TrackerConfig
 from quest.track.sharing import SIGMA, share
 from quest.track.slots import Slots, decode_slots, place_slots
 from quest.track.state import StreamState
+from quest.track.world import along_joint, to_world, world_joint
 from quest.types import Camera, Query, State
 
 _LOST_ABOVE = 0.5
@@ -305,7 +305,9 @@ class Stream:
         size, following = self._network.config.encoder.image_size, self._following
         uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
         inside = np.all((uv_px >= 0) & (uv_px <= (self.camera.width, self.camera.height)), axis=-1)
-        world = self._to_world(placed.point)
+        assert self._intake.reference is not None
+        world = to_world(placed.point, self._intake.reference)
+        world = world if self._has_depth else np.full_like(world, np.nan)
         verdict = None
         # Also of those that are found in this very frame: the answer is where they were held.
         doubted = [query.doubted for query in following]
@@ -356,19 +358,12 @@ class Stream:
     def _alarm(self, query: Following) -> Alarm | None:
         return None if self._monitor is None else self._monitor.alarm(query.query)
 
-    def _to_world(self, point: Float[np.ndarray, "K 3"]) -> Float32[np.ndarray, "K 3"]:
-        reference = self._intake.reference
-        assert reference is not None
-        metric = torch.from_numpy(point) * reference.scale.cpu().double() + reference.center.cpu().double()
-        if not self._has_depth:
-            metric = torch.full_like(metric, torch.nan)
-        return transform(invert(reference.cam_from_world)[None], metric).numpy().astype(np.float32)
-
     def _state(self) -> StreamState:
         """The newest answers of all queries."""
         rows = [(f, f.answer) for f in self._following if f.answer is not None]
         answers = [answer for _, answer in rows]
-        flags = self._intake.flags
+        reference, flags = self._intake.reference, self._intake.flags
+        joints = tuple(world_joint(self._links.joint(f.query) or f.ground.joint, reference) for f, _ in rows)
 
         def stacked(name: str, *shape: int) -> np.ndarray:
             return np.array([getattr(a, name) for a in answers], np.float32).reshape(len(answers), *shape)
@@ -384,29 +379,15 @@ class Stream:
             stamp_s=self._stamp_s,
             has_depth=self._has_depth,
             query=tuple(f.query for f, _ in rows),
-            joint=(joints := tuple(self._world_joint(f) for f, _ in rows)),
-            q=np.array([self._along(f, joint) for (f, _), joint in zip(rows, joints, strict=True)], np.float32),
+            joint=joints,
+            q=np.array(
+                [along_joint(f, joint, reference) for (f, _), joint in zip(rows, joints, strict=True)], np.float32
+            ),
             lost_p=stacked("lost_p"),
             alarm=tuple(self._alarm(f) for f, _ in rows),
             signals=Signals(stacked("signals", len(SIGNALS))),
             flags=flags,
         )
-
-    def _along(self, query: Following, joint: Joint | None) -> float:
-        """Where on its joint a query is, by the network's own point, from which the joint was learned."""
-        answered = query.answer is not None and np.isfinite(query.answer.point_world).all()
-        if joint is None or joint.kind is JointKind.STATIC or query.place is None or not answered:
-            return float("nan")
-        return float(joint.locate(self._to_world(query.place[None]).astype(np.float64))[0])
-
-    def _world_joint(self, query: Following) -> Joint | None:
-        reference, joint = self._intake.reference, self._links.joint(query.query) or query.ground.joint
-        if joint is None or reference is None or not reference.has_depth:
-            return None
-        world_from_cam = np.linalg.inv(reference.cam_from_world.numpy())
-        rotation = world_from_cam[:3, :3]
-        translation = rotation @ as_array(reference.center[0]) + world_from_cam[:3, 3]
-        return joint.transformed(rotation, translation, float(reference.scale[0]))
 
 
 def _numpy(tensor: Tensor) -> np.ndarray:
