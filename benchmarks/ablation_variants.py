@@ -18,7 +18,7 @@ LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 """Losses that know of 3D; the others are of pixels, features and confidences."""
 
 LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
-    "default": ("aff", "heat", "point", "vel", "acc", "conf", "bound", "feat", "geo", "map", "joint"),
+    "default": ("aff", "heat", "point", "vel", "acc", "conf", "feat", "geo", "map", "joint"),
     "paper": ("aff", "vel", "acc", "conf", "bound", "feat", "geo", "map"),
 }
 """Losses that are not zero by construction."""
