@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from quest.errors import ConfigError
 from quest.evaluation.lineup import FLOW_NOISES
 from quest.model.config import PRESETS, NetworkConfig
 from quest.train.settings import LOSSES, LossWeights, WindowConfig
@@ -105,6 +106,28 @@ def lines_of(table: TableName, presets: Sequence[PresetName]) -> tuple[Line, ...
     }
     rows = makers[table]
     return tuple(line for preset in presets for line in rows(preset))
+
+
+def chosen_lines(
+    tables: Sequence[TableName], presets: Sequence[PresetName], variants: Sequence[str]
+) -> dict[TableName, tuple[Line, ...]]:
+    """The rows of tables: all, or those of some variants and those that these are compared with.
+
+    Raises:
+        ConfigError: no row is of such a variant.
+    """
+    lines: dict[TableName, tuple[Line, ...]] = {table: lines_of(table, presets) for table in tables}
+    known = {line.variant.name for each in lines.values() for line in each}
+    if unknown := sorted(set(variants) - known):
+        raise ConfigError(f"--variants {unknown[0]}: expected some of {', '.join(sorted(known))}")
+    if not variants:
+        return lines
+    asked = {table: [line for line in each if line.variant.name in variants] for table, each in lines.items()}
+    compared = {line.reference for each in asked.values() for line in each}
+    return {
+        table: tuple(line for line in each if line in asked[table] or line.label in compared)
+        for table, each in lines.items()
+    }
 
 
 def _parts(preset: PresetName) -> list[Line]:

@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import torch
 import tyro
-from ablation_variants import TABLES, Line, PresetName, TableName, Variant, lines_of
+from ablation_variants import TABLES, Line, PresetName, TableName, Variant, chosen_lines
 from rich.console import Console
 
 from quest.baselines import HoldStill
@@ -112,11 +112,7 @@ class Ablations:
     def run(self) -> int:
         """Every run, every answer, every table."""
         console = Console(highlight=False)
-        lines = {table: lines_of(table, self.presets) for table in self.tables}
-        known = {line.variant.name for each in lines.values() for line in each}
-        if unknown := sorted(set(self.variants) - known):
-            raise ConfigError(f"--variants {unknown[0]}: expected some of {', '.join(sorted(known))}")
-        lines = {table: self._chosen(each) for table, each in lines.items()}
+        lines = chosen_lines(self.tables, self.presets, self.variants)
         test = TestTakes.open(self)
         encoder = self._first_network().encoder.state_dict()
         cached = self._test_features(test, console)
@@ -131,12 +127,6 @@ class Ablations:
             self._write(table, each, test)
             console.print(f"wrote {self.out / f'{table}.json'}")
         return 0
-
-    def _chosen(self, lines: tuple[Line, ...]) -> tuple[Line, ...]:
-        """The rows that were asked for, and those that they are compared with."""
-        asked = [line for line in lines if not self.variants or line.variant.name in self.variants]
-        compared = {line.reference for line in asked}
-        return tuple(line for line in lines if line in asked or line.label in compared)
 
     # Training
 
