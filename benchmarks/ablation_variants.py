@@ -121,12 +121,13 @@ def chosen_lines(
     if unknown := sorted(set(variants) - known):
         raise ConfigError(f"--variants {unknown[0]}: expected some of {', '.join(sorted(known))}")
     if not variants:
-        return lines
+        return {table: each for table, each in lines.items() if each}
     asked = {table: [line for line in each if line.variant.name in variants] for table, each in lines.items()}
     compared = {line.reference for each in asked.values() for line in each}
     return {
         table: tuple(line for line in each if line in asked[table] or line.label in compared)
         for table, each in lines.items()
+        if asked[table]
     }
 
 

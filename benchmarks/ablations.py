@@ -383,8 +383,9 @@ class TestTakes:
         ]
         kept = tuple(part for part in parts if part[1])
         # The cache of features knows takes by their names.
-        teaching = {name for path in (*asked.train, *asked.validation) for name in TakeStore(path).names()}
-        twice = sorted(teaching & {name for _, takes in kept for name in takes})
+        teaching = [name for path in {*asked.train, *asked.validation} for name in TakeStore(path).names()]
+        tested = [name for _, takes in kept for name in takes]
+        twice = sorted(name for name in tested if name in teaching or tested.count(name) > 1)
         if twice:
             raise ConfigError(f"take {twice[0]}: a store of --test has it and another one too; leave one of them away")
         digest = combined_hash((name, store.data_hash(name)) for store, takes in kept for name in takes)

@@ -12,11 +12,8 @@ for the renderer's shaders and is left out. Let nothing else run meanwhile.
 from __future__ import annotations
 
 import cProfile
-import json
 import os
 import pstats
-import shlex
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -29,9 +26,9 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from quest.data.provenance import code_commit, machine, package_versions
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import interval_over
+from quest.evaluation.report import provenance, write_report
 from quest.sim.cameras import PosedCamera
 from quest.sim.objects import SimObject
 from quest.sim.plan import ObjectShelf, plan_takes, procedural_objects
@@ -83,15 +80,12 @@ class GenerationSpeed:
             last, rest = timed[-1], _now() - start
             timed[-1] = (last[0], last[1] + rest[0], last[2] + rest[1], *last[3:])
         result = _summary(np.array(timed[1:])) | {"first_take_s": timed[0][1], "level": self.level}
-        result |= {"machine": machine(), "load": os.getloadavg()[0], "renderer": str(renderer.device)}
-        result |= {"commit": code_commit(), "versions": package_versions()}
-        result |= {"command": shlex.join(["python", "benchmarks/generation_speed.py", *sys.argv[1:]])}
+        result |= provenance() | {"load": os.getloadavg()[0], "renderer": str(renderer.device)}
         Console().print_json(data=result)
         if profiler:
             pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            write_report(result, self.out)
         return 0
 
 

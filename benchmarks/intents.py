@@ -20,6 +20,7 @@ from rich.table import Table
 import quest
 from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
+from quest.errors import ConfigError
 from quest.evaluation.intents import IntentAnswer, IntentRow, intent_rows, judge_intents
 from quest.evaluation.report import provenance, shown, write_report
 from quest.evaluation.selection import select_takes
@@ -51,6 +52,8 @@ class Intents:
         hashes: list[tuple[str, str]] = []
         for store in map(TakeStore, self.takes):
             for name, part in select_takes(store.infos(), split=self.split).items():
+                if name in {known for known, _ in hashes}:
+                    raise ConfigError(f"--takes: expected different names in all stores, {name!r} comes twice")
                 take, before = store.read(name), len(answers)
                 for view in range(len(take.views)):
                     answers += judge_intents(tracker, take, view, part=part, apart_px=self.apart_px)

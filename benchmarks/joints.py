@@ -6,15 +6,12 @@ Every simulated track is seen at 30 frames/s, stands still for up to a second, i
 ends where it has turned by 30 degrees or slid by 10 cm; half of them rest once on their way. The result says how many
 points that are, and how well an estimator without bias could know the axis at best (Cramer and Rao). A tenth or a fifth
 of the points are outliers by 15 cm per coordinate, where the name says so. Every recorded track is judged whole, where
-it moves that far; recorded tracks are not part of the project, and the result says so where they are missing.
+it moves that far; recorded tracks are not part of the project, and the result has none where they are missing.
 """
 
 from __future__ import annotations
 
-import json
 import os
-import shlex
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,10 +21,10 @@ import numpy as np
 import tyro
 from rich.console import Console
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest
 
-from quest.data.provenance import code_commit, machine, package_versions
 from quest.evaluation.bootstrap import interval_over
+from quest.evaluation.drift import clopper_pearson
+from quest.evaluation.report import provenance, write_report
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, fit_joint
 from quest.grounding.vectors import perpendicular
 
@@ -93,14 +90,12 @@ class Joints:
             },
         }  # fmt: skip
         result: dict[str, Any] = {"simulated": {k: self._simulated(**v) for k, v in conditions.items()}}
-        result["recorded"] = self._recorded() if self.recorded.is_dir() else "the recorded tracks were not available"
-        result |= {"tracks": self.tracks, "sigma_m": self.sigma_m, "seed": self.seed, "machine": machine()}
-        result |= {"load": os.getloadavg()[0], "commit": code_commit(), "versions": package_versions()}
-        result |= {"command": shlex.join(["python", "benchmarks/joints.py", *sys.argv[1:]])}
+        result["recorded"] = self._recorded() if next(self.recorded.rglob("*.log"), None) else {}
+        result |= {"tracks": self.tracks, "sigma_m": self.sigma_m, "seed": self.seed, "load": os.getloadavg()[0]}
+        result |= provenance()
         Console().print_json(data=result)
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            write_report(result, self.out)
         return 0
 
     def _recorded(self) -> dict[str, Any]:
@@ -262,8 +257,10 @@ def best_possible(rng: np.random.Generator, track: SimulatedTrack, sigma_m: floa
 
 def share(right: np.ndarray) -> dict[str, Any]:
     """Share with its 95 % interval (Clopper and Pearson)."""
-    interval = binomtest(int(right.sum()), len(right)).proportion_ci()
-    return {"share": float(right.mean()), "low": interval.low, "high": interval.high, "n": len(right)}
+    if not len(right):
+        return {"n": 0}
+    low, high = clopper_pearson(int(right.sum()), len(right))
+    return {"share": float(right.mean()), "low": low, "high": high, "n": len(right)}
 
 
 def middle(value: np.ndarray) -> dict[str, Any]:

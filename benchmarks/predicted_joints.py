@@ -87,14 +87,13 @@ def _table(rows: tuple[JointRow, ...]) -> Table:
     table = Table(
         title="joints from predicted tracks",
         box=box.SIMPLE_HEAD,
-        caption="kind: exact 95 % interval; axis: median where the kind is right, 95 % bootstrap over objects; "
-        "far: the first frame at 45 degrees or 15 cm",
+        caption="95 % bootstrap over objects; axis: median where the kind is right; far: the first frame at 45 degrees "
+        "or 15 cm",
     )
     headings = ("objects", "suite", "joint", "when", "objects/takes/answers", "none", "static", "kind right %")
     for heading in (*headings, "axis error, degrees", "p90"):
         table.add_column(heading, justify="left" if heading in headings[:4] else "right")
     for row in rows:
-        k = row.kind_right
         table.add_row(
             f"{row.source}, {row.part}",
             row.suite,
@@ -103,7 +102,7 @@ def _table(rows: tuple[JointRow, ...]) -> Table:
             f"{row.objects}/{row.takes}/{row.answers}",
             str(row.without),
             str(row.static),
-            f"{100 * k.share:.0f} ({100 * k.low:.0f} to {100 * k.high:.0f})",
+            shown(row.kind_right, factor=100, decimals=0),
             shown(row.axis_error_deg, decimals=1),
             "-" if row.axis_p90_deg is None else f"{row.axis_p90_deg:.1f}",
         )

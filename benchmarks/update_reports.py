@@ -58,6 +58,7 @@ def _intents(file: str, title: str) -> Table:
 
 def _alarms(file: str, title: str) -> Table:
     about = {"detector": "detector", "alpha": "each.alpha", "in frames": "each.alpha_frames"}
+    about |= {"fitted tail": "each.extrapolated"}
     false = {"loss-free streams": "each.trials", "false alarms": "each.false_alarms"}
     false |= {"95 % from": "%each.low", "to": "%each.high"}
     found = {"missed %": "%each.missed", "delay median": "each.delay_median", "p90": "each.delay_p90"}
@@ -151,7 +152,7 @@ TABLES = (
         | {
             "beside": "beside",
             "tracker": "tracker",
-            "n": "judged",
+            "hidden/judged": "episodes/judged",
             "right before %": "%held_before",
             "APE hidden": "ape_hidden",
             "right 5 frames after %": "%held_again",
@@ -196,7 +197,6 @@ TABLES = (
             "when": "moment",
             "objects/answers": "objects/answers",
             "kind right %": "%kind_right",
-            "by objects %": "%kind_right.over_objects",
             "axis error, degrees": "axis_error_deg",
             "p90": "axis_p90_deg",
         },
@@ -316,19 +316,25 @@ def page(folder: Path) -> str:
     parts = [
         "# Results of ablations, monitor, grounding, suites and simulator",
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
-        "what the columns are. In brackets 95 % intervals: exact ones for shares, else bootstraps over objects. "
-        "Validation objects chose settings; test objects did not. Every table names its commit. What commits "
+        "what the columns are. In brackets 95 % intervals: exact ones for false alarms, for what is right before and "
+        "after being hidden and for joints from true and real tracks, else bootstraps over objects, of speeds over "
+        "turns or takes. Validation objects chose settings; test objects did not. Every table names its commit. What commits "
         "before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before 69b1116 "
         "are of a tracker whose queries may begin in a look-alike of what they were bound to, those before 8ca5ac4 of "
         "one that does not carry the point along either that was asked for, those before 3145cc6 of one that does not "
-        "read how far the front of a link has turned. Commits 2b4179b and 6027663 are part of 47b90a7 now.",
+        "read how far the front of a link has turned.",
     ]
-    parts += [_section(table, folder / table.file) for table in TABLES if (folder / table.file).is_file()]
+    parts += [_section(table, report) for table in TABLES if (report := _report(folder / table.file, table.rows))]
     return "\n\n".join(parts) + "\n"
 
 
-def _section(table: Table, path: Path) -> str:
-    report = json.loads(path.read_text(encoding="utf-8"))
+def _report(path: Path, rows: str) -> dict[str, Any] | None:
+    """A report; None where there is no such file, or nothing of this kind in it."""
+    report = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    return report if report and (not rows or report.get(rows)) else None
+
+
+def _section(table: Table, report: dict[str, Any]) -> str:
     lines = [_line(table.columns), _line(["---"] * len(table.columns))]
     rows = report[table.rows] if table.rows else [report]
     if isinstance(rows, dict):
@@ -363,10 +369,12 @@ def _cell(row: dict[str, Any], where: str) -> str:
 def _shown(value: Any, factor: float) -> str:
     if value is None:
         return ""
+    if isinstance(value, bool):
+        return "yes" if value else ""
     if isinstance(value, dict):
         middle = _shown(value.get("share", value.get("mean")), factor)
         low, high = (_shown(value.get(key), factor) for key in ("low", "high"))
-        return f"{middle} ({low}–{high})" if low and high else middle
+        return f"{middle} ({low}–{high or '∞'})" if low else middle
     if isinstance(value, float):
         if factor == 100:
             return f"{factor * value:.{int(0 < abs(value) < 0.1)}f}"

@@ -10,10 +10,7 @@ meanwhile; the load is noted.
 
 from __future__ import annotations
 
-import json
 import os
-import shlex
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,9 +21,10 @@ import numpy as np
 import tyro
 from rich.console import Console
 
-from quest.data.provenance import code_commit, combined_hash, machine, package_versions
+from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
 from quest.data.window_reader import Window, WindowReader
+from quest.evaluation.report import provenance, write_report
 
 _BATCH = 32
 
@@ -70,7 +68,7 @@ class WindowReading:
         for _ in range(self.repeats):
             for key, read in readers.items():
                 rates[key].append(self._time(read, few if key == "take_store_1_thread" else windows))
-        result = {
+        result = provenance() | {
             "frames_per_s": {key: _spread([wall for wall, _ in r]) for key, r in rates.items()},
             "frames_per_cpu_s": {key: _spread([cpu for _, cpu in r]) for key, r in rates.items()},
             "n_windows": len(windows),
@@ -78,16 +76,11 @@ class WindowReading:
             "n_takes": len(names),
             "n_repeats": self.repeats,
             "data_hash": combined_hash((name, header.data_hash) for name, header in headers.items()),
-            "machine": machine(),
             "load": os.getloadavg()[0],
-            "commit": code_commit(),
-            "versions": package_versions(),
-            "command": shlex.join(["python", "benchmarks/window_reading.py", *sys.argv[1:]]),
         }
         Console().print_json(data=result)
         if self.out is not None:
-            self.out.parent.mkdir(parents=True, exist_ok=True)
-            self.out.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+            write_report(result, self.out)
         return 0
 
     def _time(self, read: Callable[[list[Window]], None], windows: list[Window]) -> tuple[float, float]:

@@ -119,7 +119,7 @@ def test_missing_depth_at_the_query_is_flagged(take: Take, tracker: HoldStill | 
 @pytest.mark.parametrize("tracker", BASELINES, ids=lambda t: t.name)
 @pytest.mark.parametrize("queries", [None, [Query.slot()], [Query.point(0, 5.0, 5.0), Query.semantic("knob")]])
 def test_only_point_queries(take: Take, tracker: HoldStill | LucasKanade, queries: list[Query] | None) -> None:
-    with pytest.raises(ConfigError, match="baselines only have the protocol 'point'"):
+    with pytest.raises(ConfigError, match="this tracker follows given points"):
         tracker.track(take.views[0].clip, queries)
 
 

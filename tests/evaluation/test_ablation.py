@@ -146,6 +146,11 @@ def test_the_benchmark_has_every_row_that_is_asked_for(variants) -> None:
     windows = {(line.variant.network.preset, line.variant.network.window) for line in tables["window"]}
     assert windows == {(p, t) for p in both for t in (2, 4, 8)}
     assert {line.variant.network.slots for line in tables["slots"]} == {4, 8, 16}
+    some = variants.chosen_lines(variants.TABLES, both, ("default-no-aff",))
+    assert {t: [line.label for line in lines] for t, lines in some.items()} == {
+        "losses": ["default: all losses", "default: no aff"]
+    }
+    assert "slots" not in variants.chosen_lines(variants.TABLES, ("default",), ())
     off = {f.name for f in fields(LossWeights)}
     assert off == {name for line in tables["losses"] for name in off if getattr(line.variant.losses, name) == 0}
     assert [line.variant.sources for line in tables["data"]] == [None, ("procedural",)]

@@ -208,6 +208,16 @@ def test_rows(detectors: tuple[Detector, ...]):
     assert threshold.auroc.mean == pytest.approx(auroc(score, lost))
 
 
+def test_losses_of_one_object_alone_have_no_interval(detectors: tuple[Detector, ...]):
+    records = [stream(["." * 60], seed=i, part="test") for i in range(8)]
+    records[3] = stream(["." * 20 + "x" * 40], seed=3, part="test")
+    (row, *_) = drift_rows(detectors, records, budgets=(Budget(0.3),), resamples=20, seed=0)
+    missed = row.alarms[0].missed
+    assert row.losses == 1
+    assert missed is not None
+    assert (missed.low, missed.high) == (None, None)
+
+
 def test_false_alarms_keep_the_promise():
     """No detector alarms on more new loss-free streams than one block may spend of alpha, nor on far fewer."""
     most = share(0.2, block=1, restart=0)

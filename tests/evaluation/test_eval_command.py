@@ -98,6 +98,11 @@ def test_evaluate_refuses_what_no_tracker_can(store: TakeStore) -> None:
         evaluate(store, {"panels-100001-1": "validation"}, [HoldStill(), HoldStill()])
 
 
+def test_a_protocol_named_twice_is_one(store: TakeStore) -> None:
+    found = evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], protocols=("point", "point"))
+    assert len({(r.take, r.view, r.entity) for r in found.records}) == len(found.records) > 0
+
+
 def test_progress_counts_every_frame(store: TakeStore) -> None:
     seen: list[int] = []
     evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], progress=lambda _, frames: seen.append(frames))
@@ -160,6 +165,7 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
         ({"out": Path("result.txt")}, ConfigError, "json"),
         ({"protocol": ("semantic",), "trackers": ("lk",)}, ConfigError, "semantic"),
         ({"level": (4,)}, ConfigError, "no take is left"),
+        ({"shard": "²/3"}, ConfigError, "shard"),
     ],
 )
 def test_command_errors(store: TakeStore, changes: dict, error: type[Exception], match: str) -> None:

@@ -29,7 +29,7 @@ def check_point_queries(
     if queries is None or any(q.kind != "point" for q in queries):
         asked = "discovery (no query)" if queries is None else next(q.kind for q in queries if q.kind != "point")
         raise ConfigError(
-            f"tracker {tracker!r}: expected point queries, got {asked}; baselines only have the protocol 'point'"
+            f"tracker {tracker!r}: expected point queries, got {asked}; this tracker follows given points"
         )
     w, h = clip.camera.width, clip.camera.height
     for q in queries:

@@ -219,6 +219,6 @@ class Generate:
 
 def _seed_range(text: str) -> tuple[int, int]:
     first, dots, last = text.partition("..")
-    if not (dots and first.isdigit() and last.isdigit() and int(first) <= int(last)):
+    if not (dots and first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
         raise ConfigError(f"generate: expected --seeds A..B with 0 <= A <= B, got {text!r}")
     return int(first), int(last)

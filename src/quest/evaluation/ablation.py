@@ -14,9 +14,9 @@ import numpy as np
 
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
-from quest.evaluation.metrics import INPUT_PX, Sums, accuracy, distance_at, frame_mean
+from quest.evaluation.metrics import Sums
 from quest.evaluation.records import Discovery, EntityRecord
-from quest.evaluation.summary import READINGS, Reading
+from quest.evaluation.summary import READINGS, Reading, precision_sums, recall_sums, record_sums
 from quest.evaluation.take_suite import TakeSuite
 
 PAIRED = ("ape", "ape_2d", "d100", "acc")
@@ -170,11 +170,10 @@ def _row(
     sums = _sums(records)
     metrics = {name: mean_value(s, owner, draws) for name, s in sums.items()}
     if protocol == "semantic":
-        recall = Sums(np.array([float(r.found) for r in records]), np.ones(len(records)))
-        metrics["recall"] = mean_value(recall, owner, draws)
+        metrics["recall"] = mean_value(recall_sums(records), owner, draws)
     if found:
-        slots = Sums(np.array([float(d.matched) for d in found]), np.array([float(d.slots) for d in found]))
-        metrics["precision"] = mean_value(slots, np.array([place[d.subject.object_id] for d in found]), draws)
+        of = np.array([place[d.subject.object_id] for d in found])
+        metrics["precision"] = mean_value(precision_sums(found), of, draws)
     difference = None
     if other and {s for s, _ in own} & {s for s, _ in other}:
         kept, gap = _paired(variant, own, other)
@@ -199,19 +198,8 @@ def _row(
 
 
 def _sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:
-    """Sums of the metrics, one term per record in their order."""
-    parts: dict[str, list[Sums]] = {name: [] for name in PAIRED}
-    for r in records:
-        gap, gap_px = r.distance[None].astype(np.float64), r.distance_px[None].astype(np.float64)
-        counted = (np.arange(gap.shape[1]) >= r.first_frame)[None]
-        parts["ape"].append(frame_mean(gap, counted))
-        parts["ape_2d"].append(frame_mean(gap_px / INPUT_PX, counted))
-        parts["d100"].append(distance_at(gap, 1.0, counted))
-        parts["acc"].append(accuracy(r.follows[None].astype(np.int64), np.array([r.entity]), counted))
-    return {
-        name: Sums(np.concatenate([s.total for s in each]), np.concatenate([s.count for s in each]))
-        for name, each in parts.items()
-    }
+    sums = record_sums(records)
+    return {name: sums[name] for name in PAIRED}
 
 
 def _paired(variant: str, own: list[Numbered], other: list[Numbered]) -> tuple[list[EntityRecord], dict[str, Sums]]:

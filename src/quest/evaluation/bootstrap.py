@@ -70,8 +70,9 @@ def median_value(
     medians = []
     for drawn in draws:
         below = np.cumsum(drawn[owner])
-        if below[-1] > 0:
-            medians.append(ordered[np.searchsorted(below, 0.5 * below[-1])])
+        if half := 0.5 * below[-1]:
+            middle = [np.searchsorted(below, half), np.searchsorted(below, half, side="right")]
+            medians.append(ordered[middle].mean())
     low, high = _percentiles(np.array(medians), objects=len(np.unique(owner)))
     return Value(float(np.median(value)), low, high, len(value))
 

@@ -170,7 +170,7 @@ def fit_calibration(
         hidden=hidden,
         decay=decay,
         auroc=auroc(logit, frames.lost),
-        ece=calibration_error(probability(logit), frames.lost),
+        ece=calibration_error(probability(_corrected(held_out, frames)), frames.lost),
         delay=delay,
     )
 
@@ -279,6 +279,16 @@ def _platt(logit: np.ndarray, lost: np.ndarray) -> tuple[float, float]:
 
     found = minimize(loss, np.array([1.0, 0.0]), jac=True, method="L-BFGS-B", bounds=[(0.1, 3.0), (None, None)])
     return float(found.x[0]), float(found.x[1])
+
+
+def _corrected(held_out: np.ndarray, frames: _Frames) -> np.ndarray:
+    """Log odds whose slope and shift come from the other folds too."""
+    odds = np.empty_like(held_out)
+    for i in np.unique(frames.fold):
+        own = frames.fold == i
+        slope, shift = _platt(held_out[~own], frames.lost[~own])
+        odds[own] = slope * held_out[own] + shift
+    return np.clip(odds, -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
 def _scaled(member: _Member, slope: float, shift: float) -> _Member:

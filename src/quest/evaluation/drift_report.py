@@ -189,7 +189,7 @@ class _Weights:
         mean = metric(np.ones(len(self.owner)))
         if not count or not math.isfinite(mean):
             return None
-        if self.draws.shape[1] < 2:
+        if len(np.unique(self.owner)) < 2:
             return Value(mean, None, None, count)
         drawn = (draw[self.owner] for draw in self.draws)
         samples = np.array([metric(weight) for weight in drawn if weight.sum() > 0])
@@ -335,5 +335,8 @@ def _alarm_cells(alarm: AlarmRow) -> tuple[str, ...]:
 def _show(value: Value | None, *, factor: float = 1.0, decimals: int = 3, none: str = "-") -> str:
     if value is None:
         return none
+    middle = f"{factor * value.mean:.{decimals}f}"
+    if value.low is None and value.high is None:
+        return middle
     ends = "–".join("∞" if end is None else f"{factor * end:.{decimals}f}" for end in (value.low, value.high))
-    return f"{factor * value.mean:.{decimals}f} ({ends})"
+    return f"{middle} ({ends})"

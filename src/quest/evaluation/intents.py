@@ -198,7 +198,7 @@ def _score(
     gap = distance(point_world, true[:, entities], half_diagonal_m=half)
     rank = np.searchsorted(take.tracked, entities)
     nearest = identity(point_world, true[:, take.tracked], rank, half_diagonal_m=half)
-    return gap, (nearest == rank) & (gap <= GATE)
+    return gap, nearest == rank
 
 
 def _kept(take: Take, point_world: Float[np.ndarray, "T 3"], entity: int, begin: int) -> tuple[int, float]:

@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Float32
 
-from quest.evaluation.bootstrap import Value, draw_objects, median_value
+from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
+from quest.evaluation.metrics import Sums
 from quest.evaluation.protocols import first_visible
-from quest.evaluation.reappearance import Share, share_of
 from quest.grounding import Joint, JointKind
 from quest.track import StreamState, Tracker
 from quest.types import Query, Take
@@ -97,7 +97,7 @@ class JointRow:
     answers: int
     without: int
     static: int
-    kind_right: Share
+    kind_right: Value | None
     axis_error_deg: Value | None
     axis_p90_deg: float | None
 
@@ -211,8 +211,6 @@ def _row(key: tuple, group: list[JointAnswer], *, resamples: int, seed: int) -> 
     owner = np.array([names.index(a.object_id) for a in group])
     right = np.array([a.right for a in group])
     error = np.array([np.nan if a.axis_error_deg is None else a.axis_error_deg for a in group])
-    kind_right = share_of(right.tolist(), owner, draws)
-    assert kind_right is not None
     part, source, suite, kind, moment = key
     return JointRow(
         part=part,
@@ -226,7 +224,7 @@ def _row(key: tuple, group: list[JointAnswer], *, resamples: int, seed: int) -> 
         answers=len(group),
         without=sum(a.said == NONE for a in group),
         static=sum(a.said == JointKind.STATIC for a in group),
-        kind_right=kind_right,
+        kind_right=mean_value(Sums(right.astype(np.float64), np.ones(len(right))), owner, draws),
         axis_error_deg=median_value(error[right], owner[right], draws),
         axis_p90_deg=float(np.quantile(error[right], 0.9)) if right.any() else None,
     )

@@ -140,7 +140,7 @@ def read_results(path: str | Path) -> Results:
             unscored=tuple(Unscored(**u) for u in raw["unscored"]),
             notes=tuple(raw["notes"]),
         )
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(

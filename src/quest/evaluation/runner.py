@@ -77,6 +77,7 @@ def evaluate(
         raise ConfigError(f"trackers: expected different names, got {', '.join(names)}")
     if finished is None and shard.count > 1:
         raise ConfigError("shard: expected a folder of finished takes that the processes share, got none")
+    protocols = tuple(dict.fromkeys(protocols))
     runs: list[tuple[ProtocolName, ClipTracker]] = [
         (protocol, tracker) for protocol in protocols for tracker in trackers if has_protocol(tracker, protocol)
     ]

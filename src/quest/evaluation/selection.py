@@ -43,7 +43,7 @@ class Shard:
             ConfigError: the text is of another form or the index too large.
         """
         index, _, count = text.partition("/")
-        if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        if not (index.isdecimal() and count.isdecimal() and int(index) < int(count)):
             raise ConfigError(f"shard {text!r}: expected index/count such as 0/2, the index below the count")
         return cls(int(index), int(count))
 

@@ -159,20 +159,17 @@ def _metrics(
     semantic: bool,
 ) -> Metrics:
     object_of = np.array([index[r.subject.object_id] for r in records])
-    sums = _sums(records)
+    sums = record_sums(records)
     values = {name: mean_value(s, object_of, draws) for name, s in sums.items()}
     for name, visible_only in (("median_px", False), ("median_px_vis", True)):
         kept = [r.distance_px[_counted(r, visible_only=visible_only)].astype(np.float64) for r in records]
         owner = np.repeat(object_of, [len(k) for k in kept])
         values[name] = median_value(np.concatenate(kept), owner, draws)
     if semantic:
-        recall = Sums(np.array([float(r.found) for r in records]), np.ones(len(records)))
-        values["recall"] = mean_value(recall, object_of, draws)
+        values["recall"] = mean_value(recall_sums(records), object_of, draws)
     if found:
-        matched = np.array([d.matched for d in found], dtype=float)
-        slots = np.array([d.slots for d in found], dtype=float)
         owner = np.array([index[d.subject.object_id] for d in found])
-        values["precision"] = mean_value(Sums(matched, slots), owner, draws)
+        values["precision"] = mean_value(precision_sums(found), owner, draws)
     counted = [(d.placed, d.entities, index[d.subject.object_id]) for d in found if d.placed is not None]
     if counted:
         placed, entities, owner = np.array(counted).T
@@ -185,7 +182,17 @@ def _counted(record: EntityRecord, *, visible_only: bool = False) -> np.ndarray:
     return counted & record.visible if visible_only else counted
 
 
-def _sums(records: list[EntityRecord]) -> dict[str, Sums]:
+def recall_sums(records: Sequence[EntityRecord]) -> Sums:
+    """Which entities were discovered, one term per record."""
+    return Sums(np.array([float(r.found) for r in records]), np.ones(len(records)))
+
+
+def precision_sums(found: Sequence[Discovery]) -> Sums:
+    """Which discoveries are entities, one term per view."""
+    return Sums(np.array([float(d.matched) for d in found]), np.array([float(d.slots) for d in found]))
+
+
+def record_sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:
     """Sums of every averaged metric, in the order of the records; records of equal length are computed together."""
     by_length: dict[int, list[int]] = defaultdict(list)
     for i, record in enumerate(records):

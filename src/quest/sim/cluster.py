@@ -94,7 +94,7 @@ def _connected(ray: ModuleType, cluster: ClusterSettings) -> Iterator[None]:
         yield
         return
     host, colon, port = cluster.address.rpartition(":")
-    if colon and port.isdigit() and "/" not in host:  # Ray itself would try for half a minute
+    if colon and port.isdecimal() and "/" not in host:  # Ray itself would try for half a minute
         try:
             socket.create_connection((host, int(port)), timeout=_GOODBYE_S).close()
         except OSError as error:

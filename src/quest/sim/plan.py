@@ -145,7 +145,7 @@ class ObjectShelf:
             return Path(object_id)
         if source == "procedural":
             category, _, seed = object_id.rpartition("-")
-            if category not in CATEGORIES or not seed.isdigit():
+            if category not in CATEGORIES or not seed.isdecimal():
                 raise ObjectError(
                     f"procedural object {object_id!r}: expected CATEGORY-SEED with one of {', '.join(CATEGORIES)}"
                 )
