@@ -318,9 +318,9 @@ def page(folder: Path) -> str:
         "Written by `python benchmarks/update_reports.py` out of `benchmarks/results`; [metrics.md](metrics.md) says "
         "what the columns are. In brackets 95 % intervals: exact ones for false alarms, for what is right before and "
         "after being hidden and for joints from true and real tracks, else bootstraps over objects, of speeds over "
-        "turns or takes. Validation objects chose settings; test objects did not. Every table names its commit. What commits "
-        "before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before 69b1116 "
-        "are of a tracker whose queries may begin in a look-alike of what they were bound to, those before 8ca5ac4 of "
+        "turns or takes. Validation objects chose settings; test objects did not. Every table names its commit. What "
+        "commits before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before "
+        "69b1116 are of a tracker whose queries may begin in a look-alike of what they were bound to, those before 8ca5ac4 of "
         "one that does not carry the point along either that was asked for, those before 3145cc6 of one that does not "
         "read how far the front of a link has turned.",
     ]
@@ -345,6 +345,9 @@ def _section(table: Table, report: dict[str, Any]) -> str:
             lines.append(_line([_cell(row | {"each": entry}, where) for where in table.columns.values()]))
     run = report.get("run", report)
     notes = [f"`{run['command']}`, commit {run['commit']}."]
+    notes += [
+        f"Answers: `{r['command']}`, commit {r['commit']}." for r in (o["run"] for o in report.get("origins", ()))
+    ]
     if report.get("complete") is False:
         notes.insert(0, "**Unfinished**: the run was stopped before its last take; these are the takes so far.")
     if "n_takes" in report and "machine" in report:
