@@ -54,13 +54,15 @@ class Camera:
         values = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(values).all() or min(self.fx, self.fy) <= 0:
             raise InputError(f"camera: expected finite intrinsics with fx, fy > 0, got fx, fy, cx, cy = {values}")
-        if self.width <= 0 or self.height <= 0:
-            raise InputError(f"camera: expected a positive image size, got {self.width} x {self.height}")
+        if min(self.width, self.height) <= 0 or self.width % 1 or self.height % 1:
+            raise InputError(f"camera: expected a size of > 0 whole pixels, got {self.width} x {self.height}")
         if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
             raise InputError(
                 f"camera: principal point ({self.cx:.1f}, {self.cy:.1f}) lies far outside the "
                 f"{self.width} x {self.height} image; check that the intrinsics belong to this image size"
             )
+        for name in self.__dataclass_fields__:  # numbers of numpy are no JSON
+            object.__setattr__(self, name, np.asarray(getattr(self, name)).item())
 
     @classmethod
     def from_opencv(cls, matrix: Float[np.ndarray, "3 3"], *, width: int, height: int) -> Camera:
@@ -112,6 +114,8 @@ class Clip:
     cam_from_world: Float[np.ndarray, "T 4 4"]
 
     def __post_init__(self) -> None:
+        if self.rgb.ndim != 4 or self.rgb.shape[3] != 3 or self.rgb.dtype != np.uint8:
+            raise InputError(f"clip: expected colours [T, H, W, 3] of uint8, got {self.rgb.shape} of {self.rgb.dtype}")
         t, h, w = self.rgb.shape[:3]
         if t == 0:
             raise InputError(f"clip {self.name!r}: expected at least one frame, got none")
@@ -121,14 +125,11 @@ class Clip:
                 f"{self.camera.width} x {self.camera.height}; give the intrinsics of these frames"
             )
         if self.depth_m is not None and self.depth_m.shape != (t, h, w):
-            raise InputError(
-                f"clip {self.name!r}: expected depth of shape {(t, h, w)} to match the colour frames, "
-                f"got {self.depth_m.shape}"
-            )
+            raise InputError(f"clip {self.name!r}: expected depth of shape {(t, h, w)}, got {self.depth_m.shape}")
         if self.stamp_s.shape != (t,) or self.cam_from_world.shape != (t, 4, 4):
             got = f"{self.stamp_s.shape} and {self.cam_from_world.shape}"
             raise InputError(f"clip {self.name!r}: expected {t} time stamps and poses, got {got}")
-        finite = np.isfinite(self.cam_from_world).all() and np.isfinite(self.stamp_s).all()
+        finite = all(np.isfinite(values).all() for values in (self.cam_from_world, self.stamp_s))
         if not finite or (np.diff(self.stamp_s) < 0).any():
             raise InputError(f"clip {self.name!r}: stamps and poses must be finite, times not falling; sort the frames")
 
@@ -267,8 +268,8 @@ class Joint:
     Attributes:
         name: name in the URDF.
         kind: ``revolute`` or ``prismatic``.
-        lower: lower limit used, radians or metres.
-        upper: upper limit used, radians or metres.
+        lower: lower limit of the model, radians or metres.
+        upper: upper limit of the model, radians or metres; scripts open a hinge by at most 110 degrees.
     """
 
     name: str

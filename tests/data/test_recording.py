@@ -15,7 +15,7 @@ import pytest
 from quest.data.camera_file import CameraFile, read_camera, write_camera
 from quest.data.distortion import Distortion, Rectifier
 from quest.data.frame_source import Notes
-from quest.data.recording import clean_depth, clip_from_arrays, open_recording, read_recording, write_recording
+from quest.data.recording import clean_depth, open_recording, read_recording, write_recording
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
@@ -186,6 +186,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "focal length of nothing": (lambda f: edit_camera(f, fx=0), "fx, fy > 0"),
     "focal length is a word": (lambda f: edit_camera(f, fx="wide"), "camera.json: could not convert"),
+    "without end": (lambda f: edit_camera(f, width=float("inf")), "cannot convert float infinity"),
+    "lens without coefficients": (lambda f: edit_camera(f, distortion_model="fisheye"), "without distortion"),
     "half a pixel wide": (lambda f: edit_camera(f, width=64.5), "whole pixels"),
     "unknown pixel centre": (
         lambda f: edit_camera(f, pixel_centre="corner"),
@@ -253,31 +255,9 @@ def test_video_of_no_frames(tmp_path: Path):
 def test_nothing_is_overwritten(folder: Path, clip: Clip):
     with pytest.raises(InputError, match="not an empty folder"):
         write_recording(clip, folder)
-
-
-def test_arrays_in_memory(clip: Clip):
-    assert clip.depth_m is not None
-    depth_m = clip.depth_m.astype(np.float64)
-    depth_m[0, 0, :4] = [np.nan, np.inf, -np.inf, -1]
-    found = clip_from_arrays(clip.rgb, depth_m, clip.camera, frames_per_s=10)
-    assert found.depth_m is not None
-    assert found.depth_m.dtype == np.float32
-    np.testing.assert_array_equal(found.depth_m[0, 0, :4], 0)
-    np.testing.assert_allclose(found.stamp_s[:3], [0, 0.1, 0.2])
-    assert clip_from_arrays(clip.rgb, None, clip.camera).depth_m is None
-
-
-def test_arrays_in_millimetres(clip: Clip):
-    assert clip.depth_m is not None
-    with pytest.raises(RecordingError, match=r"depth_scale_m = 0\.001 would give"):
-        clip_from_arrays(clip.rgb, (clip.depth_m * 1000).astype(np.uint16), clip.camera)
-
-
-def test_arrays_without_frames_or_with_unsorted_stamps(clip: Clip):
-    with pytest.raises(InputError, match="at least one frame"):
-        clip_from_arrays(clip.rgb[:0], None, clip.camera)
-    with pytest.raises(InputError, match="sort the frames"):
-        clip_from_arrays(clip.rgb, None, clip.camera, stamp_s=clip.stamp_s[::-1].copy())
+    with pytest.raises(InputError, match="expected a positive number"):
+        write_recording(clip, folder / "new", depth_scale_m=0)
+    assert not (folder / "new").exists()
 
 
 def test_clean_depth_keeps_what_is_valid():

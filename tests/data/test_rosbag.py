@@ -184,6 +184,18 @@ def test_times_of_logging_where_headers_have_none(tmp_path: Path):
     assert NO_STAMP in flags
 
 
+def test_transforms_without_times_are_of_when_they_were_logged(tmp_path: Path):
+    sent = [info()]
+    for t in range(3):
+        at = BEGIN + t * STEP
+        sent.append(("/tf", TF, transform("odom", COLOUR_FRAME, base_at(t), 0), at))
+        sent.append((COLOUR, IMAGE, image(RGB[t], "rgb8", 0), at + STEP // 10))
+    frames, _ = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
+    # Between two transforms, a tenth on; the last frame has the last one.
+    np.testing.assert_allclose(np.linalg.inv(frames[2].cam_from_world), base_at(2), atol=1e-6)
+    assert not np.allclose(frames[0].cam_from_world, frames[1].cam_from_world)
+
+
 def test_a_clock_that_begins_at_zero_is_kept(tmp_path: Path):
     sent = [info()] + [(COLOUR, IMAGE, image(RGB[t], "rgb8", t * STEP), BEGIN + t * STEP) for t in range(3)]
     frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))

@@ -70,6 +70,9 @@ def test_some_views_and_frames(store: TakeStore, take: Take):
     assert len(part.views) == 1
     np.testing.assert_array_equal(part.views[0].clip.rgb, take.views[1].clip.rgb[2:9:3])
     np.testing.assert_array_equal(part.point_world, take.point_world[2:9:3])
+    np.testing.assert_array_equal(part.flow_world[:-1], np.diff(take.point_world[2:9:3], axis=0))
+    assert (part.flow_world[-1] == 0).all()
+    assert part.info.frames_per_s == take.info.frames_per_s / 3
     assert store.read("panels", views=[]).views == ()
     view = store.read_view("panels", 1, frames=slice(-2, None))
     np.testing.assert_array_equal(view.entity_id, take.views[1].entity_id[-2:])

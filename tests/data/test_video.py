@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from quest.data.lerobot_export import Episode, export_lerobot
 from quest.data.recording import read_recording, write_recording
 from quest.data.video import play_video, probe_video, read_video, write_video
 from quest.errors import RecordingError
@@ -58,6 +59,15 @@ def test_depth_beside_a_turned_video_is_refused(tmp_path: Path):
         read_recording(folder)
     (folder / "depth").rename(tmp_path / "depth")
     assert len(read_recording(folder)) == 4
+
+
+def test_depth_beside_a_turned_video_of_a_dataset_is_refused(tmp_path: Path):
+    folder = tmp_path / "set"
+    export_lerobot([Episode.of_take(make_take(frames=4, views=1, size=(64, 48)))], folder)
+    (colours,) = folder.glob("videos/observation.images.view_0/*/*.mp4")
+    write_with(colours, RGB[:4], turned=180)
+    with pytest.raises(RecordingError, match=rf"{colours.name} of .*view_0: .*their depth is not turned with them"):
+        read_recording(folder)
 
 
 @pytest.mark.parametrize("suffix", [".mkv", ".webm"])

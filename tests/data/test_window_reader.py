@@ -101,7 +101,15 @@ def test_damage_is_noticed(tmp_path: Path):
     shard.write_bytes(data)
     with WindowReader(store) as reader, pytest.raises(TakeError, match=r"torn.*check sum"):
         reader.read(Window("panels", 0, 0, 4))
-    meta = store.path("panels") / "view_0" / "visible" / "zarr.json"
-    meta.write_text(json.dumps({"a": 1}).ljust(len(meta.read_text())))
-    with WindowReader(store) as reader, pytest.raises(TakeError, match="torn"):
-        reader.read(Window("panels", 0, 4, 4))
+    for array in ("visible", "rgb"):
+        meta = store.path("panels") / "view_0" / array / "zarr.json"
+        kept = meta.read_bytes()
+        for damaged in (
+            json.dumps({"a": 1}).encode().ljust(len(kept)),
+            bytes(len(kept)),
+            kept.replace(b"shape", b"shaqe"),
+        ):
+            meta.write_bytes(damaged)
+            with WindowReader(store) as reader, pytest.raises(TakeError, match="torn"):
+                reader.read(Window("panels", 0, 4, 4))
+        meta.write_bytes(kept)

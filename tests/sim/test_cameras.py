@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from quest.sim.annotate import project_points
-from quest.sim.cameras import AZIMUTH_DEG, ELEVATION_DEG, FLAT_ELEVATION_DEG, sample_cameras
+from quest.sim.cameras import AZIMUTH_DEG, ELEVATION_DEG, FLAT_ELEVATION_DEG, CameraStyle, sample_cameras
 
 seeds = st.integers(0, 2**31 - 1)
 sizes = st.tuples(st.integers(48, 640), st.integers(48, 640))
@@ -49,6 +49,12 @@ def test_cameras_stand_in_front_and_apart(seed: int) -> None:
     assert elevation.max() <= FLAT_ELEVATION_DEG[1] + 1e-6
     between = towards @ towards.T - 2 * np.eye(3)
     assert between.max() < np.cos(np.deg2rad(8))
+
+
+def test_cameras_in_one_direction_only() -> None:
+    style = CameraStyle(azimuth_deg=(20.0, 20.0), elevation_deg=(30.0, 30.0))
+    cameras = sample_cameras(cloud(0), 3, np.random.default_rng(0), width=64, height=48, style=style)
+    assert len(cameras) == 3
 
 
 def test_same_generator_same_cameras() -> None:

@@ -93,9 +93,22 @@ def test_takes_of_an_object_that_was_edited_since_do_not_count(tmp_path: Path) -
     made = {"object": object_digest(folder)}
     store.write(replace(take, info=replace(take.info, provenance=made)))
     assert missing_takes([spec], store) == []
+    with pytest.raises(ConfigError, match="of another"):
+        missing_takes([replace(spec, source="partnet", object_id=folder.name)], store)
     (folder / "entities.json").write_text("{}")
     with pytest.raises(ConfigError, match="of another"):
         missing_takes([spec], store)
+
+
+def test_an_object_is_its_materials_too(tmp_path: Path) -> None:
+    folder = write_cabinet(tmp_path / "mine")
+    mesh = next(folder.rglob("*.obj"))
+    mesh.write_text("mtllib wood.mtl\n" + mesh.read_text())
+    known = {object_digest(folder)}
+    for name, text in (("wood.mtl", "newmtl a\nmap_Kd -s 1 1 oak.png\n"), ("oak.png", "light"), ("oak.png", "dark")):
+        (mesh.parent / name).write_text(text)
+        known.add(object_digest(folder))
+    assert len(known) == 4
 
 
 def test_two_objects_of_one_name_are_refused(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def read_camera(path: Path) -> CameraFile:
         )
     try:
         return _parse(fields)
-    except (InputError, TypeError, ValueError) as error:
+    except (InputError, TypeError, ValueError, OverflowError) as error:
         raise RecordingError(f"camera file {path}: {error}; expected such as {EXAMPLE}") from error
 
 
@@ -187,6 +187,8 @@ def _parse_lens(fields: dict[str, Any]) -> Distortion:
     coefficients = np.asarray(fields.get("distortion", []), dtype=np.float64)
     if coefficients.ndim != 1:
         raise ValueError("distortion must be a list of coefficients, in the order of ROS and OpenCV")
+    if "distortion_model" in fields and not len(coefficients):
+        raise ValueError("distortion_model is given without distortion; give its coefficients too, or leave it away")
     return Distortion(str(fields.get("distortion_model", "plumb_bob")), tuple(coefficients.tolist()))
 
 

@@ -30,7 +30,8 @@ class Distortion:
     Attributes:
         model: ``plumb_bob`` (k1 k2 p1 p2, k3), ``rational_polynomial`` (k1 k2 p1 p2 k3 k4 k5 k6, and OpenCV's thin
             prism and tilt) or ``equidistant`` (k1 k2 k3 k4), also called fisheye.
-        coefficients: in that order; all zero or none at all is a lens without distortion, whatever the model.
+        coefficients: in that order; none at all is a lens without distortion, as all zero is, but for an equidistant
+            one, which is never a pinhole.
     """
 
     model: str = "plumb_bob"

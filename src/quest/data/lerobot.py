@@ -26,7 +26,7 @@ from quest.data.camera_file import CameraFile
 from quest.data.folder import read_setup
 from quest.data.frame_source import FrameSource, Notes, clean_depth
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
-from quest.data.video import play_video
+from quest.data.video import play_video, probe_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Frame
 
@@ -316,6 +316,8 @@ def _pictures(
         return
     info = (feature.get("info") or {}) | (feature.get("video_info") or {})
     path = episode.video_path(key)
+    if paired and probe_video(path).turns:
+        raise RecordingError(f"dataset {episode.root}: video {path.name} of {key}: {TURNED}")
     begin_s = float(episode.row[f"videos/{key}/from_timestamp"])
     half_s = 0.5 / float(episode.info["fps"])
     times = begin_s + rows.timestamp

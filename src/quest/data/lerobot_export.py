@@ -14,6 +14,7 @@ import json
 import shutil
 import uuid
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,7 @@ import pyarrow.parquet as pq
 
 from quest.data.frame_source import clean_depth
 from quest.data.lerobot import CAMERA_COLUMN, CAMERA_KEY, POSE, STAMP, VERSION, DepthRange
-from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, camera_words, depth_key, image_key
+from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, depth_key, image_key
 from quest.data.lerobot_stats import feature_stats, image_stats, merge_stats
 from quest.data.video import write_depth_video, write_video
 from quest.errors import InputError
@@ -118,7 +119,7 @@ class _Writer:
         row |= {"dataset_from_index": self._frames, "dataset_to_index": self._frames + frames}
         for view, clip in episode.views.items():
             self._write_videos(clip, view, place)
-            camera = row[f"{CAMERA_COLUMN}/{view}"] = camera_words(clip.camera)
+            camera = row[f"{CAMERA_COLUMN}/{view}"] = asdict(clip.camera)
             if camera != layout.cameras[view]:
                 self._own_cameras.add(view)
             stats[image_key(view)] = image_stats(clip.rgb, 255.0)

@@ -14,7 +14,7 @@ from jaxtyping import Float32
 
 from quest.data.lerobot import CAMERA_KEY, POSE, STAMP, DepthRange
 from quest.errors import InputError
-from quest.types import Camera, Clip, State, Take, Tracks
+from quest.types import Clip, State, Take, Tracks
 
 STATE, TRACKS = "observation.state", "observation.tracks"
 
@@ -103,7 +103,7 @@ class Layout:
         return cls(
             fps=max(1, round(rate)) if fps is None else fps,
             sizes={name: clip.rgb.shape[1:3] for name, clip in episode.views.items()},
-            cameras={name: camera_words(clip.camera) for name, clip in episode.views.items()},
+            cameras={name: asdict(clip.camera) for name, clip in episode.views.items()},
             deep=frozenset(name for name, clip in episode.views.items() if clip.depth_m is not None),
             joints=own_joints if joints is None else joints,
             tracked=frozenset(episode.tracks),
@@ -167,12 +167,6 @@ class Layout:
         found[STAMP] = ("float64", None)
         found["timestamp"] = ("float32", None)
         return found | {name: (dtype, None) for name, dtype in _COUNTERS.items()}
-
-
-def camera_words(camera: Camera) -> dict[str, Any]:
-    """Intrinsics as numbers that JSON has."""
-    lengths = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy")}
-    return lengths | {"width": int(camera.width), "height": int(camera.height)}
 
 
 def image_key(view: str) -> str:

@@ -208,8 +208,12 @@ def write_recording(
         depth_scale_m: metres per unit of the depth images; by default 0.1 mm where all is below 6.5 m, else 1 mm.
 
     Raises:
-        InputError: the folder has something in it.
+        InputError: the folder has something in it, or the scale of depth is not a positive number.
     """
+    try:
+        scale = 1e-3 if depth_scale_m is None else check_depth_scale(depth_scale_m)
+    except ValueError as error:
+        raise InputError(f"recording {folder}: {error}") from None
     target = Path(folder)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise InputError(f"recording {target}: exists and is not an empty folder; choose another one")
@@ -223,7 +227,6 @@ def write_recording(
             (partial / "rgb").mkdir()
             for t, image in enumerate(clip.rgb):
                 _write_png(partial / "rgb" / f"{t:06d}.png", image[..., ::-1])
-        scale = 1e-3 if depth_scale_m is None else check_depth_scale(depth_scale_m)
         if clip.depth_m is not None:
             scale = 1e-4 if depth_scale_m is None and clip.depth_m.max() < 6.5 else scale
             (partial / "depth").mkdir()

@@ -136,8 +136,8 @@ def _scan_transforms(messages: Messages, chosen: Chosen) -> tuple[Transforms, in
         begun_ns = log_ns if begun_ns is None else begun_ns
         if log_ns - begun_ns > _SCAN_NS:
             break
-        transforms.add(message, static=False)
-    return transforms, header_ns(chosen.first[chosen.rgb])
+        transforms.add(message, static=False, log_ns=log_ns)
+    return transforms, header_ns(chosen.first[chosen.rgb]) or begun_ns or 0
 
 
 def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transforms: Transforms, now_ns: int) -> Rig:
@@ -239,7 +239,7 @@ class _Play:
             elif topic == chosen.info:
                 self._compare(message)
             else:
-                self._transforms.add(message, static=False)
+                self._transforms.add(message, static=False, log_ns=log_ns)
             while self._colours and self._ready(self._colours[0][0]):
                 yield self._frame_of(*self._colours.popleft())
         while self._colours:

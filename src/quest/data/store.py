@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -143,7 +144,9 @@ class TakeStore:
         Args:
             name: the take.
             views: indices of the views to read; all by default, none for an empty sequence.
-            frames: the frames to read; all by default. The motion of entities counts from the first one read.
+            frames: the frames to read; all by default. The motion of entities counts from the first one read. With a
+                step, flow is that between the frames read, 0 at the last, and the frame rate is divided by it; the flow
+                of the last of consecutive frames leads to the next one in the store.
 
         Raises:
             TakeError: the take is missing, torn or of another format version, or has no such view or frame.
@@ -156,7 +159,12 @@ class TakeStore:
             }
             chosen = range(len(header.cameras)) if views is None else views
             parts = tuple(_read_view(group, name, header, view, rows, arrays["stamp_s"]) for view in chosen)
-        return Take(info=header.info, views=parts, **arrays)
+        info = header.info
+        if rows.step > 1:
+            point = arrays["point_world"]
+            arrays["flow_world"] = np.diff(point, axis=0, append=point[-1:])
+            info = replace(info, frames_per_s=info.frames_per_s / rows.step)
+        return Take(info=info, views=parts, **arrays)
 
     def read_view(self, name: str, view: int, *, frames: slice | None = None) -> View:
         """One camera's frames of a take with their ground truth, loading nothing else.

@@ -5,7 +5,7 @@ Reference: Foote, "tf: the transform library", 2013.
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +33,7 @@ class _Edge:
         if self.static:
             self.stamp_ns, self.position, self.quaternion = [stamp_ns], [position], [quaternion]
             return
-        at = bisect_left(self.stamp_ns, stamp_ns)
+        at = bisect_right(self.stamp_ns, stamp_ns)
         self.stamp_ns.insert(at, stamp_ns)
         self.position.insert(at, position)
         self.quaternion.insert(at, quaternion)
@@ -66,8 +66,14 @@ class Transforms:
     def __init__(self) -> None:
         self._edges: dict[str, _Edge] = {}
 
-    def add(self, message: Any, *, static: bool) -> None:
-        """Take the transforms of one TFMessage; those that are no transforms (a quaternion of zeros) are left out."""
+    def add(self, message: Any, *, static: bool, log_ns: int = 0) -> None:
+        """Take the transforms of one TFMessage; those that are no transforms (a quaternion of zeros) are left out.
+
+        Args:
+            message: the message.
+            static: whether they hold throughout.
+            log_ns: when it was recorded, for transforms without a time of their own.
+        """
         for stamped in message.transforms:
             moved, turned = stamped.transform.translation, stamped.transform.rotation
             quaternion = np.array([turned.x, turned.y, turned.z, turned.w], dtype=np.float64)
@@ -79,7 +85,7 @@ class Transforms:
             edge = self._edges.get(child)
             if edge is None or edge.parent != parent or edge.static != static:
                 edge = self._edges[child] = _Edge(parent, static)
-            edge.add(header_ns(stamped), position, quaternion / norm)
+            edge.add(header_ns(stamped) or log_ns, position, quaternion / norm)
 
     def root(self, frame: str) -> str:
         """The frame that everything around ``frame`` hangs on; itself if nothing is known of it."""

@@ -262,7 +262,10 @@ def _find_shards(name: str, folder: Path, header: TakeHeader) -> dict[str, _Shar
     for v in range(len(header.cameras)):
         keys = ["rgb", "link_id", "entity_id", *(["depth"] if header.has_depth[v] else [])]
         for key in keys:
-            array = _sharded_array(name, folder / f"view_{v}" / key)
+            try:
+                array = _sharded_array(name, folder / f"view_{v}" / key)
+            except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
+                raise _torn(name, folder, error) from error
             if array is None:
                 return {}
             found[f"view_{v}/{key}"] = array
@@ -298,7 +301,11 @@ def _small_arrays(name: str, folder: Path, header: TakeHeader) -> dict[str, np.n
         group = zarr.open_group(str(folder), mode="r", zarr_format=3, use_consolidated=False)
         return {path: np.asarray(group[path][:]) for path in paths}  # type: ignore[index]
     except (KeyError, ValueError, RuntimeError, OSError, TypeError, zlib.error) as error:
-        raise TakeError(
-            f"take {name!r}: {folder} is torn, an array cannot be decoded ({type(error).__name__}: {error}); "
-            "delete its folder and generate it again"
-        ) from error
+        raise _torn(name, folder, error) from error
+
+
+def _torn(name: str, folder: Path, error: Exception) -> TakeError:
+    return TakeError(
+        f"take {name!r}: {folder} is torn, an array cannot be decoded ({type(error).__name__}: {error}); "
+        "delete its folder and generate it again"
+    )

@@ -33,7 +33,6 @@ class Part:
         scale: factors from the mesh file's units to metres, per axis.
         uv_scale: the same before the object was stretched: for texture coordinates, which takes of one object share.
         shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
-        size_m: edge lengths; or radius and length; or radius.
         rgba: colour given by the URDF, or None.
         surface: the geometry in the body's frame, metres.
     """
@@ -46,7 +45,6 @@ class Part:
     scale: tuple[float, float, float]
     uv_scale: tuple[float, float, float]
     shape: str
-    size_m: tuple[float, ...]
     rgba: tuple[float, float, float, float] | None
     surface: trimesh.Trimesh
 

@@ -22,6 +22,9 @@ CAMERA_MOTIONS = ("static", "orbit", "handheld", "pan")
 """What ``mixed`` draws from."""
 
 _DISTINCT_DEG = 18.0
+
+_LEAST_APART_RAD = 1e-6
+"""Where directions can hardly differ, cameras may stand at one place."""
 _FILL = (0.80, 0.97)
 _ORBIT_FILL = (0.82, 0.95)
 _HANDHELD_FILL = (0.75, 0.90)
@@ -247,7 +250,7 @@ def _directions(
         direction = np.array(
             [np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)]
         )
-        if all(direction @ d < np.cos(apart) for d in directions):
+        if apart < _LEAST_APART_RAD or all(direction @ d < np.cos(apart) for d in directions):
             directions.append(direction)
         else:
             apart *= 0.97  # so that any number of cameras fits

@@ -97,7 +97,7 @@ def read_description(path: Path) -> Description:
     if len(sizes) > 1:
         raise ObjectError(f"{path}: expected size_m or height_m, got both; leave one out")
     front = raw.get("front")
-    if front is not None and front not in FRONTS:
+    if front is not None and (not isinstance(front, str) or front not in FRONTS):
         raise ObjectError(f"{path}: front is {front!r}, expected one of {', '.join(FRONTS)}; name where doors open to")
     entities = raw.get("entities", [])
     if not isinstance(entities, list):

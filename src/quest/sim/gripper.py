@@ -234,9 +234,7 @@ class _Way:
         self._approach(after, ready, held, moves, closing, straight)
 
     def _leave(self, grasp: Grasp, stops: int, frames: int) -> None:
-        left = self._held(grasp, stops - 1)
-        if self._opening[stops - 1] == grasp.width_m:
-            left = self._gripper[stops - 1]
+        left = self._gripper[stops - 1]
         cleared = _back(left, grasp.back_m)
         opening = max(2, min(4, (frames - stops) // 4))
         straight = (frames - stops - opening + 1) // 2

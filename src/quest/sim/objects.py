@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -27,8 +28,8 @@ OBJECTS_VARIABLE = "QUEST_OBJECTS"
 
 _PLAUSIBLE_M = (0.02, 3.0)
 """Longest side; what is larger has parts beyond the 6.55 m to which takes keep depth."""
-_MOST_JOINTS = 254
-"""Masks of links have one byte."""
+_MOST_JOINTS, _MOST_ENTITIES = 254, 255
+"""Masks of links and of entities have one byte."""
 _PART_NAMES = ("mobility_v2.json", "result_after_merging.json")
 _CATEGORY_OF_BASE = {
     "furniture_body": "StorageFurniture",
@@ -179,6 +180,10 @@ def load_object(path: Path) -> SimObject:
         raise ObjectError(
             f"{folder}: expected a moving link with a handle, rim or front, found none; use another object"
         )
+    if len(entities) > _MOST_ENTITIES:
+        raise ObjectError(
+            f"{folder}: expected at most {_MOST_ENTITIES} handles, knobs, rims, fronts and hinges, got {len(entities)}"
+        )
     object_id = object_id_of(Path(path))
     return SimObject(
         source, object_id, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
@@ -186,7 +191,9 @@ def load_object(path: Path) -> SimObject:
 
 
 def object_digest(path: Path) -> str:
-    """Short hash of all that an object is read from: its URDF, the files beside it that are read, and the meshes.
+    """Short hash of all that an object is read from.
+
+    That is its URDF, the files beside it that are read, the meshes, and the materials and pictures that these name.
 
     Raises:
         ObjectError: the URDF is missing or broken.
@@ -196,10 +203,27 @@ def object_digest(path: Path) -> str:
     visuals = [visual for of_link in read_urdf(urdf_path).links.values() for visual in of_link]
     meshes = sorted({visual.mesh for visual in visuals if visual.mesh is not None})
     digest = hashlib.sha256()
-    for file in (urdf_path, *beside, *meshes):
+    looks = sorted({file for mesh in meshes for file in _looks(mesh)})
+    for file in (urdf_path, *beside, *meshes, *looks):
         data = file.read_bytes() if file.is_file() else b""
         digest.update(f"{file.name}\0{len(data)}\n".encode() + data)
     return digest.hexdigest()[:12]
+
+
+def _looks(mesh: Path) -> Iterator[Path]:
+    """Material files that a Wavefront mesh names, and the pictures that these name."""
+    for library in _named_in(mesh, ("mtllib",)) if mesh.suffix.lower() == ".obj" else ():
+        yield library
+        yield from _named_in(library, ("map_", "bump", "disp", "decal", "norm", "refl"))
+
+
+def _named_in(path: Path, words: tuple[str, ...]) -> Iterator[Path]:
+    """Files named last in the lines that begin with one of these words."""
+    text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    for line in text.splitlines():
+        parts = line.split()
+        if len(parts) > 1 and parts[0].lower().startswith(words):
+            yield path.parent / parts[-1]
 
 
 def _scale(
@@ -368,7 +392,6 @@ def _part(
         scale=visual.scale,
         uv_scale=visual.scale,
         shape=visual.shape,
-        size_m=visual.size,
         rgba=visual.rgba,
         surface=in_body,
     )

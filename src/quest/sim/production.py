@@ -18,7 +18,7 @@ from quest.data.provenance import code_commit, package_versions
 from quest.data.take_format import hash_take
 from quest.errors import ConfigError, ObjectError, TakeError
 from quest.sim.generate import generate_take
-from quest.sim.objects import find_objects, object_digest
+from quest.sim.objects import find_objects, find_urdf, object_digest
 from quest.sim.plan import ObjectShelf, TakeSpec
 from quest.sim.renderer import Renderer
 from quest.types import Take
@@ -126,8 +126,8 @@ class StudioSettings:
         """A studio that can make these takes.
 
         Raises:
-            ObjectError: there is no folder of objects to take the named ones from, or some have none and it is to be
-                complete.
+            ObjectError: there is no folder of objects to take the named ones from, or it is to be complete and some
+                objects have none here.
             RendererError: nothing can render here.
         """
         wanted = {spec.object_id for spec in specs if spec.source == "partnet"}
@@ -138,6 +138,9 @@ class StudioSettings:
                     f"objects {', '.join(missing)}: no such folders in {self.objects_root or 'QUEST_OBJECTS'}; every "
                     "machine needs the folders of all objects"
                 )
+        if complete:
+            for own in {spec.object_id for spec in specs if spec.source == "own"}:
+                find_urdf(Path(own))
         return RenderingStudio(self)
 
 
@@ -213,16 +216,17 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
     there = store.headers(wanted)
     for name, header in there.items():
         spec, about = wanted[name], header.info.provenance
-        made = {"settings": spec.settings.digest}
-        if spec.source == "own":
-            made["object"] = object_digest(Path(spec.object_id))
-        for what, digest in made.items():
-            if about.get(what, digest) != digest:  # older takes do not say
-                differs = "other settings" if what == "settings" else f"another {spec.object_id}"
-                raise ConfigError(
-                    f"take {name}: {store.url} has it of {differs}, made by `{about.get('command', 'unknown')}`; "
-                    "use another store, another --seed, or delete it there"
-                )
+        own = object_digest(Path(spec.object_id)) if spec.source == "own" else None
+        differs = None
+        if about.get("settings", spec.settings.digest) != spec.settings.digest:  # older takes do not say
+            differs = "other settings"
+        elif {"settings", "object"} & about.keys() and about.get("object") != own:
+            differs = f"another {spec.object_id}"
+        if differs is not None:
+            raise ConfigError(
+                f"take {name}: {store.url} has it of {differs}, made by `{about.get('command', 'unknown')}`; "
+                "use another store, another --seed, or delete it there"
+            )
     return [spec for name, spec in wanted.items() if name not in there]
 
 

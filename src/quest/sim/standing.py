@@ -97,7 +97,6 @@ def scaled(articulation: Articulation, scale: float) -> Articulation:
                 body_from_part=pose(p.body_from_part),
                 scale=(sx, sy, sz),
                 uv_scale=(sx, sy, sz),
-                size_m=tuple(s * scale for s in p.size_m),
                 surface=p.surface.copy().apply_scale(scale),
             )
         )

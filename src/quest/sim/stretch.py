@@ -70,7 +70,6 @@ def _part(part: Part, stretch: Float[np.ndarray, "3 3"]) -> Part:
         body_from_part=body_from_part,
         mesh=None if askew else part.mesh,
         scale=(float(sx), float(sy), float(sz)),
-        size_m=(),
         surface=part.surface.copy().apply_transform(matrix),
     )
 

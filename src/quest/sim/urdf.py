@@ -89,7 +89,7 @@ def read_urdf(path: Path) -> Urdf:
         root = ElementTree.parse(path).getroot()
     except FileNotFoundError:
         raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf") from None
-    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter two: of its encoding
         raise ObjectError(f"{path}: not a readable URDF ({error}); restore the file from its source") from None
     if any("ros.org/wiki/xacro" in str(element.tag) for element in root.iter()):
         raise ObjectError(

@@ -15,16 +15,6 @@ from quest.sim.procedural.shapes import box
 _NO_HANDLES_SHARE = 0.08
 
 
-def build_furniture(category: str, rng: np.random.Generator) -> ObjectModel:
-    """A piece of board furniture.
-
-    Args:
-        category: one of :data:`FURNITURE`.
-        rng: source of randomness.
-    """
-    return FURNITURE[category](rng)
-
-
 def _chest(rng: np.random.Generator) -> ObjectModel:
     columns = int(rng.choice([1, 1, 2, 2, 3]))
     rows = int(rng.integers(4, 7)) if columns == 1 else int(rng.integers(2, 5))
