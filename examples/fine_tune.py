@@ -3,7 +3,8 @@
     python examples/fine_tune.py                                    # the tool chest in examples/toolbox
     python examples/fine_tune.py --objects path/to/mine --steps 1000
 
-Every step is a `quest` command, which is printed before it runs; what is there already is not made again.
+Every step is a `quest` command, which is printed before it runs. Run again, it makes no take and trains no step twice;
+settings are chosen and takes are evaluated anew.
 """
 
 from __future__ import annotations

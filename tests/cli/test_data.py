@@ -14,8 +14,10 @@ from PIL import Image
 
 from quest.cli import main as program
 from quest.cli.data_stats import finite
+from quest.cli.takes import write_picture
 from quest.data.consistency import Check
 from quest.data.store import TakeStore
+from quest.errors import ConfigError
 from quest.extras import is_installed
 from tests.synthetic import make_take
 
@@ -95,6 +97,15 @@ def test_show_a_store(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.skipif(not is_installed("rerun"), reason="the viz extra is not installed")
+def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path):
+    wide = np.zeros((1, 20_000, 3), np.uint8)
+    with pytest.raises(ConfigError, match=r"20000 x 1 px are too many for \.webp"):
+        write_picture(wide, tmp_path / "sheet.webp")
+    assert not list(tmp_path.iterdir())
+    write_picture(wide, tmp_path / "sheet.png")
+    assert list(tmp_path.iterdir()) == [tmp_path / "sheet.png"]
+
+
 def test_show_in_rerun(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rrd = tmp_path / "take.rrd"
     assert quest("show", whole / "single.zarr", "--rrd", rrd) == 0
@@ -163,6 +174,12 @@ def test_export(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert str(tmp_path / "single-v0.npz") in capsys.readouterr().out
     assert quest("export", whole / "single.zarr", "--out", tmp_path / "one", "--format", "tapvid3d") == 0
     assert len(list((tmp_path / "one").iterdir())) == 2
+
+
+def test_export_names_what_is_torn(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert quest("export", broken, "--out", tmp_path / "out") == 1
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["whole-v0.npz", "wrong-v0.npz"]
+    assert "left out: take 'torn'" in capsys.readouterr().err
 
 
 def test_export_to_lerobot(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -21,7 +21,7 @@ from quest.data.recording import write_recording
 from quest.data.store import TakeStore
 from quest.data.tracks_file import read_tracks
 from quest.data.video import write_video
-from quest.errors import RecordingError
+from quest.errors import InputError, RecordingError
 from quest.model.weights import save_network
 from quest.track import Stream, TrackerConfig
 from quest.types import Clip
@@ -129,6 +129,24 @@ def test_monitor_stops_where_the_recording_is_torn(
 def test_points_beyond_the_end(sources: dict[str, str]):
     source = Source(sources["clip.mcap"], point=(f"{FRAMES},1,1",))
     with pytest.raises(ValueError, match=f"0 to {FRAMES - 1}, got {FRAMES}"):
+        source.queries(source.open())
+
+
+def test_monitor_refuses_points_after_the_end_of_a_video_of_unknown_length(
+    clip: Clip, weights: str, tmp_path: Path, capsys
+):
+    write_video(tmp_path / "rgb.mkv", clip.rgb, frames_per_s=30)
+    write_camera(CameraFile(clip.camera), tmp_path / "camera.json")
+    points = ["--point", "0,20,30", "--point", "99,5,5,far"]
+    assert main(["monitor", str(tmp_path), "--weights", weights, *points]) == 2
+    error = capsys.readouterr().err
+    assert "far (from frame 99 on): expected a frame of" in error
+    assert f"ended at frame {FRAMES - 1}" in " ".join(error.split())
+
+
+def test_names_are_utf8(sources: dict[str, str]):
+    source = Source(sources["clip.mcap"], point=("0,1,1,\udcff",))
+    with pytest.raises(InputError, match="UTF-8"):
         source.queries(source.open())
 
 

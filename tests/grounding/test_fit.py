@@ -156,16 +156,18 @@ def test_one_and_two_points_are_static():
         (np.full((5, 3), np.nan), 0.01),
         (np.zeros((5, 3)), 0.0),
         (np.zeros((5, 3)), np.nan),
+        (np.zeros((5, 3)), np.ones(4)),
     ],
 )
-def test_what_cannot_be_fitted_is_refused(points: np.ndarray, sigma: float):
+def test_what_cannot_be_fitted_is_refused(points: np.ndarray, sigma: float | np.ndarray):
     with pytest.raises(BAD_INPUT, match=r"joint: expected|points"):
         fit_joint(points, sigma)
 
 
 def test_priors_are_checked():
     good = make_prior(np.array([0.0, 0.0, 1.0]), np.zeros(3))
-    for change in ({"revolute_probability": 1.0}, {"origin_sigma": 0.0}, {"origin": np.full(3, np.nan)}):
+    bad = ({"revolute_probability": 1.0}, {"origin_sigma": 0.0}, {"origin": np.full(3, np.nan)})
+    for change in (*bad, {"revolute_axis": 2 * good.revolute_axis}, {"prismatic_axis": np.zeros(3)}):
         with pytest.raises(InputError, match="joint prior"):
             replace(good, **change)
 

@@ -37,13 +37,20 @@ def test_round_trip(tmp_path: Path, config: NetworkConfig):
     assert loaded.network.config == config
     assert loaded.settings == '{"jump": 0.1}'
     assert not loaded.network.training
-    assert not list(path.parent.glob("*.partial"))
+    assert list(path.parent.iterdir()) == [path]
     for name, tensor in make_network(config).state_dict().items():
         expected = tensor.half().float()
         assert (loaded.network.state_dict()[name] == expected).all(), name
     save_network(path, loaded.network, settings=loaded.settings, about="again")
     again = load_network(path).network.state_dict()
     assert all((again[name] == tensor).all() for name, tensor in loaded.network.state_dict().items())
+
+
+def test_nothing_is_left_of_what_could_not_be_written(tmp_path: Path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(WeightsError, match="cannot be written"):
+        save_network(tmp_path / "folder", make_network(), settings="{}", about="")
+    assert list(tmp_path.iterdir()) == [tmp_path / "folder"]
 
 
 def test_a_missing_file_names_what_ships(tmp_path: Path):

@@ -35,6 +35,17 @@ def test_alarms_that_cannot_come_are_told(streams: int, never: str | None):
     assert (few.least_alpha <= 0.05) == (streams >= 24)
 
 
+def test_a_watch_may_be_too_short_for_an_alarm():
+    """Eight frames add up to 8 x 11 at most."""
+    high = replace(made(), statistic=Cusum(-3.0, 1.0), maxima=np.linspace(80.0, 100.0, 60))
+    assert high.shortfall(Budget(0.5)) is None
+    for budget, frames in ((Budget(0.5, 8), None), (Budget(0.5), 8)):
+        told = high.shortfall(budget, frames=frames)
+        assert told is not None
+        assert "at all" in told
+    assert high.shortfall(Budget(0.5, 9)) is None
+
+
 def test_later_blocks_have_thresholds_that_nothing_exceeds():
     """A frame adds at most 8 + 3 to a sum that forgets everything, and these maxima have a long tail."""
     tailed = replace(made(), statistic=Cusum(-3.0, 0.0), maxima=np.sort(np.random.default_rng(0).exponential(2, 200)))

@@ -29,6 +29,7 @@ def test_a_signal_that_adds_little_is_not_named():
 def test_depth_has_two_sides():
     assert said(depth_gap=(2.0, -0.2, 0.0, 1)).startswith("what is seen lies 0.20 before its place")
     assert said(depth_gap=(2.0, 0.2, 0.0, 1)).startswith("what is seen lies 0.20 behind its place")
+    assert said(depth_gap=(2.0, 0.03, 0.2, 1)).startswith("what is seen lies 0.03 behind its place")
 
 
 def test_the_other_direction_gets_no_wrong_words():

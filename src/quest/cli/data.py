@@ -31,7 +31,7 @@ class DataShow:
     """Picture to write (PNG, JPEG, WebP); default: NAME.png in the current folder, unless Rerun is asked for."""
 
     columns: int = 8
-    """Frames on the sheet, spread evenly from the first to the last."""
+    """Frames on the sheet, spread evenly: of one take from the first to the last, of several from the first on."""
 
     rows: int = 12
     """Takes on the sheet of a store, spread evenly over their names."""
@@ -106,10 +106,9 @@ class DataShow:
 
     @staticmethod
     def _write(sheet: np.ndarray, out: Path, what: str) -> None:
-        from PIL import Image
+        from quest.cli.takes import write_picture
 
-        out.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(sheet).save(out)
+        write_picture(sheet, out)
         print(f"{out}: {sheet.shape[1]} x {sheet.shape[0]} px, {what}")
 
 

@@ -15,7 +15,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DataExport:
-    """Write takes as TAPVid-3D examples, a LeRobot dataset, or MCAP recordings."""
+    """Write takes as TAPVid-3D examples, a LeRobot dataset, or MCAP recordings.
+
+    Exit code 1 if takes of the store cannot be read and were left out.
+    """
 
     takes: Annotated[str, tyro.conf.Positional]
     """Folder or URL of a store, or of one take (STORE/NAME.zarr)."""
@@ -28,21 +31,22 @@ class DataExport:
 
     def run(self) -> int:
         """Write and say what was written."""
-        from quest.cli.takes import open_takes
+        from quest.cli.takes import open_takes, say_torn
         from quest.errors import TakeError
 
         store, names = open_takes(self.takes)
         chosen = store.names() if names is None else names
         if not chosen:
             raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+        torn = 0 if names is not None else say_torn([store])
         if self.format == "lerobot":
             self._write_dataset(store, chosen)
-            return 0
+            return 1 if torn else 0
         write = _write_tapvid3d if self.format == "tapvid3d" else _write_mcap
         for name in chosen:
             for path in write(store.read(name), self.out):
                 print(path)
-        return 0
+        return 1 if torn else 0
 
     def _write_dataset(self, store: TakeStore, names: list[str]) -> None:
         """One episode per take, with as many places for joints and entities as the take with the most has."""

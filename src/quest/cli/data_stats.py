@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -34,6 +33,7 @@ class DataStats:
         from quest.cli.takes import open_takes, wide_console
         from quest.data.stats import store_stats
         from quest.errors import TakeError
+        from quest.evaluation.report import write_report
 
         store, names = open_takes(self.store)
         if names is not None:
@@ -43,8 +43,7 @@ class DataStats:
             task = progress.add_task("")
             found = store_stats(store, report=lambda done, of: progress.update(task, completed=done, total=of))
         if self.json is not None:
-            self.json.parent.mkdir(parents=True, exist_ok=True)
-            self.json.write_text(json.dumps(finite(asdict(found)), indent=2, allow_nan=False) + "\n", encoding="utf-8")
+            write_report(finite(asdict(found)), self.json)
         table = Table(box=None, show_header=False)
         table.add_column(no_wrap=True, style="dim")
         table.add_column(overflow="fold")

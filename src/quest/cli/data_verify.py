@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -86,6 +85,7 @@ def _print(found: StoreReport) -> None:
 
 def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
     from quest.data.provenance import code_commit, combined_hash, command_line, machine
+    from quest.evaluation.report import write_report
 
     headers = store.headers()
     known = {report.name: headers[report.name] for report in found.takes if report.name in headers}
@@ -103,5 +103,4 @@ def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
         "machine": machine(),
         "command": command_line(),
     }
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(finite(result), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_report(finite(result), path)

@@ -63,10 +63,11 @@ class EvalMonitor:
         Raises:
             ConfigError: weights without a calibration, objects that they were calibrated on, or bad settings.
             InputError: the calibration streams are missing, of other weights, or not those of the calibration.
-            TakeError: a store is missing or a take is torn.
+            TakeError: a take cannot be read; those whose description is torn already are named and left out.
         """
         from rich.console import Console
 
+        from quest.cli.takes import say_torn
         from quest.data.store import TakeStore
         from quest.errors import ConfigError
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
@@ -90,6 +91,7 @@ class EvalMonitor:
                 f"{self.alpha_frames}"
             )
         stores = [TakeStore(path) for path in self.takes]
+        say_torn(stores)
         takes = [(s, select_takes(s.infos(), split=self.split, levels=self.level)) for s in stores]
         recorded = record_streams(
             tracker,

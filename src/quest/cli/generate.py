@@ -200,6 +200,8 @@ class Generate:
         split = object_split()
         if self.split is not None and self.partnet and category is None:
             chosen += [("partnet", object_id) for object_id in split.partnet_mobility[self.split]]
+        if self.procedural < 0:
+            raise ConfigError(f"generate: expected --procedural of at least 0, got {self.procedural}")
         if self.procedural or self.seeds:
             first, last = _seed_range(self.seeds) if self.seeds else split.procedural_seeds[self.split or "train"]
             count = self.procedural or last - first + 1

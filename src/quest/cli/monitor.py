@@ -75,11 +75,12 @@ class Monitor(Source):
             shortfall := tracker.calibration.shortfall(stream.budget, frames=length)
         ):
             console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {shortfall}; `quest weights calibrate`")
-        view = LiveView(console, name=source.name, frames=length, budget=stream.budget)
-        state = None
+        view = LiveView(console, name=source.name, frames=length if source.exact else None, budget=stream.budget)
+        state, last = None, -1
         try:
             with contextlib.nullcontext() if self.jsonl is None else StateLines(self.jsonl) as lines, view:
                 for t, state, behind_s in self._play(stream, source):
+                    last = t
                     if lines is not None:
                         lines.write(state, frame=t)
                     view.show(t, state, waiting=stream.unbound, behind_s=behind_s)
@@ -88,6 +89,9 @@ class Monitor(Source):
         except KeyboardInterrupt:
             console.print(view.summary())
             raise
+        late = next((q for q in stream.unbound if q.kind == "point" and q.frame > last), None)
+        if late is not None:
+            raise InputError(f"{query_words(late)}: expected a frame of {source.name!r}, which ended at frame {last}")
         if state is None or not state.names:
             raise InputError(f"clip {source.name!r}: {NOTHING_FOUND}")
         for query in stream.unbound:

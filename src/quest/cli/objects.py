@@ -89,9 +89,7 @@ class ObjectsShow:
 
     def run(self) -> int:
         """Write the picture and say where it is."""
-        from PIL import Image
-
-        from quest.cli.takes import check_picture
+        from quest.cli.takes import check_picture, write_picture
         from quest.sim.plan import ObjectShelf
         from quest.sim.portrait import portray
         from quest.sim.renderer import Renderer
@@ -110,8 +108,7 @@ class ObjectsShow:
             cards = [Card(t, portray(t, renderer, sides=self.sides, size_px=self.size)) for t in things]
         columns = self.columns or max(1, round((len(cards) / (2 * self.sides) * 1.6) ** 0.5))
         sheet = object_sheet(cards, columns=columns)
-        self.out.parent.mkdir(parents=True, exist_ok=True)
-        Image.fromarray(sheet).save(self.out)
+        write_picture(sheet, self.out)
         print(f"{self.out}: {sheet.shape[1]} x {sheet.shape[0]} px, {len(cards)} objects")
         return 0
 

@@ -116,7 +116,10 @@ class Source:
                 ) from error
             if length is not None and frame >= length:
                 raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {length - 1}, got {frame}")
-            queries.append(Query.point(frame, x, y, name=parts[3] if len(parts) > 3 else ""))
+            name = parts[3] if len(parts) > 3 else ""
+            if any("\ud800" <= letter <= "\udfff" for letter in name):
+                raise InputError(f"--point {text!r}: expected a name in UTF-8")
+            queries.append(Query.point(frame, x, y, name=name))
         for text in self.label:
             label, _, intent = text.partition(":")
             queries.append(Query.semantic(label, intent=intent or None))

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    import numpy as np
     from rich.console import Console
 
     from quest.data.store import TakeStore
@@ -25,6 +30,44 @@ def check_picture(what: str, out: Path) -> None:
 
     if out.suffix.lower() not in PICTURES:
         raise ConfigError(f"{what}: --out {out}: expected a picture, {', '.join(PICTURES)}")
+
+
+def write_picture(sheet: np.ndarray, out: Path) -> None:
+    """Write a picture, whole or not at all.
+
+    Args:
+        sheet: colours, [H, W, 3] of uint8.
+        out: a file named like a picture.
+
+    Raises:
+        ConfigError: it is larger than this kind of file may be.
+    """
+    from PIL import Image
+
+    from quest.errors import ConfigError
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_name(f".{uuid.uuid4().hex[:8]}.partial{out.suffix}")
+    try:
+        Image.fromarray(sheet).save(partial)
+        os.replace(partial, out)
+    except (ValueError, OSError) as error:
+        if isinstance(error, OSError) and error.errno is not None:
+            raise
+        size = f"{sheet.shape[1]} x {sheet.shape[0]} px"
+        raise ConfigError(f"{out}: {size} are too many for {out.suffix} ({error}); use .png, or draw less") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def say_torn(stores: Iterable[TakeStore]) -> int:
+    """Print on standard error what is wrong with takes that cannot be read and are left out; tells how many."""
+    from rich.console import Console
+
+    problems = [problem for store in stores for problem in store.problems().values()]
+    for problem in problems:
+        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"left out: {problem}")
+    return len(problems)
 
 
 def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:

@@ -75,12 +75,9 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
         points = tracks.point_world[:, k]
         points = points[np.isfinite(points).all(axis=-1)]
         moved = f"{np.linalg.norm(points - points[0], axis=-1).max():.3f} m" if len(points) else "unknown"
-        table.add_row(
-            escape(name),
-            label or "",
-            f"{tracks.visible[:, k].mean():.0%}",
-            moved,
-            f"{tracks.confidence[:, k].mean():.2f}",
-            str(tracks.state[-1, k]),
+        bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
+        seen, sure = (
+            np.mean(values[bound, k]) if bound.any() else 0.0 for values in (tracks.visible, tracks.confidence)
         )
+        table.add_row(escape(name), label or "", f"{seen:.0%}", moved, f"{sure:.2f}", str(tracks.state[-1, k]))
     return table

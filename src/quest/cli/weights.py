@@ -217,6 +217,7 @@ class PiecesWeights:
 
     def run(self) -> int:
         """Learn, print what from, rewrite the file."""
+        from quest.cli.takes import say_torn
         from quest.data.store import TakeStore
         from quest.evaluation.piece_learning import learn_pieces
         from quest.evaluation.selection import select_takes
@@ -226,6 +227,7 @@ class PiecesWeights:
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
         stores = [TakeStore(url) for url in self.takes]
+        say_torn(stores)
         takes = [(store, select_takes(store.infos(), split=("train", "unlisted"))) for store in stores]
         learned = learn_pieces(
             load(self.weights, monitor=False),
@@ -390,7 +392,9 @@ def _pairs(values: Mapping[str, Any]) -> str:
 
 def _to_choose_by(store: TakeStore, *, levels: tuple[int, ...], objects: tuple[str, ...] = ()) -> dict[str, SplitPart]:
     """Takes of validation objects, and of objects in no part of the split, which count as such here."""
+    from quest.cli.takes import say_torn
     from quest.evaluation.selection import select_takes
 
+    say_torn([store])
     chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
     return dict.fromkeys(chosen, "validation")

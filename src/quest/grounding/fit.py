@@ -126,10 +126,12 @@ def _checked(points: np.ndarray, sigma: float | np.ndarray | None) -> tuple[np.n
         raise InputError(
             f"joint: expected at least one finite point (N x 3), got {points.shape}; leave out what is not seen"
         )
-    each = np.broadcast_to(_noise(points) if sigma is None else np.asarray(sigma, np.float64), len(points))
-    if not (np.isfinite(each).all() and (each > 0).all()):
-        raise InputError("joint: expected standard deviations that are finite and positive")
-    return points, each
+    sigma = np.asarray(_noise(points) if sigma is None else sigma, np.float64)
+    if sigma.shape not in ((), (len(points),)) or not (np.isfinite(sigma).all() and (sigma > 0).all()):
+        raise InputError(
+            f"joint: expected one standard deviation, or one for each of {len(points)} points, finite and positive"
+        )
+    return points, np.broadcast_to(sigma, len(points))
 
 
 def _noise(points: np.ndarray) -> float:

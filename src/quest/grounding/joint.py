@@ -37,7 +37,7 @@ class Joint:
         axis: unit direction of sliding, or of the axis of turning (right-handed); positive away from the first points.
         origin: point of the axis of turning nearest to ``rest``; equal to ``rest`` for other kinds.
         rest: the curve at q = 0.
-        lower: smallest q seen, units of length or radians.
+        lower: smallest q seen, units of length or radians; turns are told within half a turn either way from ``rest``.
         upper: largest q seen.
         covariance: of small changes, in the basis of :func:`perpendicular`. Prismatic: tilt of the axis (2, radians)
             and shift across it (2). Revolute: tilt about ``origin`` (2), shift of the axis across itself (2), radius,

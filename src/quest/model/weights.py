@@ -199,10 +199,7 @@ def save_network(
         tensors, shared = leave_out(tensors, beside)
         metadata |= shared
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    save_tensors(tensors, partial, metadata=metadata)
-    partial.chmod(0o644)  # safetensors makes files that only their owner can read
-    partial.replace(path)
+    save_tensors(tensors, path, metadata=metadata)
 
 
 def weights_digest(module: nn.Module, *, beside: str = "") -> str:

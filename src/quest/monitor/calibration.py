@@ -80,13 +80,14 @@ class Calibration:
         """Which alarms there will never be, as the calibration is too small for it; None if all can be.
 
         Where alpha is for a whole stream, thresholds rise from block to block, and the statistic, which starts anew in
-        each, has a largest value.
+        each, and after as many frames as alpha is for, has a largest value.
 
         Args:
             budget: of false alarms.
             frames: length of the stream, if it is known: what comes after it is not missed.
         """
-        most = self.statistic.most(LOGIT_LIMIT, self.block_frames)
+        watched = (self.block_frames, budget.frames, frames)
+        most = self.statistic.most(LOGIT_LIMIT, min(n for n in watched if n is not None))
 
         def silent(block: int) -> bool:
             part = budget.part(block=block, restart=0, block_frames=self.block_frames)

@@ -80,7 +80,7 @@ def reason(
 def _clause(signal: int, value: float, level: float, frames: int) -> str:
     name = SIGNALS[signal]
     wording = _WORDINGS[name]
-    text = wording.low if value < level else wording.high
+    text = wording.low if value < (0.0 if name == "depth_gap" else level) else wording.high  # a gap has a sign
     if text is None:
         text = f"{name.replace('_', ' ')} {{:.2f}}, at first {level:.2f}"
     shown = text.format(abs(value) if name == "depth_gap" else value)
