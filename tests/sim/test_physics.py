@@ -31,7 +31,7 @@ LID = Link(
 
 def part(size: tuple[float, float, float], centre: tuple[float, float, float] = (0, 0, 0)) -> Part:
     surface = trimesh.creation.box(size).apply_translation(centre)
-    return Part("", "", 0, np.eye(4), None, (1, 1, 1), (1, 1, 1), "box", size, None, surface)
+    return Part("", "", 0, np.eye(4), None, (1, 1, 1), (1, 1, 1), "box", None, surface)
 
 
 @pytest.fixture(scope="module")
