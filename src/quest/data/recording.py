@@ -21,7 +21,7 @@ from jaxtyping import Float, Shaped, UInt8
 from quest.data.camera_file import CameraFile, check_depth_scale, write_camera
 from quest.data.folder import open_folder, read_scale
 from quest.data.frame_source import PLAUSIBLE_DEPTH_M, FrameSource, Parts, check_units, clean_depth
-from quest.data.video import write_video
+from quest.data.video import frame_rate, write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
 
@@ -222,7 +222,7 @@ def write_recording(
     try:
         partial.mkdir()
         if rgb == "video":
-            write_video(partial / "rgb.mp4", clip.rgb, frames_per_s=_frame_rate(clip.stamp_s), crf=12, preset="slow")
+            write_video(partial / "rgb.mp4", clip.rgb, frames_per_s=frame_rate(clip.stamp_s), crf=12, preset="slow")
         else:
             (partial / "rgb").mkdir()
             for t, image in enumerate(clip.rgb):
@@ -236,18 +236,13 @@ def write_recording(
                 _write_png(partial / "depth" / f"{t:06d}.png", image)
         static = (clip.cam_from_world == clip.cam_from_world[0]).all()
         poses = clip.cam_from_world[0] if static else clip.cam_from_world
-        file = CameraFile(clip.camera, scale, _frame_rate(clip.stamp_s), clip.stamp_s, poses)
+        file = CameraFile(clip.camera, scale, frame_rate(clip.stamp_s), clip.stamp_s, poses)
         write_camera(file, partial / "camera.json")
         if target.exists():
             target.rmdir()
         partial.rename(target)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
-
-
-def _frame_rate(stamp_s: np.ndarray) -> float:
-    seconds = float(stamp_s[-1] - stamp_s[0])
-    return (len(stamp_s) - 1) / seconds if seconds > 0 else 30.0
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:

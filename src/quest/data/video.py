@@ -180,6 +180,12 @@ def _undecodable(path: Path, number: int, error: av.error.FFmpegError) -> Record
     )
 
 
+def frame_rate(stamp_s: Float[np.ndarray, " T"]) -> float:
+    """Frames per second by their times in seconds; 30 where these do not tell."""
+    seconds = float(stamp_s[-1] - stamp_s[0])
+    return (len(stamp_s) - 1) / seconds if seconds > 0 else 30.0
+
+
 def write_video(
     path: Path,
     frames: Iterable[UInt8[np.ndarray, "H W 3"]],

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from quest.data.video import write_video
+from quest.data.video import frame_rate, write_video
 from quest.errors import InputError
 from quest.types import Clip, State, Tracks
 from quest.viz.ink import (
@@ -47,9 +47,7 @@ def write_overlay(clip: Clip, tracks: Tracks, path: str | Path, *, trail_s: floa
         InputError: clip and tracks are of different length.
     """
     painter = OverlayPainter(clip, tracks, trail_s=trail_s)
-    seconds = float(clip.stamp_s[-1] - clip.stamp_s[0])
-    rate = (len(clip) - 1) / seconds if seconds > 0 else 30.0
-    write_video(Path(path), painter.frames(), frames_per_s=float(np.clip(rate, 1.0, 120.0)))
+    write_video(Path(path), painter.frames(), frames_per_s=float(np.clip(frame_rate(clip.stamp_s), 1.0, 120.0)))
 
 
 class OverlayPainter:
