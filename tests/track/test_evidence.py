@@ -15,12 +15,13 @@ from tests.tiny import DEFAULT, make_frames
 WALL_M = 1.5
 
 
-def evidence(log_p: torch.Tensor | None = None) -> tuple[FrameEvidence, float]:
-    """One frame that looks at a wall, and the metres of a reference unit."""
+def evidence(log_p: torch.Tensor | None = None, *, padding_px: int = 0) -> tuple[FrameEvidence, float]:
+    """One frame that looks at a wall, padded left and right, and the metres of a reference unit."""
     frames = make_frames(batch=1, frames=1)
     frames = replace(frames, depth_m=torch.full_like(frames.depth_m, WALL_M))
     log_p = torch.zeros(DEFAULT.cells**2) if log_p is None else log_p
-    return FrameEvidence(frames, log_p, DEFAULT), float(frames.scale[0])
+    size = DEFAULT.encoder.image_size
+    return FrameEvidence(frames, log_p, DEFAULT, (padding_px, 0, size - padding_px, size)), float(frames.scale[0])
 
 
 def place(depth_m: float, *, x_px: float = 32.0) -> np.ndarray:
@@ -42,6 +43,12 @@ def test_nothing_is_known_where_nothing_is_seen():
     outside = place(1.5, x_px=-20.0)[None]
     assert np.isnan(frame.room(outside)).all()
     assert np.isnan(frame.ratio(outside)).all()
+
+
+def test_padding_says_nothing():
+    at = np.stack([place(1.5, x_px=x_px) for x_px in (7.0, 9.0)])
+    assert np.isnan(evidence(padding_px=8)[0].ratio(at)).tolist() == [True, False]
+    assert np.isfinite(evidence()[0].ratio(at)).all()
 
 
 def test_ratio_is_that_of_the_cell_to_chance():

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from quest.data.lerobot import CAMERA_KEY, POSE, STAMP, DepthRange
+from quest.data.video import frame_rate
 from quest.errors import InputError
 from quest.types import Clip, State, Take, Tracks
 
@@ -96,12 +97,10 @@ class Layout:
                 f"dataset: expected views named by letters, digits and underscores, got {bad or 'no view'}"
             )
         first = next(iter(episode.views.values()))
-        seconds = float(first.stamp_s[-1] - first.stamp_s[0])
-        rate = (len(first) - 1) / seconds if seconds > 0 else 30.0
         own_joints = 0 if episode.joint_position is None else episode.joint_position.shape[1]
         own_entities = max((len(tracks.names) for tracks in episode.tracks.values()), default=0)
         return cls(
-            fps=max(1, round(rate)) if fps is None else fps,
+            fps=max(1, round(frame_rate(first.stamp_s))) if fps is None else fps,
             sizes={name: clip.rgb.shape[1:3] for name, clip in episode.views.items()},
             cameras={name: asdict(clip.camera) for name, clip in episode.views.items()},
             deep=frozenset(name for name, clip in episode.views.items() if clip.depth_m is not None),

@@ -48,6 +48,12 @@ class Letterbox:
         return (self.size - width) // 2, (self.size - height) // 2
 
     @property
+    def picture_px(self) -> tuple[float, float, float, float]:
+        """Left, top, right and bottom edge of the image on the canvas; beyond them is padding."""
+        (left, top), (width, height) = self.pad_px, self._resized
+        return left, top, left + width, top + height
+
+    @property
     def camera(self) -> Camera:
         """Intrinsics of the canvas."""
         left, top = self.pad_px

@@ -35,18 +35,26 @@ class FrameEvidence:
         frames: the newest frame (B = T = 1).
         log_p: log probability of every cell of the heatmap.
         config: the network's.
+        picture_px: left, top, right and bottom edge of the image on the network's input; what is beyond is padding.
     """
 
-    def __init__(self, frames: FrameBatch, log_p: Float[Tensor, " C"], config: NetworkConfig) -> None:
+    def __init__(
+        self,
+        frames: FrameBatch,
+        log_p: Float[Tensor, " C"],
+        config: NetworkConfig,
+        picture_px: tuple[float, float, float, float],
+    ) -> None:
         self._frames = frames
         self._log_p = log_p
         self._config = config
+        self._corners_px = torch.tensor(picture_px, device=log_p.device).view(2, 2)
 
     def ratio(self, point: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
         """Log of how much likelier than a cell by chance each place is to show the query; NaN outside the image."""
         uv_px = self._frames.from_reference(self._tensor(point))[0]
         uv = uv_px / self._config.encoder.image_size
-        inside = ((uv >= 0) & (uv <= 1)).all(-1)
+        inside = ((uv_px >= self._corners_px[0]) & (uv_px <= self._corners_px[1])).all(-1)
         value = sample_grid(self._log_p[None, :, None], uv.nan_to_num(0.5), self._config.cells).squeeze(-1)
         value = torch.where(inside, value, torch.nan)[0].cpu().double().numpy()
         return value + math.log(self._config.cells**2)

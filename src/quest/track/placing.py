@@ -61,6 +61,7 @@ class Placer:
         prediction: the network's answers for the frame (B = T = 1).
         frames: the frame.
         network: its configuration.
+        picture_px: edges of the image on its input (see :class:`~quest.data.letterbox.Letterbox`).
         config: settings of tracking.
         elapsed: frames since the one before.
         now: time of the frame, in frames.
@@ -73,6 +74,7 @@ class Placer:
         frames: FrameBatch,
         *,
         network: NetworkConfig,
+        picture_px: tuple[float, float, float, float],
         config: TrackerConfig,
         elapsed: float,
         now: float,
@@ -82,7 +84,7 @@ class Placer:
         self._elapsed = elapsed
         self._now = now
         log_p = prediction.logits[0, 0].log_softmax(dim=-1)
-        self._evidence = [FrameEvidence(frames, log_p[k], network) for k in range(len(following))]
+        self._evidence = [FrameEvidence(frames, log_p[k], network, picture_px) for k in range(len(following))]
         self._seen = as_array(prediction.visible_logit[0, 0].sigmoid())
         self._right = as_array(prediction.right_logit[0, 0].sigmoid())
 

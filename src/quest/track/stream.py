@@ -276,7 +276,7 @@ class Stream:
         candidate = as_array(lift_near(prediction, frames, self._config.lift_tolerance))
         placer = Placer(
             following, prediction, frames, network=self._network.config, config=self._config,
-            elapsed=self._intake.elapsed, now=self._intake.now,
+            picture_px=self._intake.letterbox.picture_px, elapsed=self._intake.elapsed, now=self._intake.now,
         )  # fmt: skip
         placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:
