@@ -11,7 +11,7 @@ from quest.model.decoder import Prediction
 from quest.model.observation import FrameBatch
 from quest.track.following import Following
 from quest.track.grounded import Ground
-from quest.track.marks import marked
+from quest.track.marks import beside, marked
 from quest.track.settings import TrackerConfig
 from tests.tiny import make_frames
 
@@ -58,6 +58,18 @@ def test_without_depth_or_the_same_thing_in_sight_the_network_alone_answers(away
     assert query.asked_px is None
 
 
+def test_without_depth_pixels_are_those_that_were_asked_for():
+    frames, query, uv = plain_frames(0.0), make_query(), (ASKED_PX - 3)[None] / 64
+    shown = marked([query], np.full((1, 3), np.nan), make_prediction(ASKED_PX - 3), frames)
+    torch.testing.assert_close(beside([query], uv, shown, size=64) * 64, ASKED_PX[None])
+    torch.testing.assert_close(beside([query], uv + 0.25, shown, size=64) * 64, ASKED_PX[None] + 16)
+    # With depth the place tells, but for frames that have none.
+    query = make_query()
+    shown = marked([query], OWN, make_prediction(ASKED_PX - 3), plain_frames())
+    torch.testing.assert_close(beside([query], uv, shown, size=64), uv)
+    torch.testing.assert_close(beside([query], uv, np.full((1, 3), np.nan), size=64) * 64, ASKED_PX[None])
+
+
 def test_a_mark_turns_with_the_link(monkeypatch: pytest.MonkeyPatch):
     frames, query = plain_frames(), make_query()
     marked([query], OWN, make_prediction(ASKED_PX), frames)
@@ -82,5 +94,7 @@ def test_marks_are_saved_and_end_with_their_reference_frame():
     assert query.mark is not None
     assert again.mark is not None
     np.testing.assert_array_equal(again.mark, query.mark)
+    assert again.mark_px is not None
+    np.testing.assert_array_equal(again.mark_px, query.mark_px)
     again.forget_places(TrackerConfig())
     assert again.mark is None

@@ -254,6 +254,31 @@ class Binding:
         anchor = self._network.bind(observed, uv, point, label, valid, intent)
         self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)
 
+    def bind_again(self, observed: Observation, frames: FrameBatch, following: Sequence[Following]) -> None:
+        """Bind what was seen in the frame before anew where it was, as the reference frame is another.
+
+        Anchors that were made without depth do not match frames with it. What was hidden keeps its anchor, and is
+        searched for everywhere.
+
+        Args:
+            observed: the frame as observed (T = 1).
+            frames: the frame.
+            following: the queries, in the order of the anchors.
+        """
+        rows = [k for k, f in enumerate(following) if f.answer is not None and f.answer.visible]
+        if self.anchor is None or not rows:
+            return
+        again = [following[k] for k in rows]
+        uv_px = np.stack([f.answer.uv_px for f in again if f.answer is not None])
+        uv = torch.from_numpy(self._letterbox.to_canvas(uv_px) / self._network.config.encoder.image_size)
+        label = [LABELS.index(f.label) if f.label else UNKNOWN_LABEL for f in again]
+        intent = [INTENTS.index(f.intent) if f.intent else UNKNOWN_INTENT for f in again]
+        self._join(observed, frames, again, uv, torch.tensor(label), torch.tensor(intent))
+        order = [len(following) + rows.index(k) if k in rows else k for k in range(len(following))]
+        self.anchor = self.anchor.select(torch.tensor(order, device=self.anchor.content.device))
+        for query in again:
+            query.asked_px = None if query.mark_px is None else query.bound_px
+
     def _bind_learned(self, frame: int, slots: Slots, following: Sequence[Following]) -> list[Following]:
         """Queries take slots and keep them; the thresholds are those of anchored queries."""
         config, existence, label = self._config, slots.existence(self._config), slots.label

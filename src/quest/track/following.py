@@ -73,6 +73,7 @@ class Following:
         bound_px: the pixel of the network's input at which it was bound, until it is matched for the first time.
         asked_px: the user's pixel in the network's input, until the first answer.
         mark: from where it was first to the point under the user's pixel, reference frame; None if there was none.
+        mark_px: the same in pixels of the network's input, for what has no place; None if there was none.
     """
 
     query: int
@@ -96,11 +97,12 @@ class Following:
     bound_px: Float[Tensor, "2"] | None = None
     asked_px: Float[Tensor, "2"] | None = None
     mark: Float[np.ndarray, "3"] | None = None
+    mark_px: Float[np.ndarray, "2"] | None = None
 
     def forget_places(self, config: TrackerConfig) -> None:
         """Begin anew in another reference frame."""
         self.ground = Ground(config, fixed=self.ground.fixed)
-        self.belief, self.place, self.home, self.mark, self.held = None, None, None, None, False
+        self.belief, self.place, self.home, self.mark, self.born, self.held = None, None, None, None, None, False
         self.safe.clear()
         self.since_safe = self.refused = 0
         self.buried = False
@@ -150,6 +152,8 @@ class Following:
             found["home"] = self.home
         if self.mark is not None:
             found["mark"] = self.mark
+        if self.mark_px is not None:
+            found["mark_px"] = self.mark_px
         if self.born is not None:
             found["born"] = self.born.float().cpu().numpy()
         if self.answer is not None:
@@ -204,6 +208,7 @@ class Following:
             ground=Ground.restored(config, part(state, "ground.")),
             belief=belief,
             place=state.get("place"),
+            mark_px=state.get("mark_px"),
             home=state.get("home"),
             mark=state.get("mark"),
             held=bool(held),

@@ -20,6 +20,7 @@ from quest.model.observation import FrameBatch
 from quest.types import Camera
 
 NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
+DEPTH_BEGINS_FLAG = "depth begins: what is seen is bound again where it was seen"
 
 _FRAMES_PER_S = 30.0
 _MOST_FRAMES = 10.0
@@ -138,6 +139,8 @@ class Intake:
             self.flags += (NO_DEPTH_FLAG,)
         renewed = self.reference is None or (not self.reference.has_depth and self._framer.shows_depth(depth))
         if renewed:
+            if self.reference is not None:
+                self.flags += (DEPTH_BEGINS_FLAG,)
             self.reference = self._framer.reference(depth, pose)
         assert self.reference is not None
         # The same picture again is not looked at again.

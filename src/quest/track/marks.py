@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -38,23 +39,41 @@ def marked(
     for k, query in enumerate(following):
         if query.asked_px is not None:
             uv_px = prediction.uv[0, 0, k].float() * frames.depth_m.shape[-1]
-            query.mark = _mark(query.asked_px, uv_px, point[k], frames)
+            query.mark, query.mark_px = _marks(query.asked_px, uv_px, point[k], frames)
             query.asked_px = None
         if query.mark is not None:
             shown[k] = point[k] + _turned(query, point[k])
     return shown
 
 
-def _mark(
+def beside(
+    following: Sequence[Following], uv: Float[Tensor, "K 2"], point: Float[np.ndarray, "K 3"], *, size: int
+) -> Float[Tensor, "K 2"]:
+    """Pixels of the points that were asked for, where places do not tell: as far from the network's as at first.
+
+    Args:
+        following: the queries.
+        uv: where they are, in [0, 1]^2 of the input.
+        point: their places as :func:`marked` gives them; NaN where there is no depth.
+        size: of the input, pixels.
+    """
+    shift = np.zeros((len(following), 2))
+    for k, query in enumerate(following):
+        if query.mark_px is not None and (query.mark is None or not np.isfinite(point[k]).all()):
+            shift[k] = query.mark_px / size
+    return uv + torch.from_numpy(shift).to(uv)
+
+
+def _marks(
     asked_px: Float[Tensor, "2"], uv_px: Float[Tensor, "2"], own: Float[np.ndarray, "3"], frames: FrameBatch
-) -> Float[np.ndarray, "3"] | None:
-    """From the network's own point to the one under the user's pixel; None where that is not known."""
+) -> tuple[Float[np.ndarray, "3"] | None, Float[np.ndarray, "2"] | None]:
+    """From the network's own point to the one under the user's pixel, and from its pixel; None where not known."""
     asked_px = asked_px.to(uv_px)
     if float((uv_px - asked_px).norm()) > _SAME_THING_PX:
-        return None
+        return None, None
     at = asked_px[None, None, None]
     mark = frames.to_reference(at, frames.edge_depth_at(at))[0, 0, 0].cpu().double().numpy() - own
-    return mark if np.isfinite(mark).all() else None
+    return mark if np.isfinite(mark).all() else None, (asked_px - uv_px).cpu().double().numpy()
 
 
 def _turned(query: Following, place: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:

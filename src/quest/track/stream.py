@@ -23,7 +23,7 @@ from quest.track.expectation import joint_rows
 from quest.track.following import Answer, Following, part
 from quest.track.intake import Arrival, Intake
 from quest.track.lifting import lift_near
-from quest.track.marks import marked
+from quest.track.marks import beside, marked
 from quest.track.matching import match
 from quest.track.measuring import measure, no_signals
 from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
@@ -193,6 +193,8 @@ class Stream:
                 for following in self._following:
                     following.forget_places(self._config)
             observed, slots = self._network.observe(frames), None
+            if renewed:
+                self._binding.bind_again(observed, frames, self._following)
             learned = self._network.config.queries == "learned"
             while not learned and len(self._ring) < self._network.config.window - 1:
                 self._ring.append(observed)
@@ -283,6 +285,7 @@ class Stream:
             share(self._links, self._t, following, placed)
         shown = replace(placed, point=marked(following, placed.point, prediction, frames))
         uv, judged_uv = (self._project(p, frames, prediction) for p in (shown.point, placed.judged))
+        uv = beside(following, uv, shown.point, size=self._network.config.encoder.image_size)
         signals = measure(self._network, self._binding.anchor, self._ring[-1], prediction, placed, judged_uv, following)
         for k, query in enumerate(following):
             query.move(placed.point[k], held=bool(placed.held[k]), embedding=prediction.embedding[0, 0, k])
