@@ -52,8 +52,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(values).all() or min(self.fx, self.fy) <= 0:
-            raise InputError(f"camera: expected finite intrinsics with fx, fy > 0, got fx, fy, cx, cy = {values}")
+        if not np.isfinite(values).all() or self.fx < 0.01 * self.width or self.fy < 0.01 * self.height:  # 179 degrees
+            raise InputError(f"camera: expected intrinsics in pixels, fx, fy > 0.01 of the size, got {values}")
         if min(self.width, self.height) <= 0 or self.width % 1 or self.height % 1:
             raise InputError(f"camera: expected a size of > 0 whole pixels, got {self.width} x {self.height}")
         if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):

@@ -180,6 +180,10 @@ def test_export_names_what_is_torn(broken: Path, tmp_path: Path, capsys: pytest.
     assert quest("export", broken, "--out", tmp_path / "out") == 1
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["whole-v0.npz", "wrong-v0.npz"]
     assert "left out: take 'torn'" in capsys.readouterr().err
+    rotten = next(path for path in (broken / "whole.zarr" / "view_0" / "rgb" / "c").rglob("*") if path.is_file())
+    rotten.write_bytes(rotten.read_bytes()[:40] + b"x" + rotten.read_bytes()[41:])
+    assert quest("export", broken, "--out", tmp_path / "again") == 1
+    assert sorted(path.name for path in (tmp_path / "again").iterdir()) == ["wrong-v0.npz"]
 
 
 def test_export_to_lerobot(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

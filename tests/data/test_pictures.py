@@ -44,6 +44,32 @@ def test_depth_beside_turned_images_is_refused(tmp_path: Path):
     assert len(read_recording(tmp_path, camera=ACROSS)) == 2
 
 
+def test_depth_goes_with_the_colours_of_its_name(tmp_path: Path):
+    (tmp_path / "depth").mkdir()
+    for t in range(4):
+        save(tmp_path / "rgb" / f"{t}.png", 1)
+        Image.fromarray(np.full((48, 64), 1000 + t, np.uint16)).save(tmp_path / "depth" / f"{t}.png")
+    (tmp_path / "rgb" / "1.png").unlink()
+    with pytest.raises(RecordingError, match="4 depth images for 3 colour frames, and 1 has no colours"):
+        read_recording(tmp_path, camera=ACROSS)
+    (tmp_path / "depth" / "2.png").unlink()
+    with pytest.raises(RecordingError, match="3 depth images for 3 colour frames, and 1 has no colours"):
+        read_recording(tmp_path, camera=ACROSS)
+    for path in (tmp_path / "depth").iterdir():  # names of another kind: by order
+        path.rename(path.with_name(f"depth{path.name}"))
+    assert len(read_recording(tmp_path, camera=ACROSS)) == 3
+    for path in (tmp_path / "depth").iterdir():
+        path.rename(path.with_suffix(".npy"))
+    with pytest.raises(RecordingError, match=r"expected 16-bit PNG images, got files such as depth0\.npy"):
+        read_recording(tmp_path, camera=ACROSS)
+
+
+def test_names_that_are_times_are_in_their_order(tmp_path: Path):
+    for level, name in enumerate(("10", "10.0667", "10.2", "10.5", "9.75")):
+        Image.fromarray(np.full((48, 64, 3), level, np.uint8)).save(tmp_path / f"{name}.png")
+    assert read_recording(tmp_path, camera=ACROSS).rgb[:, 0, 0, 0].tolist() == [4, 0, 1, 2, 3]
+
+
 def test_deep_grey_keeps_its_higher_byte(tmp_path: Path):
     grey = np.random.default_rng(1).integers(0, 65536, (48, 64)).astype(np.uint16)
     Image.fromarray(grey).save(tmp_path / "0.png")

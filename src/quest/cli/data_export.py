@@ -31,7 +31,7 @@ class DataExport:
 
     def run(self) -> int:
         """Write and say what was written."""
-        from quest.cli.takes import open_takes, say_torn
+        from quest.cli.takes import open_takes, say_left_out, say_torn
         from quest.errors import TakeError
 
         store, names = open_takes(self.takes)
@@ -44,7 +44,14 @@ class DataExport:
             return 1 if torn else 0
         write = _write_tapvid3d if self.format == "tapvid3d" else _write_mcap
         for name in chosen:
-            for path in write(store.read(name), self.out):
+            try:
+                take = store.read(name)
+            except TakeError as error:
+                if names is not None:
+                    raise
+                torn += say_left_out(str(error))
+                continue
+            for path in write(take, self.out):
                 print(path)
         return 1 if torn else 0
 

@@ -204,6 +204,13 @@ class Generate:
             raise ConfigError(f"generate: expected --procedural of at least 0, got {self.procedural}")
         if self.procedural or self.seeds:
             first, last = _seed_range(self.seeds) if self.seeds else split.procedural_seeds[self.split or "train"]
+            if self.seeds and self.split is not None:
+                low, high = split.procedural_seeds[self.split]
+                if not low <= first <= last <= high:
+                    raise ConfigError(
+                        f"generate: --seeds {self.seeds} are not {self.split} seeds, which are {low}..{high}; name "
+                        "such, or leave --split away"
+                    )
             count = self.procedural or last - first + 1
             if count > last - first + 1:
                 raise ConfigError(f"generate: {count} procedural objects do not fit into seeds {first}..{last}")
@@ -221,6 +228,7 @@ class Generate:
 
 def _seed_range(text: str) -> tuple[int, int]:
     first, dots, last = text.partition("..")
-    if not (dots and first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
-        raise ConfigError(f"generate: expected --seeds A..B with 0 <= A <= B, got {text!r}")
+    last = last if dots else first
+    if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
+        raise ConfigError(f"generate: expected --seeds A..B, or one seed, with 0 <= A <= B, got {text!r}")
     return int(first), int(last)

@@ -62,12 +62,15 @@ def write_picture(sheet: np.ndarray, out: Path) -> None:
 
 def say_torn(stores: Iterable[TakeStore]) -> int:
     """Print on standard error what is wrong with takes that cannot be read and are left out; tells how many."""
+    return sum(say_left_out(problem) for store in stores for problem in store.problems().values())
+
+
+def say_left_out(problem: str) -> int:
+    """Print on standard error what is wrong with one take; tells that it is one."""
     from rich.console import Console
 
-    problems = [problem for store in stores for problem in store.problems().values()]
-    for problem in problems:
-        Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"left out: {problem}")
-    return len(problems)
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"left out: {problem}")
+    return 1
 
 
 def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -89,6 +89,7 @@ def open_folder(
     if depth is not None or folder.exists():
         depths = _list_depth(folder)
         if colours.video is None:
+            _check_partners(folder, depths, colours.images)
             _check_depth_number(folder, len(depths), len(colours.images))
         if not depths:
             _check_depth_number(folder, 0, colours.number or 0)
@@ -167,6 +168,18 @@ def _check_numbers(source: Path, setup: CameraFile, frames: int) -> None:
             raise RecordingError(f"recording {source}: {what} of the camera is for {number} frames, expected {frames}")
 
 
+def _check_partners(folder: Path, depths: Sequence[Path], images: Sequence[Path]) -> None:
+    """Where depth images are named as colours are, each must have its own; where none is, they go in order."""
+    depth_of, colour_of = ({path.stem for path in paths} for paths in (depths, images))
+    alone = sorted(depth_of ^ colour_of)
+    if alone and depth_of & colour_of:
+        what = "colours" if alone[0] in depth_of else "depth"
+        raise RecordingError(
+            f"depth {folder}: {len(depths)} depth images for {len(images)} colour frames, and {alone[0]} has no "
+            f"{what}; expected one for each, drop frames without a partner"
+        )
+
+
 def _check_depth_number(folder: Path, depths: int, frames: int) -> None:
     if depths != frames:
         raise RecordingError(
@@ -178,7 +191,11 @@ def _check_depth_number(folder: Path, depths: int, frames: int) -> None:
 def _list_depth(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise RecordingError(f"depth {folder}: no such folder; expected one 16-bit PNG per colour frame")
-    return _list_images(folder, (".png",))
+    found = _list_images(folder, (".png",))
+    others = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    if others and not found:
+        raise RecordingError(f"depth {folder}: expected 16-bit PNG images, got files such as {others[0]}; convert them")
+    return found
 
 
 def _read_depth(path: Path, rig: Rig, scale_m: float) -> np.ndarray:
@@ -203,8 +220,10 @@ def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(paths, key=_natural)
 
 
-def _natural(path: Path) -> list[tuple[int, int, str]]:
-    """Sorts frame 2 before frame 10."""
+def _natural(path: Path) -> Sequence[tuple[float, float, str]]:
+    """Sorts frame 2 before frame 10, and names that are times by these."""
+    if re.fullmatch(r"\d+\.\d+", path.stem):
+        return [(0, 0, ""), (1, float(path.stem), ""), (0, 0, ""), (0, 0, path.suffix)]
     parts = re.split(r"(\d+)", path.stem)
     return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts] + [(0, 0, path.suffix)]
 

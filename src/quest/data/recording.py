@@ -179,10 +179,12 @@ def clip_from_arrays(
         cam_from_world: pose per frame; identities by default.
 
     Raises:
-        InputError: shapes contradict each other, times decrease, or there are no frames; as RecordingError if the
-            depth is in the wrong units (millimetres, say).
+        InputError: shapes contradict each other, times decrease, there are no frames or no frame rate; as
+            RecordingError if the depth is in the wrong units (millimetres, say).
     """
     frames = len(rgb)
+    if stamp_s is None and not 0 < frames_per_s < np.inf:
+        raise InputError(f"clip {name!r}: expected frames_per_s > 0, got {frames_per_s}")
     stamps = np.arange(frames) / frames_per_s if stamp_s is None else np.asarray(stamp_s, dtype=np.float64)
     poses = np.tile(np.eye(4), (frames, 1, 1)) if cam_from_world is None else cam_from_world
     clean = None if depth_m is None else clean_depth(depth_m)

@@ -85,7 +85,7 @@ def verify_take(store: TakeStore, name: str) -> TakeReport:
     try:
         header = store.header(name)
         truth = store.read(name, views=[])
-        checks = tuple(_check_take(store, header, truth))
+        checks = tuple(_check_take(store, name, header, truth))
     except QuestError as error:
         return TakeReport(name, 0, 0, (), " ".join(str(error).split()))
     return TakeReport(name, header.frames, len(header.cameras), checks)
@@ -108,14 +108,14 @@ def verify_store(
     return StoreReport(tuple(done))
 
 
-def _check_take(store: TakeStore, header: TakeHeader, truth: Take) -> Iterator[Check]:
+def _check_take(store: TakeStore, name: str, header: TakeHeader, truth: Take) -> Iterator[Check]:
     digest = TakeHash(header.info, header.cameras)
     for path, array in take_arrays(truth):
         digest.add(path, array)
     checks = list(check_truth(truth))
     computable = all(check.passed for check in checks if check.name in ("indices", "finite"))
     for v in range(len(header.cameras)):
-        view = store.read_view(header.info.name, v)
+        view = store.read_view(name, v)
         for path, array in _view_arrays(truth, view):
             digest.add(f"view_{v}/{path}", array)
         if computable:

@@ -78,16 +78,27 @@ class Binding:
         self._network = network
         self._config = config
         self._letterbox = letterbox
+        if isinstance(queries, Query | str):
+            raise InputError(f"queries: expected a list of them, got {queries!r}")
         for query in queries or ():
             self.ask(query, frame=0)
 
-    def ask(self, query: Query, *, frame: int) -> int:
+    def ask(self, query: Query, *, frame: int, following: Sequence[Following] = ()) -> int:
         """Ask for one more entity from a frame on; returns the query's number.
 
+        Args:
+            query: what to follow.
+            frame: from which on.
+            following: queries that have found theirs.
+
         Raises:
-            InputError: a point query lies outside the image or in a frame that has passed, or a query asks for an
-                intent of a network that knows none.
+            InputError: a point query lies outside the image or in a frame that has passed, a query asks for an intent
+                of a network that knows none, has the name of another one, or is none.
         """
+        if not isinstance(query, Query):
+            raise InputError(f"queries: expected Query.point(…), Query.semantic(…) or Query.slot(), got {query!r}")
+        if query.name and query.name in self.names(following).values():
+            raise InputError(f"query {query.name!r}: another query is called so already; choose another name")
         network = self._network.config
         if query.intent is not None and not (network.intents and network.queries == "anchored"):
             raise InputError(

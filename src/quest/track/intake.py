@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
+from quest.data.frame_source import PLAUSIBLE_DEPTH_M
 from quest.data.letterbox import Letterbox
 from quest.errors import InputError
 from quest.geometry.poses import is_rigid, nearest_rigid
@@ -25,6 +26,7 @@ DEPTH_BEGINS_FLAG = "depth begins: what is seen is bound again where it was seen
 _FRAMES_PER_S = 30.0
 _MOST_FRAMES = 10.0
 _CLOCK_RESTART_S = 5.0
+_LEAST_DEPTHS = 16
 
 
 class Arrival(Enum):
@@ -76,18 +78,23 @@ class Intake:
         """Refuse what no camera sends.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
-                rigid.
+            InputError: the frame does not have the camera's size or type, its stamp is not finite, its pose is not
+                rigid, or the first depth is not in metres.
         """
         camera = self.letterbox.source
         expected = (camera.height, camera.width, 3)
         if rgb.shape != expected or rgb.dtype != np.uint8:
             raise InputError(f"frame {frame}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
-        if depth_m is not None and (depth_m.shape != expected[:2] or not np.issubdtype(depth_m.dtype, np.floating)):
+        if depth_m is not None and depth_m.shape != expected[:2]:
+            raise InputError(f"frame {frame}: expected depth of the colours' size {expected[:2]}, got {depth_m.shape}")
+        if depth_m is not None and not np.issubdtype(depth_m.dtype, np.floating):
             raise InputError(
-                f"frame {frame}: expected depth {expected[:2]} in metres as float, got {depth_m.shape} of "
-                f"{depth_m.dtype}; multiply raw units by their size in metres"
+                f"frame {frame}: expected depth in metres as float, got {depth_m.dtype}; multiply raw units by their "
+                "size in metres"
             )
+        median_m = None if depth_m is None or self._has_depth else _implausible(depth_m)
+        if median_m is not None:
+            raise InputError(f"frame {frame}: expected depth in metres, got {median_m:.3g} in the median")
         if not np.isfinite(stamp_s):
             raise InputError(f"frame {frame}: expected a finite time stamp in seconds, got {stamp_s}")
         pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
@@ -133,6 +140,10 @@ class Intake:
 
         The reference frame is made at the first frame, and again at the first that brings depth.
         """
+        median_m = None if depth_m is None else _implausible(depth_m)
+        if median_m is not None:
+            self.flags += (f"depth ignored: {median_m:.3g} m in the median",)
+            depth_m = None
         depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
         pose = torch.from_numpy(self._pose_of(cam_from_world))
         if not (depth > 0).any():
@@ -147,6 +158,10 @@ class Intake:
         frames = self._framer.frame(self.letterbox.rgb(rgb), depth, pose, self.reference, features=self._features)
         self._features = frames.features
         return frames, renewed
+
+    @property
+    def _has_depth(self) -> bool:
+        return self.reference is not None and self.reference.has_depth
 
     def _pose_of(self, cam_from_world: np.ndarray | None) -> np.ndarray:
         """The frame's pose; where a posed stream misses one, the last one.
@@ -189,3 +204,13 @@ class Intake:
                 torch.from_numpy(state["reference.scale"]).to(self._device),
                 bool(state["reference.has_depth"]),
             )
+
+
+def _implausible(depth_m: Float32[np.ndarray, "H W"]) -> float | None:
+    """The median of depth that no camera sees in metres; None where it is plausible, or hardly any is there."""
+    sample = depth_m[::8, ::8]
+    valid = sample[np.isfinite(sample) & (sample > 0)]
+    if len(valid) < _LEAST_DEPTHS:
+        return None
+    median_m, (low, high) = float(np.median(valid)), PLAUSIBLE_DEPTH_M
+    return None if low <= median_m <= high else median_m

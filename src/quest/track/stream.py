@@ -113,9 +113,9 @@ class Stream:
         """Follow one more entity from the next frame on; returns the query's number.
 
         Raises:
-            InputError: a point query lies outside the image or in a frame that has passed.
+            InputError: a point query lies outside the image or in a frame that has passed, or its name is taken.
         """
-        return self._binding.ask(query, frame=self._t)
+        return self._binding.ask(query, frame=self._t, following=self._following)
 
     def retire(self, query: int | str) -> None:
         """Follow a query no longer, by its number or name.

@@ -162,15 +162,15 @@ class Tracker:
             alpha_frames: as in :meth:`stream`; ``len(clip)`` shares alpha among all parts of the clip alike.
 
         Raises:
-            InputError: a point query lies outside the clip.
+            InputError: a point query lies outside the clip, or two queries have one name.
             ConfigError: alpha is no probability, or there are no frames.
         """
+        stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
         for query in queries or ():
             if query.frame >= len(clip):
                 raise InputError(
                     f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames"
                 )
-        stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
         states = []
         for t in range(len(clip)):
             frame = clip.frame(t)
