@@ -119,6 +119,8 @@ def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, c
         (["--point", "77,2,3"], "77"),
         (["--view", "7"], "view"),
         (["--device", "abacus"], "abacus"),
+        (["--alpha", "0"], "--alpha"),
+        (["--alpha-frames", "0"], "--alpha-frames"),
         (["--weights", "none.safetensors"], "none.safetensors"),
         (["--out", __file__], "cannot be made a folder"),
         (["--out", "/proc"], "not be written to"),

@@ -34,10 +34,6 @@ class Monitor(Source):
     Without queries the entities are discovered. Exit code: 0 if no alarm is open at the end, 3 if one is.
     """
 
-    alpha: float = 0.05
-    """Share of streams without any loss that may raise an alarm."""
-    alpha_frames: int | None = None
-    """--alpha is for every so many frames instead, such as 300, so that alarms come as readily late as early."""
     jsonl: Path | None = None
     """Write one JSON object per frame to this file; - is standard output, and then the view goes to standard error."""
     realtime: bool = False
@@ -50,14 +46,11 @@ class Monitor(Source):
             ConfigError: alpha is no probability, or there are no frames.
             InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
         """
-        from quest.errors import ConfigError, InputError
+        from quest.errors import InputError
         from quest.track.state_lines import StateLines
         from quest.viz.live import LiveView, query_words
 
-        if not 0.0 < self.alpha < 1.0:
-            raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
-        if self.alpha_frames is not None and self.alpha_frames < 1:
-            raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
+        self.check_alpha()
         console = self._console()
         source = self.open()
         length = source.length
@@ -71,10 +64,7 @@ class Monitor(Source):
                 f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
                 "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
             )
-        elif tracker.calibration is not None and (
-            shortfall := tracker.calibration.shortfall(stream.budget, frames=length)
-        ):
-            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {shortfall}; `quest weights calibrate`")
+        self.say_shortfall(tracker, console, frames=length)
         view = LiveView(console, name=source.name, frames=length if source.exact else None, budget=stream.budget)
         state, last = None, -1
         try:

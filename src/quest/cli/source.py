@@ -46,6 +46,10 @@ class Source:
     """What to read of a LeRobot dataset or a bag."""
     device: str = "auto"
     """cpu, cuda, mps or auto."""
+    alpha: float = 0.05
+    """Share of streams without any loss that may raise an alarm."""
+    alpha_frames: int | None = None
+    """--alpha is for every so many frames instead, such as 300, so that alarms come as readily late as early."""
 
     def open(self) -> FrameSource:
         """The recording or the view of a take, to be read frame by frame.
@@ -124,6 +128,29 @@ class Source:
             label, _, intent = text.partition(":")
             queries.append(Query.semantic(label, intent=intent or None))
         return queries or None
+
+    def check_alpha(self) -> None:
+        """Raise ConfigError unless alpha is a probability, of some frames if it is of frames."""
+        from quest.errors import ConfigError
+
+        if not 0.0 < self.alpha < 1.0:
+            raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
+        if self.alpha_frames is not None and self.alpha_frames < 1:
+            raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
+
+    def say_shortfall(self, tracker: Tracker, console: Console, *, frames: int | None) -> None:
+        """Print which alarms there will never be, if the monitor's calibration is too small for some.
+
+        Args:
+            tracker: with the weights.
+            console: to print on.
+            frames: length of the recording, if it is known.
+        """
+        from quest.monitor import Budget
+
+        budget = Budget(self.alpha, self.alpha_frames)
+        if tracker.calibration is not None and (told := tracker.calibration.shortfall(budget, frames=frames)):
+            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {told}; `quest weights calibrate`")
 
     def tracker(self) -> Tracker:
         """The tracker of the weights.

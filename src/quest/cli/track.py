@@ -33,6 +33,7 @@ class Track(Source):
         from quest.errors import InputError
         from quest.viz.overlay import write_overlay
 
+        self.check_alpha()
         console = Console(highlight=False)
         clip = self.read()
         queries = self.queries(clip)
@@ -46,9 +47,10 @@ class Track(Source):
                 f"--out {out}: cannot be made a folder, or not be written to ({error.strerror}); name another"
             ) from error
         with console.status(f"tracking {len(clip)} frames on {tracker.device}"):
-            tracks = tracker.track(clip, queries)
+            tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
         write_tracks(tracks, out / "tracks.parquet")
         console.print(_summary(clip, tracks))
+        self.say_shortfall(tracker, console, frames=len(clip))
         for flag in tracks.frame_flags:
             console.print(f"[yellow]note:[/] {escape(flag)}")
         console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")

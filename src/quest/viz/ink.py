@@ -6,6 +6,7 @@ the same words on every frame.
 
 from __future__ import annotations
 
+import unicodedata
 from functools import lru_cache
 from typing import Literal
 
@@ -159,9 +160,15 @@ def _font(size: int) -> ImageFont.FreeTypeFont:
     return font
 
 
+def _drawable(text: str) -> str:
+    """What Pillow's own font has letters for: without accents, a question mark for what has no such letter."""
+    plain = (unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode() or "?" for letter in text)
+    return text if text.isascii() else "".join(plain)
+
+
 @lru_cache(maxsize=4096)
 def _text_mask(text: str, size: int) -> np.ndarray:
-    font = _font(size)
+    font, text = _font(size), _drawable(text)
     ascent, descent = font.getmetrics()
     width = max(1, int(np.ceil(font.getlength(text))) + 1)
     image = Image.new("L", (width, ascent + descent))
