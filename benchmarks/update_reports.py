@@ -201,6 +201,8 @@ TABLES = (
             "p90": "axis_p90_deg",
         },
     ),
+    _tracking("fine_tune/before.json", "The tool chest of examples/fine_tune.py, shipped weights"),
+    _tracking("fine_tune/after.json", "The same takes, weights that were fitted to it"),
     _tracking("levels/test.json", "Levels 1 to 4 of the same objects"),
     _tracking("robust/test.json", "Noise on the colours, and a camera position never trained on"),
     _intents("intents", "Open and lift: two places of one label on one thing, both asked for"),
