@@ -220,12 +220,14 @@ def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
     return sorted(paths, key=_natural)
 
 
-def _natural(path: Path) -> Sequence[tuple[float, float, str]]:
+def _natural(path: Path) -> list[tuple[float, float, str]]:
     """Sorts frame 2 before frame 10, and names that are times by these."""
-    if re.fullmatch(r"\d+\.\d+", path.stem):
-        return [(0, 0, ""), (1, float(path.stem), ""), (0, 0, ""), (0, 0, path.suffix)]
-    parts = re.split(r"(\d+)", path.stem)
-    return [(1, int(part), "") if part.isdecimal() else (0, 0, part) for part in parts] + [(0, 0, path.suffix)]
+    time = re.fullmatch(r"\d+\.\d+", path.stem)
+    parts = ["", path.stem, ""] if time else re.split(r"(\d+)", path.stem)
+    key: list[tuple[float, float, str]] = []
+    for part in parts:
+        key.append((1, float(part), "") if (time and part) or part.isdecimal() else (0, 0, part))
+    return [*key, (0, 0, path.suffix)]
 
 
 def _open_image(path: Path) -> Image.Image:
