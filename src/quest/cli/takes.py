@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import uuid
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -45,19 +43,16 @@ def write_picture(sheet: np.ndarray, out: Path) -> None:
     from PIL import Image
 
     from quest.errors import ConfigError
+    from quest.whole_file import whole_file
 
-    out.parent.mkdir(parents=True, exist_ok=True)
-    partial = out.with_name(f".{uuid.uuid4().hex[:8]}.partial{out.suffix}")
     try:
-        Image.fromarray(sheet).save(partial)
-        os.replace(partial, out)
+        with whole_file(out) as partial:
+            Image.fromarray(sheet).save(partial)
     except (ValueError, OSError) as error:
         if isinstance(error, OSError) and error.errno is not None:
             raise
         size = f"{sheet.shape[1]} x {sheet.shape[0]} px"
         raise ConfigError(f"{out}: {size} are too many for {out.suffix} ({error}); use .png, or draw less") from error
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def say_torn(stores: Iterable[TakeStore]) -> int:

@@ -21,7 +21,6 @@ Reference: Koppula et al. (2024), TAPVid-3D: A Benchmark for Tracking Any Point 
 from __future__ import annotations
 
 import io
-import os
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +29,7 @@ from PIL import Image
 
 from quest.errors import InputError
 from quest.types import Take, View
+from quest.whole_file import whole_file
 
 
 def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95) -> list[Path]:
@@ -56,13 +56,8 @@ def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95) -
         if len(arrays["queries_xyt"]) == 0:
             continue
         path = folder / f"{take.info.name}-v{v}.npz"
-        partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
-        try:
-            with partial.open("wb") as file:
-                np.savez(file, allow_pickle=False, **arrays)
-            partial.replace(path)
-        finally:
-            partial.unlink(missing_ok=True)
+        with whole_file(path) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
         written.append(path)
     return written
 

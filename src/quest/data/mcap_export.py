@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +15,7 @@ from quest.data.frame_source import clean_depth
 from quest.errors import InputError
 from quest.extras import require
 from quest.types import Camera, Clip, Tracks
+from quest.whole_file import whole_file
 
 WORLD = "world"
 CAMERA = "camera_color_optical_frame"
@@ -60,21 +60,14 @@ def export_mcap(
         raise InputError(f"clip {clip.name!r}: MCAP has no times before 0, got {clip.stamp_s[0]} s; shift the stamps")
     if tracks is not None and len(tracks) != len(clip):
         raise InputError(f"clip {clip.name!r}: tracks of {len(tracks)} frames for a clip of {len(clip)}")
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
-    try:
-        with partial.open("wb") as file, writer_module.Writer(file) as writer:
-            send = _sender(writer)
-            for t in range(len(clip)):
-                stamp_ns = round(float(clip.stamp_s[t]) * 1e9)
-                for topic, kind, message in _messages(clip, t, stamp_ns, rgb, depth, quality):
-                    send(topic, kind, message, stamp_ns)
-                if tracks is not None:
-                    send(TRACKS, "visualization_msgs/msg/MarkerArray", _markers(tracks, t, stamp_ns), stamp_ns)
-        partial.replace(target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(Path(path)) as partial, partial.open("wb") as file, writer_module.Writer(file) as writer:
+        send = _sender(writer)
+        for t in range(len(clip)):
+            stamp_ns = round(float(clip.stamp_s[t]) * 1e9)
+            for topic, kind, message in _messages(clip, t, stamp_ns, rgb, depth, quality):
+                send(topic, kind, message, stamp_ns)
+            if tracks is not None:
+                send(TRACKS, "visualization_msgs/msg/MarkerArray", _markers(tracks, t, stamp_ns), stamp_ns)
 
 
 def _sender(writer: Any) -> Callable[[str, str, dict, int], None]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
-import uuid
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +11,7 @@ import pyarrow.parquet as pq
 
 from quest.errors import InputError
 from quest.types import Joints, State, Tracks
+from quest.whole_file import whole_file
 
 VERSION = 2
 _METADATA_KEY = b"quest-tracks"
@@ -77,15 +76,8 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
         "joints": None if tracks.joints is None else _joints_to_json(tracks.joints),
     }
     schema = SCHEMA.with_metadata({_METADATA_KEY: json.dumps(metadata).encode()})
-    target = Path(path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
-    try:
-        with partial.open("wb") as file:  # not by its path, which may be no UTF-8
-            pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
+    with whole_file(Path(path)) as partial, partial.open("wb") as file:  # not by its path, which may be no UTF-8
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
 
 
 def read_tracks(path: str | Path) -> Tracks:

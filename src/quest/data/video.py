@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, Shaped, UInt8, UInt16
 
 from quest.errors import InputError, RecordingError
+from quest.whole_file import whole_file
 
 SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v")
 """Suffixes by which a video is recognised in a folder; any other that FFmpeg knows can be named explicitly."""
@@ -252,9 +252,8 @@ class _Codec:
 
 def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec: _Codec) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:8]}{path.suffix}")
     written, size = 0, None
-    try:
+    with whole_file(path) as partial:
         with av.open(str(partial.resolve()), "w") as container:
             rate = Fraction(float(frames_per_s)).limit_denominator(1001)
             stream = container.add_stream(codec.encoder, rate=rate, options=codec.options)
@@ -273,7 +272,4 @@ def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec
                 container.mux(stream.encode(None))
         if not written:
             raise InputError(f"video {path}: expected at least one frame, got none")
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
     return written

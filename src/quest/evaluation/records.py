@@ -5,7 +5,6 @@ Every number in a table can be computed again from these; they are stored as Par
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -17,6 +16,7 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float32, Int16
 
 from quest.errors import InputError
+from quest.whole_file import whole_file
 
 
 @dataclass(frozen=True)
@@ -133,12 +133,8 @@ def write_records(records: Sequence[EntityRecord], path: Path, *, about: Mapping
     for name, dtype in _PER_FRAME.items():
         item = pa.from_numpy_dtype(dtype)
         arrays[name] = pa.array([getattr(r, name) for r in records], type=pa.list_(item))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        pq.write_table(pa.table(arrays).replace_schema_metadata(about), temporary, compression="zstd")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        pq.write_table(pa.table(arrays).replace_schema_metadata(about), partial, compression="zstd")
 
 
 def read_records(path: str | Path) -> tuple[EntityRecord, ...]:

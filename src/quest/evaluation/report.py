@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import sys
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.records import EntityRecord, read_records
 from quest.evaluation.results import Run, read_results
+from quest.whole_file import whole_file
 
 RECORDS_SUFFIX = ".records.parquet"
 
@@ -95,13 +95,8 @@ def write_report(report: dict[str, Any], path: Path) -> None:
         report: plain values and origins.
         path: the file; its folder is made.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def origins_json(origins: Sequence[Origin]) -> list[dict[str, Any]]:

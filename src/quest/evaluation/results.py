@@ -20,6 +20,7 @@ from quest.evaluation.records import (
     write_records,
 )
 from quest.evaluation.summary import Metrics, Row
+from quest.whole_file import whole_file
 
 FORMAT = 1
 """Version of the result file."""
@@ -112,15 +113,10 @@ def write_results(results: Results, path: str | Path, *, records: tuple[EntityRe
         "unscored": [asdict(u) for u in results.unscored],
     }
     text = json.dumps(raw, indent=1, allow_nan=False)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("w", encoding="utf-8") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.write(text + "\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def read_results(path: str | Path) -> Results:

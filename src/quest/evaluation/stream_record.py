@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -23,6 +22,7 @@ from quest.monitor.calibration import Unit
 from quest.track import Tracker
 from quest.track.settings import REVISION
 from quest.types import Query, Take
+from quest.whole_file import whole_file
 
 LIFTING_PX = 8.0
 """A seen entity whose pixel is this near to the true one is not lost, whatever its 3D point: pixels of the input."""
@@ -251,17 +251,11 @@ def record_streams(
 
 def write_record(record: StreamRecord | None, path: Path, *, made_by: str, take_hash: str) -> None:
     """Write a record whole or not at all; None leaves a mark that the stream has nothing to follow."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     values: dict[str, Any] = {"format": np.array(FORMAT), "made_by": np.array(made_by)}
     values["take_hash"] = np.array(take_hash)
     values |= {} if record is None else {f.name: np.asarray(getattr(record, f.name)) for f in fields(StreamRecord)}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, **values)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with whole_file(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **values)
 
 
 def read_records(folder: str | Path, *, made_by: str) -> tuple[StreamRecord, ...]:

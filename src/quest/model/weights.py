@@ -198,7 +198,6 @@ def save_network(
     if beside is not None:
         tensors, shared = leave_out(tensors, beside)
         metadata |= shared
-    path.parent.mkdir(parents=True, exist_ok=True)
     save_tensors(tensors, path, metadata=metadata)
 
 

@@ -20,6 +20,7 @@ from quest.errors import ConfigError
 from quest.extras import require
 from quest.types import LABELS, Take, View
 from quest.viz.palette import HELD, LINE, MUTED, RGB, query_colour
+from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
     import rerun as rr
@@ -41,18 +42,12 @@ def save_rrd(take: Take, path: str | Path, *, every: int = 1) -> None:
     Raises:
         MissingExtraError: the extra ``viz`` is not installed.
     """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
     recording = _new_recording(take)
-    try:
+    with whole_file(Path(path)) as partial:
         recording.save(partial, default_blueprint=take_blueprint(take))
         log_take(take, recording, every=every)
         recording.flush()
         recording.disconnect()
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def open_viewer(take: Take, *, every: int = 1) -> None:
