@@ -11,7 +11,7 @@ import torch
 from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
 from quest.model.decoder import Prediction
-from quest.model.flow_head import FlowHead
+from quest.model.flow_head import REST, FlowHead
 from tests.tiny import DEFAULT, PAPER, make_frames, make_network
 
 CONFIGS = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
@@ -41,6 +41,26 @@ def test_one_displacement_per_query(config: NetworkConfig):
     assert flow.shape == (2, 3, 3)
     assert flow.isfinite().all()
     assert (flow != 0).any()
+
+
+@CONFIGS
+def test_what_hardly_moves_rests(config: NetworkConfig):
+    """Each query by itself, and not while the head learns."""
+    head, (embedding, point) = lively(config), inputs(config)
+    raw = head.train()(embedding, point)
+    length = raw.norm(dim=-1)
+    with torch.no_grad():
+        final = head.out[-1]
+        assert isinstance(final, torch.nn.Linear)
+        shrink = REST / length.median()
+        final.weight *= shrink
+        final.bias *= shrink
+    raw, settled = head(embedding, point), head.eval()(embedding, point)
+    still = raw.norm(dim=-1) < REST
+    assert still.any()
+    assert not still.all()
+    assert (settled[still] == 0).all()
+    assert (settled[~still] == raw[~still]).all()
 
 
 @CONFIGS

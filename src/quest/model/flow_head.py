@@ -2,7 +2,8 @@
 
 The frame after it is one step on, and a step is whatever lies between the frames of the window: the head is told of no
 clock, it sees motion per step and answers for one more. What moves at an even pace needs no more than that, so the
-answer is made of the steps that were seen, each with a weight of its own, and of a free rest.
+answer is made of the steps that were seen, each with a weight of its own, and of a free rest. Most things rest most of
+the time, and a head is never quite still: what it answers below :data:`REST` is rest, but while it learns.
 """
 
 from __future__ import annotations
@@ -13,6 +14,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from quest.model.config import NetworkConfig
+
+REST = 0.003
+"""Displacements shorter than this, in units of the reference frame, are answered as 0."""
 
 
 class FlowHead(nn.Module):
@@ -53,13 +57,16 @@ class FlowHead(nn.Module):
         x = F.gelu(self.frame(self.norm(embedding)) + self.age[:, None])
         x = self.fuse(x.transpose(1, 2).flatten(2))
         if self.steps is None:
-            return self.out(x).float()
+            return self._settled(self.out(x).float())
         step, seen = _steps(point)
         # Twice, so that a thousandth and a tenth of the reference frame are both of a size that a layer can read.
         code = torch.cat((10 * step.clamp(-1, 1), (100 * step).tanh(), seen.to(step.dtype)), dim=-1)
         out = self.out(x + self.steps(code.transpose(1, 2).flatten(2))).float()
         weight, rest = out[..., :-3], out[..., -3:]
-        return (weight.transpose(1, 2).unsqueeze(-1) * step).sum(1) + rest
+        return self._settled((weight.transpose(1, 2).unsqueeze(-1) * step).sum(1) + rest)
+
+    def _settled(self, flow: Float[Tensor, "B K 3"]) -> Float[Tensor, "B K 3"]:
+        return flow if self.training else torch.where(flow.norm(dim=-1, keepdim=True) < REST, 0.0, flow)
 
 
 def _steps(point: Float[Tensor, "B T K 3"]) -> tuple[Float[Tensor, "B S K 3"], Float[Tensor, "B S K 1"]]:
