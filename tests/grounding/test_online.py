@@ -47,6 +47,21 @@ def test_a_point_that_tells_nothing_new_costs_no_fit(monkeypatch: pytest.MonkeyP
     assert estimator.joint is before
 
 
+def test_another_belief_counts_at_once():
+    """Of a point that stood still: no further point is needed."""
+    estimator = JointEstimator(0.01)
+    for x in (0.0, 0.05, 0.1):
+        estimator.add(np.array([x, 0.0, 0.0]))
+    across, upright = np.eye(3)[0], np.eye(3)[2]
+    turns = JointPrior(0.99, across, 0.1, upright, 0.02, np.array([0.0, 0.3, 0.0]), 0.02)
+    slides = JointPrior(0.01, across, 0.1, upright, 0.02, np.array([0.0, 0.3, 0.0]), 0.02)
+    for prior, kind in ((turns, JointKind.REVOLUTE), (slides, JointKind.PRISMATIC)):
+        estimator.believe(prior)
+        assert estimator.joint is not None
+        assert estimator.joint.kind is kind
+    JointEstimator(0.01).believe(turns)  # nothing to fit yet
+
+
 def test_outliers_do_not_crowd_out_the_motion():
     """Every fifth point is wrong by decimetres, for far more frames than are kept."""
     points, axis, _ = make_track(JointKind.REVOLUTE, amount=1.2, sigma=0.002, seed=2, n=400)

@@ -25,10 +25,10 @@ def handle_on_a_door() -> Following:
     return Following(0, "handle", None, None, ground, place=point)
 
 
-def seen_at(query: Following, place: np.ndarray, frame: Sight) -> float:
+def seen_at(query: Following, place: np.ndarray, frame: Sight, *, right: float = 0.6) -> float:
     placer = object.__new__(Placer)
     vars(placer).update(_following=[query], _evidence=[frame], _config=TrackerConfig(), _elapsed=1.0, _now=40.0)
-    placer._seen = np.array([0.9])
+    placer._seen, placer._right = np.array([0.9]), np.array([right])
     return placer._seen_at(0, place, query.ground.residual(place))
 
 
@@ -40,6 +40,18 @@ def test_what_the_hinge_cannot_bring_somewhere_is_not_seen_there_unless_the_netw
     assert max(said[:30]) <= 0.2
     assert said[30] == pytest.approx(0.9)
     assert not query.buried
+
+
+def test_what_the_network_is_sure_of_is_seen_off_the_turn_too():
+    query = handle_on_a_door()
+    assert seen_at(query, FAR, BLIND, right=0.85) == pytest.approx(0.9)
+
+
+def test_where_the_front_is_not_in_sight_less_is_enough():
+    query = handle_on_a_door()
+    query.ground.face(None, elapsed=1.0)
+    assert seen_at(query, FAR, BLIND) == pytest.approx(0.9)
+    assert seen_at(query, FAR, BLIND, right=0.4) <= 0.2
 
 
 def test_what_comes_before_the_places_of_a_hinge_buries_the_query():

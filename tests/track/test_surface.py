@@ -100,6 +100,14 @@ def test_what_disagrees_for_long_gives_the_joint_up():
     assert front.belief is None
 
 
+def test_where_no_turn_brings_the_query_it_is_seen_again_and_again_until_the_joint_is_given_up():
+    front, (on, _) = opened(), door(0.8)
+    off = on + np.array([0.0, 0.0, 0.3])
+    assert [front.given_up_for(point) for point in (*[off] * 5, on, *[off] * 6)] == [False] * 11 + [True]
+    assert front.joint is None
+    assert front.expected(on)[0] is None  # any plane may be the front again
+
+
 def test_an_unseen_front_may_turn_further():
     front = Front(0.04)
     assert front.expected(np.zeros(3))[0] is None
@@ -112,6 +120,22 @@ def test_an_unseen_front_may_turn_further():
 def seen(angle: float) -> BeliefRow:
     """A network that believes in a drawer."""
     return BeliefRow(-1.0, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.full(3, 0.4), np.full(3, 0.2))
+
+
+def test_a_joint_that_was_given_up_is_no_prior_any_more():
+    """A drawer whose handle turned for a while: from the frame in which the hinge goes it is a drawer again."""
+    ground = Ground(TrackerConfig())
+    for t, angle in enumerate((*np.zeros(8), *np.arange(0.0, 0.8, 0.03))):
+        point, plane = door(angle)
+        ground.face(plane, elapsed=1.0)
+        ground.see(point, seen(angle), now=t)
+    for t in range(6):
+        assert ground.front.joint is not None
+        ground.face(None, elapsed=1.0)
+        ground.see(point + np.array([0.0, 0.0, -0.4 - 0.1 * t]), seen(0.8), now=40 + t)
+    assert ground.front.joint is None
+    assert ground._estimator.prior is not None
+    assert ground._estimator.prior.revolute_probability < 0.5
 
 
 def test_a_query_follows_the_front_where_the_network_slides_along_it():

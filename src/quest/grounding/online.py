@@ -77,6 +77,10 @@ class JointEstimator:
         if len(self._points) > self._capacity:
             self._make_room()
 
+    def believe(self, prior: JointPrior) -> None:
+        """Take another belief for the one there was, which was wrong: the joint is fitted again at once."""
+        self.prior, self._stale = prior, len(self._points) > 0
+
     def state(self) -> dict[str, np.ndarray]:
         """All that was learned and set, as numeric arrays: what is restored from it goes on to the same bytes."""
         state = {"points": self._points.copy(), "counts": self._counts.copy()}

@@ -13,6 +13,9 @@ from quest.grounding.hinge import HingeEstimator, Plane
 _TURN_PER_FRAME_RAD = 0.05
 _MOST_TURN_RAD = 0.35
 _CONTRADICTED = 20
+_INSISTED = 5
+OFF_TURN = 0.1
+"""What is farther than this from where a turn brings it, reference units, is not there."""
 
 
 class Front:
@@ -29,6 +32,7 @@ class Front:
         self._normal: np.ndarray | None = None
         self._unseen = 0.0
         self._contradicted = 0
+        self._insisted = 0
 
     @property
     def joint(self) -> Joint | None:
@@ -39,6 +43,11 @@ class Front:
     def belief(self) -> JointPrior | None:
         """What that says of the joint to one who has more to go by."""
         return self._hinge.belief
+
+    @property
+    def in_sight(self) -> bool:
+        """Whether it is seen in the newest frame, standing as it can."""
+        return self._plane is not None
 
     def expected(self, place: Float[np.ndarray, "3"]) -> tuple[Float[np.ndarray, "3"] | None, float]:
         """The normal that it should have now, and the least cosine to it; None before it was seen.
@@ -66,15 +75,33 @@ class Front:
         """
         given_up = False
         if plane is not None:
-            agrees = self._hinge.agrees(plane)
-            self._contradicted = 0 if agrees else self._contradicted + 1
-            plane = plane if agrees else None
-            if self._contradicted > _CONTRADICTED:
-                self._hinge, self._contradicted, given_up = HingeEstimator(self._sigma), 0, True
+            if self._hinge.agrees(plane):
+                self._contradicted = 0
+            else:
+                plane, self._contradicted = None, self._contradicted + 1
+                given_up = self._contradicted > _CONTRADICTED and self._give_up()
         self._plane = plane
         self._unseen = self._unseen + elapsed if plane is None else 0.0
         self._normal = self._normal if plane is None else plane.normal
         return given_up
+
+    def given_up_for(self, point: Float[np.ndarray, "3"]) -> bool:
+        """Whether the joint is given up because the query is seen, again and again, where no turn brings it.
+
+        Args:
+            point: where it is seen and trusted in the newest frame.
+        """
+        joint = self._hinge.joint
+        if joint is None or np.linalg.norm(point - joint.at(joint.locate(point[None]))[0]) < OFF_TURN:
+            self._insisted = 0
+            return False
+        self._insisted += 1
+        return self._insisted > _INSISTED and self._give_up()
+
+    def _give_up(self) -> bool:
+        self._hinge, self._normal = HingeEstimator(self._sigma), None
+        self._contradicted = self._insisted = 0
+        return True
 
     def learn(self, point: Float[np.ndarray, "3"]) -> None:
         """The query is seen at a point, and trusted, in the newest frame."""
@@ -92,13 +119,13 @@ class Front:
     def state(self) -> dict[str, np.ndarray]:
         """What the next frame depends on, as numeric arrays."""
         found = {f"hinge.{key}": value for key, value in self._hinge.state().items()}
-        found["counts"] = np.array([self._unseen, self._contradicted])
+        found["counts"] = np.array([self._unseen, self._contradicted, self._insisted])
         return found if self._normal is None else {**found, "normal": self._normal}
 
     def restore(self, state: Mapping[str, np.ndarray]) -> None:
         """Go on where :meth:`state` was taken."""
         prefix = "hinge."
         self._hinge.restore({key.removeprefix(prefix): v for key, v in state.items() if key.startswith(prefix)})
-        unseen, contradicted = state["counts"].tolist()
-        self._unseen, self._contradicted, self._normal = unseen, int(contradicted), state.get("normal")
+        self._unseen, contradicted, insisted = state["counts"].tolist()
+        self._contradicted, self._insisted, self._normal = int(contradicted), int(insisted), state.get("normal")
         self._plane = None

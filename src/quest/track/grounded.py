@@ -16,7 +16,7 @@ from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, joint_
 from quest.grounding.hinge import Plane
 from quest.track.evidence import Evidence
 from quest.track.expectation import BeliefRow, Expectation
-from quest.track.front import Front
+from quest.track.front import OFF_TURN, Front
 from quest.track.settings import TrackerConfig
 
 _SAMPLES = 97
@@ -35,7 +35,6 @@ _STANDING = 8
 _OFF_FIXED = -3.0
 _TURN_SIGMA_RAD = 0.05
 _LEAST_TURN_WEIGHT = -4.0
-_OFF_TURN = 0.1
 _SAME_AXIS_RAD = 0.2
 _SAME_AXIS = 0.1
 
@@ -91,7 +90,8 @@ class Ground:
     def face(self, plane: Plane | None, *, elapsed: float) -> None:
         """Take how the front of the link stands in the newest frame (see :meth:`~quest.track.front.Front.see`)."""
         if self.front.see(plane, elapsed=elapsed) and self._estimator.prior is not None:
-            self._curves = self._make_curves(self._estimator.prior)
+            self._estimator.believe(self._expectation.prior())
+            self._curves = self._make_curves(self._expectation.prior())
 
     def see(self, point: Float[np.ndarray, "3"], row: BeliefRow, *, now: float) -> None:
         """Learn from a frame in which the query is seen and trusted.
@@ -105,6 +105,8 @@ class Ground:
             self._expectation.add(row, point)
             if not self.fixed:
                 self.front.learn(point)
+            if self.front.given_up_for(point):
+                self._estimator.believe(self._expectation.prior())
             self._estimator.prior = prior = self.front.belief or self._expectation.prior()
             if self._on_turn(point):
                 self._estimator.add(point)
@@ -268,7 +270,7 @@ class Ground:
             return True
         turned = self.front.turned(turning)
         q = turning.locate(point[None]) if turned is None else np.array([turned])
-        return bool(np.linalg.norm(point - turning.at(q)[0]) < _OFF_TURN)
+        return bool(np.linalg.norm(point - turning.at(q)[0]) < OFF_TURN)
 
     def _turned(self, curve: Curve) -> np.ndarray | float:
         """How well the samples of a curve agree with how the link's front stands: log weights."""

@@ -28,6 +28,10 @@ _OFF_JOINT_SIGMAS = 4.0
 _INSISTING = 10
 _LONG_INSISTING = 30
 _OFF_TURN_SIGMAS = 2.5
+_SURE = 0.8
+"""What the network must be sure of, of being seen and right alike, to take a query off the turn of a front in sight ..."""
+_RATHER_SURE = 0.5
+"""... and of one that is not in sight."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +45,7 @@ class Placed:
         held: whether the answer is held without being seen.
         trusted: whether the answer was seen and taken for right.
         residual: distance of the candidate to the joint's curve in standard deviations, NaN where unknown.
-        room: how far what is seen at the judged place lies behind it.
+        room: how far what is seen at the judged place lies behind it; NaN until queries of a link have shared.
     """
 
     point: Float[np.ndarray, "K 3"]
@@ -112,10 +116,13 @@ class Placer:
             elif np.isfinite(own).all():
                 point[i], query.buried = self._see(i, own, joints[i]), False
             judged[i] = point[i]
-        room = np.array([e.room(p[None])[0] for e, p in zip(self._evidence, judged, strict=True)]).reshape(k)
         doubted = np.array([query.doubted for query in self._following], bool)
         trusted = ~held & ~doubted & (self._right >= LOST_BELOW)
-        return Placed(point, judged, seen, held, trusted, residual, room)
+        return Placed(point, judged, seen, held, trusted, residual, np.full(k, np.nan))
+
+    def room(self, judged: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, " K"]:
+        """How far what is seen at each query's judged place lies behind it, reference units."""
+        return np.array([e.room(p[None])[0] for e, p in zip(self._evidence, judged, strict=True)]).reshape(len(judged))
 
     def _see(self, i: int, own: np.ndarray, joint: BeliefRow) -> np.ndarray:
         query = self._following[i]
@@ -147,11 +154,14 @@ class Placer:
         looked = leapt or query.buried
         covered = looked and query.ground.covered(query.place, self._evidence[i], self._elapsed) > _COVERED
         query.buried |= covered and leapt
-        off_turn = query.ground.front.joint is not None and residual > _OFF_TURN_SIGMAS
-        if off_turn and not query.buried and query.refused < _LONG_INSISTING:
+        front = query.ground.front
+        off_turn = front.joint is not None and residual > _OFF_TURN_SIGMAS
+        sure = min(seen, self._right[i]) >= (_SURE if front.in_sight else _RATHER_SURE)
+        if off_turn and not query.buried and not sure and query.refused < _LONG_INSISTING:
             query.refused += 1
             return min(seen, _AFTER_ALL)
         if not looked:
+            query.refused = 0
             return seen
         on_joint = residual < _OFF_JOINT_SIGMAS
         if not leapt:

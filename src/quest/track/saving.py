@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-9"
+FORMAT = "quest-stream-10"
 _KEY = "quest-stream"
 
 

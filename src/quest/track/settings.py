@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from quest.errors import ConfigError, WeightsError
 from quest.model.discovery import RADIUS_CELLS
 
-REVISION = 8
+REVISION = 9
 """Grows when the same weights and settings give other answers, so that no monitor is fitted to streams of before."""
 
 

@@ -283,6 +283,7 @@ class Stream:
         placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:
             share(self._links, self._t, following, placed)
+        placed = replace(placed, room=placer.room(placed.judged))
         shown = replace(placed, point=marked(following, placed.point, prediction, frames))
         uv, judged_uv = (self._project(p, frames, prediction) for p in (shown.point, placed.judged))
         uv = beside(following, uv, shown.point, size=self._network.config.encoder.image_size)
