@@ -29,7 +29,7 @@ _INSISTING = 10
 _LONG_INSISTING = 30
 _OFF_TURN_SIGMAS = 2.5
 _SURE = 0.8
-"""What the network must be sure of, of being seen and right alike, to take a query off the turn of a front in sight ..."""
+"""How sure the network must be, of seen and right alike, to take a query off the turn of a front in sight ..."""
 _RATHER_SURE = 0.5
 """... and of one that is not in sight."""
 
