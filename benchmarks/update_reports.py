@@ -322,7 +322,8 @@ def page(folder: Path) -> str:
         "after being hidden and for joints from true and real tracks, else bootstraps over objects, of speeds over "
         "turns or takes. Validation objects chose settings; test objects did not. Every table names its commit. What "
         "commits before 3ce3175 say of discovery is of maps that learned from fewer objects. Tables of commits before "
-        "69b1116 are of a tracker whose queries may begin in a look-alike of what they were bound to, those before "
+        "7f76a48 are of a tracker that keeps a hinge even where the network is sure that it is wrong, those before "
+        "69b1116 of one whose queries may begin in a look-alike of what they were bound to, those before "
         "8ca5ac4 of one that does not carry the point along either that was asked for, those before 3145cc6 of one "
         "that does not read how far the front of a link has turned.",
     ]

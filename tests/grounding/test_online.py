@@ -48,7 +48,7 @@ def test_a_point_that_tells_nothing_new_costs_no_fit(monkeypatch: pytest.MonkeyP
 
 
 def test_another_belief_counts_at_once():
-    """Of a point that stood still: no further point is needed."""
+    """No further point is needed."""
     estimator = JointEstimator(0.01)
     for x in (0.0, 0.05, 0.1):
         estimator.add(np.array([x, 0.0, 0.0]))

@@ -7,21 +7,16 @@ import pytest
 
 from quest.track import TrackerConfig
 from quest.track.following import Following
-from quest.track.grounded import Ground
 from quest.track.placing import Placer
 from tests.track.test_grounded import BLIND, COVERED, Sight
-from tests.track.test_surface import DOOR_ORIGIN, door, seen
+from tests.track.test_surface import DOOR_ORIGIN, ground_of_a_door
 
 FAR = DOOR_ORIGIN + np.array([0.0, 0.5, -0.6])
 
 
 def handle_on_a_door() -> Following:
     """Followed while the door opened by 0.8 radians."""
-    ground, point = Ground(TrackerConfig()), door(0.0)[0]
-    for t, angle in enumerate((*np.zeros(8), *np.arange(0.0, 0.8, 0.03))):
-        point, plane = door(angle)
-        ground.face(plane, elapsed=1.0)
-        ground.see(point, seen(angle), now=t)
+    ground, point = ground_of_a_door()
     return Following(0, "handle", None, None, ground, place=point)
 
 

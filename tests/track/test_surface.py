@@ -122,13 +122,19 @@ def seen(angle: float) -> BeliefRow:
     return BeliefRow(-1.0, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), np.full(3, 0.4), np.full(3, 0.2))
 
 
-def test_a_joint_that_was_given_up_is_no_prior_any_more():
-    """A drawer whose handle turned for a while: from the frame in which the hinge goes it is a drawer again."""
-    ground = Ground(TrackerConfig())
+def ground_of_a_door() -> tuple[Ground, np.ndarray]:
+    """What is known of a handle, and where it is, after its door opened by 0.8 radians."""
+    ground, point = Ground(TrackerConfig()), door(0.0)[0]
     for t, angle in enumerate((*np.zeros(8), *np.arange(0.0, 0.8, 0.03))):
         point, plane = door(angle)
         ground.face(plane, elapsed=1.0)
         ground.see(point, seen(angle), now=t)
+    return ground, point
+
+
+def test_a_joint_that_was_given_up_is_no_prior_any_more():
+    """A drawer whose handle turned for a while: from the frame in which the hinge goes it is a drawer again."""
+    ground, point = ground_of_a_door()
     for t in range(6):
         assert ground.front.joint is not None
         ground.face(None, elapsed=1.0)
@@ -140,11 +146,7 @@ def test_a_joint_that_was_given_up_is_no_prior_any_more():
 
 def test_a_query_follows_the_front_where_the_network_slides_along_it():
     """In its last frame it is said to be at the hinge; the front and the sights before tell better."""
-    ground = Ground(TrackerConfig())
-    for t, angle in enumerate((*np.zeros(8), *np.arange(0.0, 0.8, 0.03))):
-        point, plane = door(angle)
-        ground.face(plane, elapsed=1.0)
-        ground.see(point, seen(angle), now=t)
+    ground, _ = ground_of_a_door()
     assert ground.joint is not None
     assert ground.joint.kind is JointKind.REVOLUTE
     point, plane = door(1.2)

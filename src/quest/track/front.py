@@ -79,7 +79,9 @@ class Front:
                 self._contradicted = 0
             else:
                 plane, self._contradicted = None, self._contradicted + 1
-                given_up = self._contradicted > _CONTRADICTED and self._give_up()
+                given_up = self._contradicted > _CONTRADICTED
+        if given_up:
+            self._give_up()
         self._plane = plane
         self._unseen = self._unseen + elapsed if plane is None else 0.0
         self._normal = self._normal if plane is None else plane.normal
@@ -96,12 +98,14 @@ class Front:
             self._insisted = 0
             return False
         self._insisted += 1
-        return self._insisted > _INSISTED and self._give_up()
+        given_up = self._insisted > _INSISTED
+        if given_up:
+            self._give_up()
+        return given_up
 
-    def _give_up(self) -> bool:
+    def _give_up(self) -> None:
         self._hinge, self._normal = HingeEstimator(self._sigma), None
         self._contradicted = self._insisted = 0
-        return True
 
     def learn(self, point: Float[np.ndarray, "3"]) -> None:
         """The query is seen at a point, and trusted, in the newest frame."""
