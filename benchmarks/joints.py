@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.drift import clopper_pearson
 from quest.evaluation.report import provenance, write_report
+from quest.geometry.vectors import perpendicular
 from quest.grounding import Joint, JointEstimator, JointKind, JointPrior, fit_joint
-from quest.grounding.vectors import perpendicular
 
 KIND_OF_FOLDER = {
     "drawer": JointKind.PRISMATIC,

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quest.geometry.vectors import perpendicular
 from quest.grounding import JointKind, JointPrior, curves
 from quest.grounding.curves import Track, fit_circle, fit_line
 from quest.grounding.starts import start_circles, start_lines
-from quest.grounding.vectors import perpendicular
 from tests.grounding.tracks import angle_deg, make_track
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
-from quest.data.letterbox import Letterbox
+from quest.geometry.letterbox import Letterbox
 from quest.model.framing import Framer
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation

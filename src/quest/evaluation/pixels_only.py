@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from quest.baselines.point_queries import hold_last, lift_pixels
-from quest.data.letterbox import Letterbox
+from quest.geometry.letterbox import Letterbox
 from quest.model.discovery import Peaks
 from quest.track.tracker import DEFAULT_ALPHA, Tracker
 from quest.types import Camera, Clip, Frame, Query, Tracks

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
+from quest.geometry.vectors import cross, perpendicular
 from quest.grounding.prior import JointPrior
 from quest.grounding.starts import Starts
-from quest.grounding.vectors import cross, perpendicular
 
 _ROBUST_SIGMAS = 2.5
 _OUTLIER_SIGMAS = 4.0

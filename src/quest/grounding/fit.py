@@ -12,11 +12,11 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import InputError
+from quest.geometry.vectors import cross, perpendicular
 from quest.grounding.curves import Curve, Track, fit_circle, fit_line, rebased
 from quest.grounding.joint import Joint, JointKind
 from quest.grounding.prior import JointPrior
 from quest.grounding.starts import Starts, circle_through, join, line_through, start_circles, start_lines
-from quest.grounding.vectors import cross, perpendicular
 
 _MOST_MISFIT = 9.0
 _OUTLIER_SIGMAS = 4.0

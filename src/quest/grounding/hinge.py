@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from quest.geometry.vectors import cross, perpendicular, rotated
 from quest.grounding.fit import joint_from_prior
 from quest.grounding.joint import Joint, JointKind
 from quest.grounding.prior import JointPrior
-from quest.grounding.vectors import cross, perpendicular, rotated
 
 _STILL_RAD = 0.08
 _STEP_RAD = 0.03

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import InputError
-from quest.grounding.vectors import cross, perpendicular
+from quest.geometry.vectors import cross, perpendicular
 
 
 class JointKind(StrEnum):

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import least_squares
 
+from quest.geometry.vectors import cross, perpendicular, rotated
 from quest.grounding.joint import Joint, JointKind
-from quest.grounding.vectors import cross, perpendicular, rotated
 
 _OUTLIER_SIGMAS = 4.0
 _RELATIVE_SIGMA = 0.01

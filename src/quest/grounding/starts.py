@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from quest.grounding.vectors import cross
+from quest.geometry.vectors import cross
 
 _TRIPLES = 24
 _MOST_SCORED = 96

@@ -11,8 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from quest.data.letterbox import Letterbox
 from quest.errors import InputError
+from quest.geometry.letterbox import Letterbox
 from quest.model.decoder import Anchor
 from quest.model.discovery import Peaks, find_candidates
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork

@@ -12,8 +12,8 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from quest.data.frame_source import PLAUSIBLE_DEPTH_M
-from quest.data.letterbox import Letterbox
 from quest.errors import InputError
+from quest.geometry.letterbox import Letterbox
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.framing import Framer, Reference
 from quest.model.network import QuestNetwork

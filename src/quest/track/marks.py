@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from quest.geometry.vectors import rotated
 from quest.grounding import JointKind
-from quest.grounding.vectors import rotated
 from quest.model.decoder import Prediction
 from quest.model.observation import FrameBatch
 from quest.track.following import Following

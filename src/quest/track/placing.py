@@ -65,7 +65,7 @@ class Placer:
         prediction: the network's answers for the frame (B = T = 1).
         frames: the frame.
         network: its configuration.
-        picture_px: edges of the image on its input (see :class:`~quest.data.letterbox.Letterbox`).
+        picture_px: edges of the image on its input (see :class:`~quest.geometry.letterbox.Letterbox`).
         config: settings of tracking.
         elapsed: frames since the one before.
         now: time of the frame, in frames.

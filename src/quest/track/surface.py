@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from quest.geometry.vectors import cross
 from quest.grounding.hinge import Plane
-from quest.grounding.vectors import cross
 from quest.model.observation import FrameBatch
 from quest.track.following import Following, as_rows
 

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Int8, UInt8, UInt16
 
-from quest.data.letterbox import Letterbox
 from quest.data.mirror import mirror_take, mirrored_name
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
+from quest.geometry.letterbox import Letterbox
 from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder
 from quest.model.observation import cell_depth

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quest.grounding.vectors import cross, rotated
+from quest.geometry.vectors import cross, rotated
 
 
 @pytest.mark.parametrize(("one", "other"), [((3,), (3,)), ((3,), (7, 3)), ((4, 7, 3), (3,)), ((4, 7, 3), (7, 3))])

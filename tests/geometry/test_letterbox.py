@@ -8,8 +8,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quest.data.letterbox import Letterbox
 from quest.geometry import lift, project
+from quest.geometry.letterbox import Letterbox
 from quest.types import Camera
 
 
