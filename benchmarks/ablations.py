@@ -24,15 +24,15 @@ from typing import Any, Literal
 
 import torch
 import tyro
+from ablation_rows import Answers, ablation_rows
 from ablation_variants import TABLES, Line, PresetName, TableName, Variant, chosen_lines
+from cached_encoder import CachedEncoder
 from rich.console import Console
 
 from quest.baselines import HoldStill
 from quest.data.provenance import code_commit, combined_hash, file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.ablation import Answers, ablation_rows
-from quest.evaluation.cached_encoder import CachedEncoder
 from quest.evaluation.lineup import units_of, variant
 from quest.evaluation.memory import remember_frames
 from quest.evaluation.pixels_only import PixelsOnly

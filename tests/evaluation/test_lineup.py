@@ -13,12 +13,10 @@ import quest
 from quest.baselines import FlowChain, Redetect
 from quest.baselines.point_queries import lift_pixels
 from quest.errors import ConfigError, WeightsError
-from quest.evaluation.cached_encoder import CachedEncoder
 from quest.evaluation.lineup import FLOW_NOISES, OF_WEIGHTS, detector_of, line_up, units_of, variant
 from quest.evaluation.pixels_only import PixelsOnly
 from quest.evaluation.runner import has_protocol
 from quest.track import Tracker, TrackerConfig
-from quest.train.feature_cache import FeatureCache
 from quest.types import Clip, Query, Take
 from tests.synthetic import make_take
 from tests.tiny import make_network
@@ -112,19 +110,3 @@ def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
     torch.testing.assert_close(peaks.logit, blind.logit)
     assert torch.isfinite(peaks.point_m).all(dim=1).any()
     assert torch.isnan(blind.point_m).all()
-
-
-def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:
-    network = make_network()
-    store = make_store(tmp_path / "takes", (0, 1))
-    cache = FeatureCache(tmp_path / "cache", network.config, network.encoder)
-    list(cache.build(store, store.names(), device=CPU))
-    views = cache.views(store.names())
-    other = make_network(seed=5)
-    computed = other.encode(torch.from_numpy(np.array(views[0].rgb[:1])))
-    CachedEncoder(views).serve(other)
-    rgb = torch.from_numpy(np.array(views[1].rgb[2:4]))
-    torch.testing.assert_close(other.encode(rgb), torch.from_numpy(np.array(views[1].features[2:4])).float())
-    assert not torch.allclose(other.encode(torch.from_numpy(np.array(views[0].rgb[:1]))), computed, atol=1e-3)
-    unknown = torch.zeros_like(rgb)
-    torch.testing.assert_close(other.encode(unknown), make_network(seed=5).encode(unknown))

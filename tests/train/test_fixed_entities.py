@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from quest.data.store import TakeStore
-from quest.evaluation.predicted_joints import moments_of
 from quest.model.joint_head import JointBelief
 from quest.train import losses
 from quest.train.feature_cache import FeatureCache
@@ -41,10 +40,9 @@ def test_feature_cache_keeps_no_joint_for_what_is_fixed(tmp_path: Path) -> None:
     assert not view.axis_world[1].any()
 
 
-def test_contact_sheet_and_judged_joints_cope() -> None:
+def test_contact_sheet_copes() -> None:
     take = take_with_fixed_entity()
     assert contact_sheet(take, columns=2, tile_width_px=64).std() > 0
-    assert 1 not in moments_of(take)
 
 
 def test_intent_follows_from_the_joint() -> None:

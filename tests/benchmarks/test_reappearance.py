@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.reappearance import STILL, episodes, reappearances
 from quest.errors import InputError
 from quest.evaluation import EntityRecord
-from quest.evaluation.reappearance import STILL, episodes, reappearances
 from tests.evaluation.answers import make_answer
 
 FRAMES, START, END = 60, 20, 45

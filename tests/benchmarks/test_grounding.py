@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.grounding import MARGIN, Compared, compare, pair_up, seen_around
 from quest.errors import InputError
 from quest.evaluation import EntityRecord
-from quest.evaluation.paired import MARGIN, Compared, compare, pair_up, seen_around
 from quest.evaluation.take_suite import TakeSuite
 from tests.evaluation.answers import make_answer
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quest.evaluation.predicted_joints import (
+from benchmarks.predicted_joints import (
     FAR,
     JointAnswer,
     axis_error_deg,
@@ -45,6 +45,9 @@ def test_when_joints_are_judged(take: Take):
     assert all(names == {len(take) - 1: ("end",)} for names in moments_of(near).values())
     carried = replace(take, info=replace(take.info, moved_joints=(1,)))
     assert set(moments_of(carried)) == {1}
+    first, second = take.info.entities[:2]
+    fixed = replace(take, info=replace(take.info, entities=(first, replace(second, link=0, joint=-1))))
+    assert set(moments_of(fixed)) == {0}
 
 
 def test_far_at_the_last_frame_is_both(take: Take):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from quest.errors import InputError
-from quest.evaluation.endurance import (
+from benchmarks.endurance import (
     FeatureRing,
     Reading,
     forth_and_back,
@@ -15,6 +14,7 @@ from quest.evaluation.endurance import (
     resident_bytes,
     time_change,
 )
+from quest.errors import InputError
 from tests.tiny import make_network
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.scene_flow import ANSWERS, flow_errors, flow_rows, records_of
 from quest.errors import ConfigError
-from quest.evaluation.scene_flow import ANSWERS, flow_errors, flow_rows, records_of
 from quest.train.feature_cache import CachedView
 from quest.train.flow import with_flow_head
 from tests.tiny import make_network

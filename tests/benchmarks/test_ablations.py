@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
+from benchmarks import ablation_variants as variants
+from benchmarks.ablation_rows import AblationRow, Answers, ablation_rows
+from benchmarks.cached_encoder import CachedEncoder
 from quest.errors import InputError
-from quest.evaluation.ablation import AblationRow, Answers, ablation_rows
 from quest.evaluation.records import Discovery, EntityRecord
+from quest.train.feature_cache import FeatureCache
 from tests.evaluation.answers import make_answer
+from tests.tiny import make_network
+from tests.train.prepared import CPU, make_store
 
 SETTINGS = {"resamples": 200, "seed": 0}
 OBJECTS = ("desk-102015", "chest-102016", "safe-102017")
@@ -119,14 +123,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
         ablation_rows([full, Answers("less", 0, answers(rng, first_frame=3), reference="full")], **SETTINGS)
 
 
-@pytest.fixture
-def variants(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
-    yield importlib.import_module("ablation_variants")
-    sys.modules.pop("ablation_variants")
-
-
-def test_the_benchmark_has_every_row_that_is_asked_for(variants) -> None:
+def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
     from dataclasses import fields
 
     from quest.evaluation.lineup import OF_WEIGHTS
@@ -158,3 +155,19 @@ def test_the_benchmark_has_every_row_that_is_asked_for(variants) -> None:
     assert not flat.network.points3d
     assert flat.windows.depth_drop_share == 1.0
     assert flat.losses.aff > 0 == flat.losses.point == flat.losses.joint
+
+
+def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:
+    network = make_network()
+    store = make_store(tmp_path / "takes", (0, 1))
+    cache = FeatureCache(tmp_path / "cache", network.config, network.encoder)
+    list(cache.build(store, store.names(), device=CPU))
+    views = cache.views(store.names())
+    other = make_network(seed=5)
+    computed = other.encode(torch.from_numpy(np.array(views[0].rgb[:1])))
+    CachedEncoder(views).serve(other)
+    rgb = torch.from_numpy(np.array(views[1].rgb[2:4]))
+    torch.testing.assert_close(other.encode(rgb), torch.from_numpy(np.array(views[1].features[2:4])).float())
+    assert not torch.allclose(other.encode(torch.from_numpy(np.array(views[0].rgb[:1]))), computed, atol=1e-3)
+    unknown = torch.zeros_like(rgb)
+    torch.testing.assert_close(other.encode(unknown), make_network(seed=5).encode(unknown))
