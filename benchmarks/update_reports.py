@@ -274,12 +274,6 @@ TABLES = (
         },
     ),
     Table(
-        "speed/windows.json",
-        "Random training windows of four frames, frames per second",
-        "frames_per_s",
-        {"reader": "key", "median": "median", "least": "least", "most": "most"},
-    ),
-    Table(
         "speed/training.json",
         "Training steps of the loop, beside bare steps of the same network",
         "",

@@ -11,7 +11,6 @@ import numpy as np
 from quest.data.consistency import has_sensed_depth
 from quest.data.store import TakeStore
 from quest.data.take_format import TakeHeader
-from quest.data.window_reader import Window, WindowReader
 from quest.types import LABELS
 
 _DEPTH_FRAMES = 4
@@ -117,15 +116,14 @@ def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda
         TakeError: a take's arrays cannot be decoded.
     """
     headers, tally = store.headers(), _Tally()
-    with WindowReader(store, threads=1, takes_in_memory=1) as reader:
-        for done, (name, header) in enumerate(headers.items(), start=1):
-            tally.add(header, reader.small_arrays(name))
-            for v in np.flatnonzero(header.has_depth):
-                for t in np.unique(np.linspace(0, header.frames - 1, _DEPTH_FRAMES).astype(int)):
-                    view = reader.read(Window(name, int(v), int(t), 1)).views[0]
-                    assert view.clip.depth_m is not None
-                    tally.add_depth(view.clip.depth_m, view.link_id)
-            report(done, len(headers))
+    for done, (name, header) in enumerate(headers.items(), start=1):
+        tally.add(header, store.read_small_arrays(name))
+        for v in np.flatnonzero(header.has_depth):
+            for t in np.unique(np.linspace(0, header.frames - 1, _DEPTH_FRAMES).astype(int)):
+                view = store.read_view(name, int(v), frames=slice(int(t), int(t) + 1))
+                assert view.clip.depth_m is not None
+                tally.add_depth(view.clip.depth_m, view.link_id)
+        report(done, len(headers))
     return tally.result(list(headers.values()), len(store.problems()))
 
 

@@ -188,6 +188,18 @@ class TakeStore:
         with self._opened(name, header) as group:
             return _read_clip(group, name, header, view, rows, _read_array(group, "stamp_s", rows))
 
+    def read_small_arrays(self, name: str) -> dict[str, np.ndarray]:
+        """Every array of a take but its pixels, by path in the group, such as ``view_0/visible``.
+
+        Raises:
+            TakeError: the take is missing, torn or of another format version.
+        """
+        header = self.header(name)
+        small = [key for key in ("cam_from_world", *VIEW_ARRAYS) if key not in PIXEL_ARRAYS]
+        paths = [*TAKE_ARRAYS, *(f"view_{view}/{key}" for view in range(len(header.cameras)) for key in small)]
+        with self._opened(name, header) as group:
+            return {path: _read_array(group, path, slice(None)) for path in paths}
+
     def verify(self, name: str) -> None:
         """Read every array of a take and compare with its recorded hash.
 
