@@ -4,12 +4,18 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "quest"
 FILES = sorted(SOURCE.rglob("*.py"))
+MODULES = {
+    ".".join(("quest", *path.relative_to(SOURCE).with_suffix("").parts)).removesuffix(".__init__"): path
+    for path in FILES
+}
 
 RANKS = {
     **dict.fromkeys(["geometry"], 0),
@@ -23,12 +29,18 @@ RANKS = {
 ALLOWED_WITHIN_RANK = {("sim", "data")}
 """Generated takes go into the store."""
 
-MAX_FILE_LINES = 400
 MAX_FUNCTION_LINES = 60
 
 
+@cache
 def tree(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"), filename=str(path))
+
+
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    """Everything in a file, at any depth."""
+    return list(ast.walk(tree(path)))
 
 
 def name(path: Path) -> str:
@@ -47,7 +59,7 @@ def room_of_file(path: Path) -> str:
 def imports(path: Path) -> Iterator[tuple[int, str]]:
     """Line and dotted name of everything that a file imports, at any depth."""
     package = ("quest", *path.relative_to(SOURCE).parent.parts)
-    for node in ast.walk(tree(path)):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -81,6 +93,37 @@ def test_imports_point_one_way():
     assert not wrong
 
 
+def imported_modules(path: Path) -> Iterator[str]:
+    """Modules of this package that a file imports anywhere in it, also for type checkers alone.
+
+    ``from quest.data import folder`` is of the module, ``from quest import __version__`` of the package.
+    """
+    for node in nodes(path):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name in MODULES)
+        elif isinstance(node, ast.ImportFrom) and node.module in MODULES:
+            named = (f"{node.module}.{alias.name}" for alias in node.names)
+            yield from (module if module in MODULES else node.module for module in named)
+
+
+def circle(imported: dict[str, set[str]]) -> list[str]:
+    """Modules that import each other in a circle; none if there is no circle."""
+    try:
+        TopologicalSorter(imported).prepare()
+    except CycleError as error:
+        return error.args[1]
+    return []
+
+
+def test_no_module_imports_itself_by_a_detour():
+    assert not circle({module: set(imported_modules(path)) for module, path in MODULES.items()})
+
+
+def test_circle_rule_itself():
+    assert circle({"store": {"folder", "bucket"}, "bucket": {"folder"}, "folder": set()}) == []
+    assert set(circle({"store": {"folder"}, "folder": {"bucket"}, "bucket": {"folder"}})) == {"folder", "bucket"}
+
+
 def test_import_rule_itself():
     assert may_import("cli", "evaluation")
     assert may_import("sim", "data")
@@ -110,7 +153,7 @@ def test_no_pickles():
         if module.partition(".")[0] in ("pickle", "dill", "cloudpickle", "joblib")
     ]
     for path in FILES:
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.Attribute) and ast.unparse(node) in ("torch.load", "torch.save"):
                 wrong.append(f"{name(path)}:{node.lineno} uses {ast.unparse(node)}")
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
@@ -122,13 +165,10 @@ def test_no_rooms_without_a_name():
     assert not [name(path) for path in FILES if path.stem in ("utils", "helpers", "common", "misc")]
 
 
-def test_files_and_functions_are_short():
+def test_functions_are_short():
     long = []
     for path in FILES:
-        lines = len(path.read_text(encoding="utf-8").splitlines())
-        if lines > MAX_FILE_LINES:
-            long.append(f"{name(path)} has {lines} lines (at most {MAX_FILE_LINES})")
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 lines = code_lines(node)
                 if lines > MAX_FUNCTION_LINES:
@@ -175,7 +215,7 @@ def at_import(node: ast.AST) -> Iterator[ast.expr | ast.stmt]:
 def dataclass_fields() -> Iterator[tuple[Path, str, str]]:
     """File, class and field of every configuration: dataclasses called ``...Config`` and all commands."""
     for path in FILES:
-        for node in ast.walk(tree(path)):
+        for node in nodes(path):
             if not isinstance(node, ast.ClassDef) or not any(
                 "dataclass" in ast.unparse(d) for d in node.decorator_list
             ):
@@ -190,7 +230,7 @@ def test_every_setting_is_read():
     read = {
         node.attr
         for path in FILES
-        for node in ast.walk(tree(path))
+        for node in nodes(path)
         if isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load)
     }
     assert not [f"{name(path)}: {owner}.{field}" for path, owner, field in dataclass_fields() if field not in read]

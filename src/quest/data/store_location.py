@@ -7,7 +7,6 @@ that becomes a take all at once or not at all.
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import socket
 import time
@@ -17,11 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 from quest.data.take_format import HEADER_FILE
-from quest.errors import ConfigError, TakeError
+from quest.errors import TakeError
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -105,26 +102,6 @@ class Location(Protocol):
     def reaching(self) -> AbstractContextManager[None]:
         """Turns what goes wrong between here and there into a StoreError."""
         ...
-
-
-def open_location(root: str | Path) -> Location:
-    """The place that a path or URL names.
-
-    Raises:
-        ConfigError: it is a URL that cannot be used.
-        MissingExtraError: it is in an object store and obstore is not installed.
-    """
-    text = str(root)
-    if re.match(r"[a-z][a-z0-9]+:/([^/]|$)", text):  # not a drive letter
-        raise ConfigError(f"store {text}: a URL needs two slashes, such as s3://bucket/takes; a Path loses one of them")
-    if "://" not in text:
-        return LocalFolder(Path(root))
-    parts = urlsplit(text)
-    if parts.scheme == "file":
-        return LocalFolder(Path(url2pathname(parts.path)))
-    from quest.data.object_store import ObjectPrefix
-
-    return ObjectPrefix(text)
 
 
 class LocalFolder:
