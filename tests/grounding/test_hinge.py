@@ -105,19 +105,3 @@ def test_what_cannot_be_the_front_is_told():
     assert not estimator.agrees(Plane(AXIS, plane.middle, behind=False))
     back = plane.middle - 0.06 * plane.normal
     assert estimator.agrees(Plane(plane.normal, back, behind=True))
-
-
-def test_it_goes_on_from_its_state():
-    estimator, again, rng = opened(0.8), HingeEstimator(SIGMA), np.random.default_rng(2)
-    again.restore(estimator.state())
-    for angle in (0.9, 1.0, 1.1):
-        point, plane = sight(angle, rng)
-        estimator.add(point, plane)
-        again.add(point, plane)
-    assert estimator.joint is not None
-    assert again.joint is not None
-    for name, value in estimator.joint.state().items():
-        np.testing.assert_array_equal(again.joint.state()[name], value)
-    empty = HingeEstimator(SIGMA)
-    empty.restore(HingeEstimator(SIGMA).state())
-    assert empty.joint is None

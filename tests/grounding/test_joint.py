@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -68,16 +66,3 @@ def test_joints_are_told_in_words():
     still = Joint(JointKind.STATIC, axis, arm, arm, 0.0, 0.0, covariance[:3, :3], 0.01, 20)
     assert still.describe() == "static, at (0.41, 0.00, 0.00) m"
     assert np.isnan(still.axis_sigma_rad)
-
-
-@pytest.mark.parametrize("kind", list(JointKind))
-def test_arrays_give_the_same_joint_back(kind: JointKind):
-    joint = make_joint(kind, 3)
-    state = joint.state()
-    assert all(value.dtype == np.float64 for value in state.values())
-    again = Joint.restored(state)
-    assert again.kind is kind
-    for f in fields(Joint):
-        np.testing.assert_array_equal(np.asarray(getattr(again, f.name)), np.asarray(getattr(joint, f.name)))
-    with pytest.raises(InputError, match="lacks kind"):
-        Joint.restored({name: value for name, value in state.items() if name != "kind"})

@@ -7,6 +7,7 @@ import pytest
 
 from quest.errors import InputError
 from quest.grounding import JointEstimator, JointKind, JointPrior, fit_joint
+from quest.track.saving import load, save
 from tests.grounding.tracks import angle_deg, make_track
 
 
@@ -108,37 +109,8 @@ def test_restored_estimators_go_on_to_the_same_bytes(kind: JointKind):
             assert whole.joint is not None
             assert first.joint is not None
         if t in (0, 5, 40, 90):
-            second = JointEstimator(1.0)
-            second.restore({name: value.copy() for name, value in first.state().items()})
-            first = second
-    one, other = whole.state(), first.state()
-    assert list(one) == list(other)
-    assert all(one[name].tobytes() == other[name].tobytes() for name in one)
-    assert all(value.dtype == np.float64 for value in one.values())
-
-
-def test_a_copy_goes_its_own_way():
-    points, _, _ = make_track(JointKind.PRISMATIC, amount=0.5, sigma=0.002, seed=1)
-    estimator = JointEstimator(0.002)
-    for point in points[:30]:
-        estimator.add(point)
-    before = estimator.state()
-    other = JointEstimator(0.002)
-    other.restore(before)
-    for point in points[30:]:
-        other.add(point)
-    assert len(other.state()["points"]) > len(before["points"])
-    assert all((estimator.state()[name] == before[name]).all() for name in before)
-
-
-def test_a_state_that_is_not_one_is_refused():
-    estimator = JointEstimator(0.01)
-    with pytest.raises(InputError, match="lacks"):
-        estimator.restore({"points": np.zeros((0, 3))})
-    with pytest.raises(InputError, match="belong together"):
-        estimator.restore(estimator.state() | {"counts": np.ones(4)})
-    with pytest.raises(InputError, match="joint prior: the state lacks"):
-        JointPrior.restored({})
+            first = load(save(first), JointEstimator)
+    assert save(first) == save(whole)
 
 
 def test_bad_input_is_refused():

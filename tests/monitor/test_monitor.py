@@ -12,12 +12,12 @@ from jaxtyping import TypeCheckError
 
 from quest.errors import ConfigError, InputError
 from quest.evaluation.detectors import our_monitor, play
-from quest.monitor import SIGNALS, Alarm, Calibration, Monitor, Signals, Verdict
+from quest.monitor import SIGNALS, Alarm, Calibration, Monitor, MonitorState, Signals, Verdict
 from quest.monitor import memory as memories
 from quest.monitor.statistic import Cusum
+from quest.track.saving import load, save
 from tests.monitor.calibrations import make_calibrator, share, watching
 from tests.monitor.streams import make_stream
-from tests.tiny import BAD_INPUT
 
 
 def signals(*values: float, name: str = "anchor_cosine") -> Signals:
@@ -180,8 +180,8 @@ def test_a_query_that_is_not_answered_rests():
         monitor.step([0, 1] if t % 2 else [0], signals(*[-0.3] * (1 + t % 2)), frame=t, stamp_s=0.0)
     for t in range(4):
         last = other.step([1], signals(-0.3), frame=t, stamp_s=0.0)
-    np.testing.assert_array_equal(monitor.state()["memory"][1], other.state()["memory"][1])
-    assert monitor.state()["statistic"][1, 0] == pytest.approx(float(last.statistic[0]))
+    np.testing.assert_array_equal(monitor.state.memory[1], other.state.memory[1])
+    assert monitor.state.statistic[1, 0] == pytest.approx(float(last.statistic[0]))
 
 
 def test_who_rests_while_a_block_begins_begins_from_nothing_too():
@@ -215,11 +215,8 @@ def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
         if t == 20:
             monitor.clear(1)
         if t == 30:
-            state = monitor.state()
-            assert all(array.dtype.kind in "iuf" for array in state.values())
             restored = Monitor(calibration, alpha=0.1)
-            restored.restore(state)
-            state["memory"][:] = 0.0  # a copy: what is saved and what goes on must not share memory
+            restored.state = load(save(monitor.state), MonitorState)
         verdict = monitor.step([0, 1, 2], Signals(record.signals[t]), frame=t, stamp_s=0.1 * t)
         if restored is not None:
             again = restored.step([0, 1, 2], Signals(record.signals[t]), frame=t, stamp_s=0.1 * t)
@@ -228,8 +225,7 @@ def test_a_restored_monitor_goes_on_as_if_nothing_had_happened():
             assert (again.open, again.raised) == (verdict.open, verdict.raised)
     assert restored is not None
     assert any(verdict.open)
-    for name, array in monitor.state().items():
-        np.testing.assert_array_equal(restored.state()[name], array)
+    assert save(restored.state) == save(monitor.state)
 
 
 def test_alarms_of_numbers_of_numpy_are_saved():
@@ -241,7 +237,7 @@ def test_alarms_of_numbers_of_numpy_are_saved():
         monitor.watch(0, "door")
         for t in range(15):
             monitor.step([0], signals(-1.0), frame=whole(t), stamp_s=real(t))
-        again.restore(monitor.state())
+        again.state = load(save(monitor.state), MonitorState)
         assert monitor.alarm(0) is not None
         assert again.alarm(0) == monitor.alarm(0)
 
@@ -282,10 +278,3 @@ def test_misuse_is_named():
         monitor.step([0, 0], signals(0.0, 0.0), frame=0, stamp_s=0.0)
     with pytest.raises(InputError, match="watch"):
         monitor.step([5], signals(0.0), frame=0, stamp_s=0.0)
-    with pytest.raises(InputError, match="missing"):
-        monitor.restore({})
-    for torn in (np.zeros(3, np.uint8), np.zeros(0, np.uint8), Monitor(watching("step"), alpha=0.1).state()["texts"]):
-        with pytest.raises(InputError, match="texts"):
-            monitor.restore(monitor.state() | {"texts": torn})
-    with pytest.raises(BAD_INPUT):
-        monitor.restore(monitor.state() | {"memory": np.zeros((1, 2, 3))})

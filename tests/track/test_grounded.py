@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 from quest.grounding import JointKind
 from quest.track.expectation import BeliefRow
 from quest.track.grounded import Ground
+from quest.track.saving import load, save
 from quest.track.settings import TrackerConfig
 
 AXIS = np.array([0.0, 0.0, 1.0])
@@ -86,7 +88,7 @@ def test_what_is_fixed_stands_where_it_was_first_seen_whatever_is_taken_for_it_l
     there, away = ground.favour(np.stack((on_door(0.0), on_door(1.2))))
     assert there == pytest.approx(0.0, abs=0.1)
     assert away < CONFIG.off_joint  # a joint that was never seen could not say so
-    again = Ground.restored(CONFIG, ground.state())
+    again = load(save(ground), Ground)
     see(again, 1.2, now=40)
     assert again.fixed
     np.testing.assert_array_equal(again.favour(on_door(1.2)[None]), [away])
@@ -267,7 +269,7 @@ def test_a_copy_answers_alike_and_learns_by_itself(hidden: bool):
     ground = opened()
     if hidden:
         hide(ground, on_door(1.2))
-    copy = ground.copy()
+    copy = deepcopy(ground)
     points = on_door(np.linspace(-1, 2, 50)) + 0.08 * AXIS
     np.testing.assert_array_equal(copy.favour(points), ground.favour(points))
     np.testing.assert_array_equal(hide(copy, on_door(1.2)), hide(ground, on_door(1.2)))

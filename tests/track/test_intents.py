@@ -55,7 +55,7 @@ def test_what_is_asked_for_to_be_lifted_by_stands_still(clip: Clip, monkeypatch:
     stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
     # Of a handle that nobody asked for to lift by, the network may only think so.
     for each in (stream, tracker.restore(tracker.save(stream))):
-        assert [f.ground.fixed for f in each._following] == [True, False, False]
+        assert [f.ground.fixed for f in each.memory.following] == [True, False, False]
 
 
 def all_at_one_place(*_: object, **__: object) -> Candidates:

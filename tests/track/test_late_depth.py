@@ -20,10 +20,10 @@ def test_what_is_seen_is_bound_again_where_it_was_seen():
     clip, tracker = make_clip(frames=3), make_tracker()
     stream, (first, second, third) = tracker.stream(clip.camera, POINTS), map(clip.frame, range(3))
     stream.step(first.rgb, None, first.stamp_s)
-    for query, visible in zip(stream._following, (True, False), strict=True):
+    for query, visible in zip(stream.memory.following, (True, False), strict=True):
         assert query.answer is not None
         query.answer = replace(query.answer, visible=visible)
-    answer, before = stream._following[0].answer, stream._binding.anchor
+    answer, before = stream.memory.following[0].answer, stream.memory.binding.anchor
     assert answer is not None
     assert before is not None
     state = stream.step(second.rgb, second.depth_m, second.stamp_s)
@@ -32,7 +32,7 @@ def test_what_is_seen_is_bound_again_where_it_was_seen():
     # As if it had been asked for here; what was hidden keeps what it was bound to.
     fresh = tracker.stream(clip.camera, [Query.point(0, *map(float, answer.uv_px))])
     assert DEPTH_BEGINS_FLAG not in fresh.step(second.rgb, second.depth_m, second.stamp_s).flags
-    after, expected = stream._binding.anchor, fresh._binding.anchor
+    after, expected = stream.memory.binding.anchor, fresh.memory.binding.anchor
     assert after is not None
     assert expected is not None
     torch.testing.assert_close(after.content[0, 0], expected.content[0, 0])

@@ -12,6 +12,7 @@ from quest.model.observation import FrameBatch
 from quest.track.following import Following
 from quest.track.grounded import Ground
 from quest.track.marks import beside, marked
+from quest.track.saving import load, save
 from quest.track.settings import TrackerConfig
 from tests.tiny import make_frames
 
@@ -88,9 +89,7 @@ def test_a_mark_turns_with_the_link(monkeypatch: pytest.MonkeyPatch):
 def test_marks_are_saved_and_end_with_their_reference_frame():
     query = make_query()
     marked([query], OWN, make_prediction(ASKED_PX), plain_frames())
-    again = Following.restored(
-        [0, "handle", None, None], query.state(), config=TrackerConfig(), device=torch.device("cpu")
-    )
+    again = load(save(query), Following)
     assert query.mark is not None
     assert again.mark is not None
     np.testing.assert_array_equal(again.mark, query.mark)

@@ -20,16 +20,16 @@ def test_a_query_that_binds_counts_its_frame_once():
     stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
     with torch.inference_mode():
         stream.step(frame.rgb, frame.depth_m, 0.0, frame.cam_from_world)
-        anchor = stream._binding.anchor
+        anchor = stream.memory.binding.anchor
         assert anchor is not None
-        window = Observation.stack(list(stream._ring))
+        window = Observation.stack(list(stream.memory.ring))
         x = tracker.network.embed(anchor, window)[:, -1:]
         assert isinstance(tracker.network.head, HeatmapHead)
         newest = window.during(slice(-1, None))
         logits = tracker.network.head.logits(x, newest)
         seen = tracker.network.head.confidences(x, logits, newest, logits.argmax(dim=-1))[0, 0, :, 0].sigmoid()
         cell_px = cell_centres(tracker.network.config)
-        for k, one in enumerate(stream._following):
+        for k, one in enumerate(stream.memory.following):
             assert one.belief is not None
             assert one.belief.probability.sum() == pytest.approx(1, abs=1e-5)
             uv_px = torch.tensor(POINTS[k].uv_px)
@@ -49,4 +49,4 @@ def test_what_is_asked_for_is_first_answered_near_its_pixel():
     # Untrained scores are best anywhere; 16 px are free, another two sigmas and half a cell may come on top.
     scale = clip.camera.width / tracker.network.config.encoder.image_size
     assert np.linalg.norm(answer.uv_px - np.array(pixels), axis=-1).max() < (16 + 8 + 8) * scale
-    assert all(query.bound_px is None for query in stream._following)
+    assert all(query.bound_px is None for query in stream.memory.following)

@@ -51,7 +51,7 @@ def make(config: TrackerConfig = EAGER, *, confidence: list[float] | None = None
 def slots_of(tracker: Tracker, clip: Clip, queries: list[Query] | None) -> list[int | None]:
     stream, frame = tracker.stream(clip.camera, queries), clip.frame(0)
     stream.step(frame.rgb, frame.depth_m, 0.0, frame.cam_from_world)
-    return [f.slot for f in sorted(stream._following, key=lambda f: f.query)]
+    return [f.slot for f in sorted(stream.memory.following, key=lambda f: f.query)]
 
 
 def first_answers(clip: Clip) -> np.ndarray:
@@ -81,11 +81,11 @@ def test_labels_are_decided_when_slots_are_taken(clip: Clip):
         told.append(state.labels)
         if t == 0:
             with torch.inference_mode():
-                network, window = tracker.network, Observation.stack(list(stream._ring))
+                network, window = tracker.network, Observation.stack(list(stream.memory.ring))
                 head = network.head
                 assert isinstance(head, RegressionHead)
                 expected = head.labels(network.embed(network.slots(1), window))[0, 0].argmax(-1).tolist()
-            assert state.labels == tuple(LABELS[expected[f.slot]] for f in stream._following)  # type: ignore[index]
+            assert state.labels == tuple(LABELS[expected[f.slot]] for f in stream.memory.following)  # type: ignore[index]
     assert len(set(told)) == 1
 
 
@@ -122,7 +122,7 @@ def test_later_points_take_slots_that_are_free(clip: Clip):
     for t in range(2):
         frame = clip.frame(t)
         stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-    first, second = (f.slot for f in stream._following)
+    first, second = (f.slot for f in stream.memory.following)
     assert first == 2 != second
 
 
@@ -179,11 +179,11 @@ def test_a_window_is_decoded_as_it_was_trained(clip: Clip):
     for t in range(len(clip)):
         frame = clip.frame(t)
         state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-        assert len(stream._ring) == min(t + 1, PAPER.window)
+        assert len(stream.memory.ring) == min(t + 1, PAPER.window)
         with torch.inference_mode():
-            x = network.embed(network.slots(1), Observation.stack(list(stream._ring)))
+            x = network.embed(network.slots(1), Observation.stack(list(stream.memory.ring)))
             uv = network.head(x).uv[0, -1]  # type: ignore[call-arg]
-        slots = [f.slot for f in stream._following]
+        slots = [f.slot for f in stream.memory.following]
         np.testing.assert_allclose(state.uv_px, 64 * uv[slots].numpy(), atol=1e-3)
 
 

@@ -16,7 +16,6 @@ from quest.errors import ConfigError, InputError
 from quest.monitor import SIGNALS, Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
 from quest.track.events import Events
-from quest.track.saving import SavedStream
 from quest.types import Clip, Query, State
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
@@ -86,7 +85,7 @@ def test_dropped_frames_let_things_move_farther(clip: Clip):
         feed(stream, clip, range(1))
     feed(soon, clip, range(4, 5), stamp_s=1 / 30)
     feed(later, clip, range(4, 5), stamp_s=0.3)
-    spreads = [stream._intake.elapsed for stream in (soon, later)]
+    spreads = [stream.memory.intake.elapsed for stream in (soon, later)]
     assert spreads == [1.0, pytest.approx(9.0)]
 
 
@@ -115,7 +114,7 @@ def test_time_passes_in_every_frame(clip: Clip):
     stream = tracker.stream(clip.camera, POINTS[:1])
     feed(stream, without_depth(clip, slice(1, 3)), range(3))
     feed(stream, clip, range(3, 4), stamp_s=1.0)
-    assert [s._intake.now for s in (stream, tracker.restore(tracker.save(stream)))] == [3 + 28, 3 + 28]
+    assert [s.memory.intake.now for s in (stream, tracker.restore(tracker.save(stream)))] == [3 + 28, 3 + 28]
 
 
 def test_poses_that_begin_late_move_nothing(clip: Clip):
@@ -163,9 +162,9 @@ def test_specks_of_depth_make_no_reference(clip: Clip):
     stream.step(first.rgb, specks, 0.0)
     stream.step(full.rgb, full.depth_m, 0.1)
     whole.step(full.rgb, full.depth_m, 0.1)
-    assert stream._intake.reference is not None
-    assert whole._intake.reference is not None
-    torch.testing.assert_close(stream._intake.reference.scale, whole._intake.reference.scale)
+    assert stream.memory.intake.reference is not None
+    assert whole.memory.intake.reference is not None
+    torch.testing.assert_close(stream.memory.intake.reference.scale, whole.memory.intake.reference.scale)
 
 
 def test_queries_come_and_go(clip: Clip):
@@ -191,12 +190,12 @@ def test_retiring_leaves_the_others_alone():
     clip = make_clip(frames=4)
     stream = make_tracker().stream(clip.camera, POINTS)
     feed(stream, clip, range(3))
-    kept, anchor = stream._following[1], stream._binding.anchor
+    kept, anchor = stream.memory.following[1], stream.memory.binding.anchor
     stream.retire("a")
-    assert stream._following == [kept]
-    assert stream._binding.anchor is not None
+    assert stream.memory.following == [kept]
+    assert stream.memory.binding.anchor is not None
     assert anchor is not None
-    np.testing.assert_array_equal(stream._binding.anchor.content[0, 0], anchor.content[0, 1])
+    np.testing.assert_array_equal(stream.memory.binding.anchor.content[0, 0], anchor.content[0, 1])
 
 
 def test_queries_that_are_not_there(clip: Clip):
@@ -321,13 +320,6 @@ def test_a_saved_stream_keeps_what_alpha_is_for(clip: Clip):
     for each in (tracker, make_tracker()):
         with pytest.raises(ConfigError, match="alpha_frames"):
             each.stream(clip.camera, POINTS, alpha_frames=0)
-
-
-def test_numbers_of_numpy_are_saved():
-    """Cameras and queries are often made of them."""
-    saved = SavedStream({"fx": np.float32(1.5)}, None, None, {"frame": np.int64(3)}, {"place": np.zeros(3)})
-    again = SavedStream.from_bytes(saved.to_bytes())
-    assert (again.maker, again.words) == ({"fx": 1.5}, {"frame": 3})
 
 
 def test_without_alpha_there_are_no_alarms(clip: Clip):

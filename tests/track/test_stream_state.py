@@ -29,13 +29,13 @@ def test_where_on_its_joint_a_query_is(clip: Clip):
     """By the network's own point: the joint was never told of the user's pixel beside it."""
     stream = make_tracker().stream(clip.camera, POINTS)
     state = feed(stream, clip, range(8))[-1]
-    assert stream._intake.reference is not None
-    for k, query in enumerate(stream._following):
+    assert stream.memory.intake.reference is not None
+    for k, query in enumerate(stream.memory.following):
         joint = state.joint[k]
         assert joint is not None
         assert query.place is not None
         moves = joint.kind is not JointKind.STATIC
-        own = to_world(query.place[None], stream._intake.reference).astype(np.float64)
+        own = to_world(query.place[None], stream.memory.intake.reference).astype(np.float64)
         assert state.q[k] == pytest.approx(joint.locate(own)[0] if moves else np.nan, nan_ok=True)
 
 

@@ -11,6 +11,7 @@ from quest.track import TrackerConfig
 from quest.track.expectation import BeliefRow
 from quest.track.front import Front
 from quest.track.grounded import Ground
+from quest.track.saving import load, save
 from quest.track.surface import plane_at
 
 SIDE, FOCAL = 224, 112.0
@@ -158,7 +159,7 @@ def test_a_query_follows_the_front_where_the_network_slides_along_it():
     assert there > off + 0.5
     ground.see(wrong, seen(1.2), now=40.0)  # what is not where the front says teaches nothing
     assert abs(ground.joint.axis @ DOOR_AXIS) > 0.99
-    again = Ground.restored(TrackerConfig(), ground.state())
+    again = load(save(ground), Ground)
     for each in (ground, again):
         each.face(door(1.3)[1], elapsed=1.0)
     np.testing.assert_array_equal(again.settle(wrong), ground.settle(wrong))

@@ -274,9 +274,9 @@ def test_memory_is_bounded(clip: Clip):
     stream, frame = make_tracker().stream(clip.camera, POINTS), clip.frame(0)
     for t in range(3 * DEFAULT.window):
         stream.step(frame.rgb, frame.depth_m, float(t))
-        assert len(stream._ring) == DEFAULT.window
-    assert all(observed.tokens.shape[1] == 1 for observed in stream._ring)
-    assert len(stream._following) == 2
+        assert len(stream.memory.ring) == DEFAULT.window
+    assert all(observed.tokens.shape[1] == 1 for observed in stream.memory.ring)
+    assert len(stream.memory.following) == 2
 
 
 @pytest.mark.parametrize(

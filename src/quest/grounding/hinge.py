@@ -7,8 +7,7 @@ by the link itself or seen at a grazing angle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float
@@ -86,6 +85,7 @@ class _Turning:
     shift: float
 
 
+@dataclass(eq=False)
 class HingeEstimator:
     """The axis about which the front of a link turns, and how far it has turned.
 
@@ -93,12 +93,11 @@ class HingeEstimator:
         sigma: standard deviation of a point of the link per coordinate, reference units.
     """
 
-    def __init__(self, sigma: float) -> None:
-        self._sigma = sigma
-        self._rest: np.ndarray | None = None
-        self._at_rest = 0.0
-        self._rows = np.zeros((0, 9))
-        self._found: _Turning | None = None
+    sigma: float
+    _rest: Float[np.ndarray, "9"] | None = field(default=None, init=False)
+    _at_rest: float = field(default=0.0, init=False)
+    _rows: Float[np.ndarray, "N 9"] = field(default_factory=lambda: np.zeros((0, 9)), init=False)
+    _found: _Turning | None = field(default=None, init=False)
 
     @property
     def joint(self) -> Joint | None:
@@ -122,7 +121,7 @@ class HingeEstimator:
             self._rest, self._at_rest = row, 1.0
             return
         if _angle(self._rest[None, 3:6], plane.normal)[0] < _STILL_RAD:
-            if np.linalg.norm(point - self._rest[:3]) < 2 * self._sigma and not len(self._rows):
+            if np.linalg.norm(point - self._rest[:3]) < 2 * self.sigma and not len(self._rows):
                 self._at_rest += 1
                 self._rest = _mixed(self._rest, row, 1 / min(self._at_rest, 16.0))
             return
@@ -154,18 +153,6 @@ class HingeEstimator:
             return None
         return rotated(self._rest[3:6], self._found.joint.axis, q - self._found.bias)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All that was learned, as numeric arrays: what is restored from it goes on to the same bytes."""
-        found = {"rows": self._rows.copy(), "at_rest": np.array(self._at_rest)}
-        return found if self._rest is None else {**found, "rest": self._rest.copy()}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on from what :meth:`state` gave."""
-        self._rows = np.array(state["rows"], np.float64)
-        self._rest = np.array(state["rest"], np.float64) if "rest" in state else None
-        self._at_rest = float(state["at_rest"])
-        self._found = self._fit() if len(self._rows) else None
-
     def _fit(self) -> _Turning | None:
         """The axis by Gauss-Newton steps; None where it is not known yet, or what is followed does not turn with it."""
         assert self._rest is not None
@@ -192,7 +179,7 @@ class HingeEstimator:
         rows = self._misfits(x, axis, rest, seen, q)
         planes, points = np.abs(rows[: len(q) + 1]), np.hypot(*rows[len(q) + 1 : -2].reshape(2, -1))
         shift = float(np.sqrt(np.linalg.inv(information)[:2, :2].trace() / 2))
-        sigma = _POINT_SIGMAS * self._sigma
+        sigma = _POINT_SIGMAS * self.sigma
         way = np.linalg.norm(x[:2]) * 2 * np.sin(np.abs(q) / 2) / sigma
         missed = points * self._point_sigma(len(q)) / sigma
         if shift > _MOST_SHIFT or way.max() < _LEAST_WAY_SIGMAS:
@@ -201,7 +188,7 @@ class HingeEstimator:
             return None
         at, tilt = rest.point[0], _AXIS_SIGMA_RAD / np.sin(min(q.max(), np.pi / 2))
         belief = JointPrior(0.99, axis, tilt, axis, tilt, at + basis @ x[:2], max(shift, _PLANE_SIGMA))
-        joint = joint_from_prior(belief, at, kind=JointKind.REVOLUTE, rest_sigma=self._sigma / 2)
+        joint = joint_from_prior(belief, at, kind=JointKind.REVOLUTE, rest_sigma=self.sigma / 2)
         q = q + x[3]
         joint = replace(joint, lower=float(min(q.min(), 0.0)), upper=float(q.max()), n=len(q))
         return _Turning(joint, belief, float(x[2]), float(x[3]), shift)
@@ -231,7 +218,7 @@ class HingeEstimator:
 
     def _point_sigma(self, n: int) -> float:
         """Of each of n points: errors of neighbouring frames are alike, so that many count as four."""
-        return _POINT_SIGMAS * self._sigma * max(n / 4, 1.0) ** 0.5
+        return _POINT_SIGMAS * self.sigma * max(n / 4, 1.0) ** 0.5
 
 
 def _mixed(old: np.ndarray, new: np.ndarray, share: float) -> np.ndarray:

@@ -6,9 +6,8 @@ section 4, for the three models.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -23,9 +22,6 @@ class JointKind(StrEnum):
     STATIC = "static"
     PRISMATIC = "prismatic"
     REVOLUTE = "revolute"
-
-
-_KINDS = tuple(JointKind)
 
 
 @dataclass(frozen=True)
@@ -140,26 +136,6 @@ class Joint:
             covariance=change @ self.covariance @ change.T,
             sigma=scale * self.sigma,
         )
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The joint as numeric arrays."""
-        state = {f.name: np.array(getattr(self, f.name), np.float64) for f in fields(self)[1:]}
-        return state | {"kind": np.array(_KINDS.index(self.kind), np.float64)}
-
-    @classmethod
-    def restored(cls, state: dict[str, np.ndarray]) -> Joint:
-        """The joint that :meth:`state` gave.
-
-        Raises:
-            InputError: an entry is missing.
-        """
-        missing = {f.name for f in fields(cls)} - set(state)
-        if missing:
-            raise InputError(f"joint: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
-        values = {f.name: np.array(state[f.name], np.float64) for f in fields(cls)[1:]}
-        plain: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in values.items()}
-        plain["n"] = int(plain["n"])
-        return cls(_KINDS[int(state["kind"])], **plain)
 
     def _tangent(self, q: np.ndarray) -> np.ndarray:
         if self.kind is JointKind.STATIC:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 from jaxtyping import Float
 
@@ -20,6 +22,7 @@ _MOST_OUTLIERS = 0.25
 _FURTHER = 0.1
 
 
+@dataclass(eq=False)
 class JointEstimator:
     """The joint of a track that is seen point by point.
 
@@ -36,23 +39,26 @@ class JointEstimator:
         prior: what is believed besides the track; takes effect at the next fit.
     """
 
-    def __init__(self, sigma: float, *, capacity: int = 64) -> None:
-        if not (np.isfinite(sigma) and sigma > 0) or capacity < 4:
-            raise InputError(f"joint: expected a positive sigma and a capacity of 4 or more, got {sigma}, {capacity}")
-        self.prior: JointPrior | None = None
-        self._sigma = float(sigma)
-        self._capacity = int(capacity)
-        self._points = np.zeros((0, 3))
-        self._counts = np.zeros(0)
-        self._waiting = 0
-        self._stale = False
-        self._joint: Joint | None = None
+    sigma: float
+    capacity: int = field(default=64, kw_only=True)
+    prior: JointPrior | None = field(default=None, init=False)
+    _points: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.zeros((0, 3)), init=False)
+    _counts: Float[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0), init=False)
+    _waiting: int = field(default=0, init=False)
+    _stale: bool = field(default=False, init=False)
+    _joint: Joint | None = field(default=None, init=False)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sigma) and self.sigma > 0) or self.capacity < 4:
+            raise InputError(
+                f"joint: expected a positive sigma and a capacity of 4 or more, got {self.sigma}, {self.capacity}"
+            )
 
     @property
     def joint(self) -> Joint | None:
         """The joint that explains the points so far; None without any. Fitted when something new is known."""
         if self._stale:
-            sigma = self._sigma / np.sqrt(np.minimum(self._counts, _MOST_COUNTED))
+            sigma = self.sigma / np.sqrt(np.minimum(self._counts, _MOST_COUNTED))
             self._joint = fit_joint(self._points, sigma, prior=self.prior, near=self._joint)
             self._stale, self._waiting = False, 0
         return self._joint
@@ -68,47 +74,18 @@ class JointEstimator:
         if len(self._points):
             gap = np.linalg.norm(self._points - point, axis=1)
             near = int(gap.argmin())
-            if gap[near] < _MERGE_SIGMAS * self._sigma:
+            if gap[near] < _MERGE_SIGMAS * self.sigma:
                 self._merge(near, point)
                 return
         self._points = np.vstack((self._points, point))
         self._counts = np.append(self._counts, 1.0)
         self._tell(not self._as_expected(point))
-        if len(self._points) > self._capacity:
+        if len(self._points) > self.capacity:
             self._make_room()
 
     def believe(self, prior: JointPrior) -> None:
         """Take another belief for the one there was, which was wrong: the joint is fitted again at once."""
         self.prior, self._stale = prior, len(self._points) > 0
-
-    def state(self) -> dict[str, np.ndarray]:
-        """All that was learned and set, as numeric arrays: what is restored from it goes on to the same bytes."""
-        state = {"points": self._points.copy(), "counts": self._counts.copy()}
-        state["settings"] = np.array([self._sigma, self._capacity, self._waiting, self._stale], np.float64)
-        if self._joint is not None:
-            state |= {f"joint.{name}": value for name, value in self._joint.state().items()}
-        if self.prior is not None:
-            state |= {f"prior.{name}": value for name, value in self.prior.state().items()}
-        return state
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from what :meth:`state` gave.
-
-        Raises:
-            InputError: entries are missing or do not belong together.
-        """
-        missing = {"points", "counts", "settings"} - set(state)
-        if missing:
-            raise InputError(f"joint: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
-        n = len(state["points"])
-        if state["points"].shape != (n, 3) or state["counts"].shape != (n,) or state["settings"].shape != (4,):
-            raise InputError("joint: points, counts and settings of the state do not belong together")
-        self._points, self._counts = (np.array(state[name], np.float64) for name in ("points", "counts"))
-        sigma, capacity, waiting, stale = state["settings"]
-        self._sigma, self._capacity, self._waiting, self._stale = float(sigma), int(capacity), int(waiting), bool(stale)
-        joint, prior = _below(state, "joint."), _below(state, "prior.")
-        self._joint = Joint.restored(joint) if joint else None
-        self.prior = JointPrior.restored(prior) if prior else None
 
     def _tell(self, urgent: bool) -> None:
         """Something new is known; it waits for more of its kind unless it is urgent."""
@@ -123,7 +100,7 @@ class JointEstimator:
         q = joint.locate(point[None])
         further = _FURTHER * (joint.upper - joint.lower)
         seen = joint.lower - further <= q[0] <= joint.upper + further
-        return bool(seen and np.linalg.norm(point - joint.at(q)[0]) < _AS_EXPECTED_SIGMAS * self._sigma)
+        return bool(seen and np.linalg.norm(point - joint.at(q)[0]) < _AS_EXPECTED_SIGMAS * self.sigma)
 
     def _merge(self, index: int, point: np.ndarray) -> None:
         # A running mean that forgets, so that the memory of a long stand-still stays as mobile as a short one's.
@@ -136,7 +113,7 @@ class JointEstimator:
     def _make_room(self) -> None:
         if self._joint is not None and self._joint.kind is not JointKind.STATIC:
             gap = np.linalg.norm(self._points - self._joint.at(self._joint.locate(self._points)), axis=1)
-            off = np.flatnonzero(gap[:-1] > _OUTLIER_SIGMAS * self._sigma)
+            off = np.flatnonzero(gap[:-1] > _OUTLIER_SIGMAS * self.sigma)
             if len(off) > _MOST_OUTLIERS * len(gap):
                 self._drop(int(off[0]))
                 return
@@ -151,7 +128,3 @@ class JointEstimator:
     def _drop(self, index: int) -> None:
         self._points = np.delete(self._points, index, axis=0)
         self._counts = np.delete(self._counts, index)
-
-
-def _below(state: dict[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -49,21 +48,3 @@ class JointPrior:
             raise InputError(f"joint prior: expected axes of length 1, got {self}")
         if not 0 < self.revolute_probability < 1:
             raise InputError(f"joint prior: expected a probability within (0, 1), got {self.revolute_probability}")
-
-    def state(self) -> dict[str, np.ndarray]:
-        """The belief as numeric arrays."""
-        return {f.name: np.array(getattr(self, f.name), np.float64) for f in fields(self)}
-
-    @classmethod
-    def restored(cls, state: dict[str, np.ndarray]) -> JointPrior:
-        """The belief that :meth:`state` gave.
-
-        Raises:
-            InputError: an entry is missing.
-        """
-        missing = {f.name for f in fields(cls)} - set(state)
-        if missing:
-            raise InputError(f"joint prior: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
-        values = {f.name: np.array(state[f.name], np.float64) for f in fields(cls)}
-        plain: dict[str, Any] = {name: value if value.ndim else float(value) for name, value in values.items()}
-        return cls(**plain)

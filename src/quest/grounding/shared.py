@@ -8,9 +8,10 @@ that slide side by side at the same time cannot be told from one link, and are j
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse.csgraph import connected_components
 
 from quest.errors import InputError
@@ -25,6 +26,7 @@ _REGROUP_FRAMES = 3
 _REFIT_FRAMES = 6
 
 
+@dataclass(eq=False)
 class LinkGroups:
     """The links that queries of one stream sit on.
 
@@ -36,19 +38,22 @@ class LinkGroups:
         capacity: most frames that are kept.
     """
 
-    def __init__(self, sigma: float, *, capacity: int = 96) -> None:
-        if not (np.isfinite(sigma) and sigma > 0) or capacity < 8:
-            raise InputError(f"links: expected a positive sigma and a capacity of 8 or more, got {sigma}, {capacity}")
-        self._sigma = float(sigma)
-        self._capacity = int(capacity)
-        self._keys: list[int] = []
-        self._frames = np.zeros(0, np.int64)
-        self._points = np.zeros((0, 0, 3))
-        self._label = np.zeros(0, np.int64)
-        self._age = np.zeros(0, np.int64)
-        self._since = 0
-        self._own: dict[int, Joint] = {}
-        self._shared: dict[int, Joint] = {}
+    sigma: float
+    capacity: int = field(default=96, kw_only=True)
+    _keys: list[int] = field(default_factory=list, init=False)
+    _frames: Int[np.ndarray, " M"] = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
+    _points: Float[np.ndarray, "M K 3"] = field(default_factory=lambda: np.zeros((0, 0, 3)), init=False)
+    _label: Int[np.ndarray, " K"] = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
+    _age: Int[np.ndarray, " K"] = field(default_factory=lambda: np.zeros(0, np.int64), init=False)
+    _since: int = field(default=0, init=False)
+    _own: dict[int, Joint] = field(default_factory=dict, init=False)
+    _shared: dict[int, Joint] = field(default_factory=dict, init=False)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sigma) and self.sigma > 0) or self.capacity < 8:
+            raise InputError(
+                f"links: expected a positive sigma and a capacity of 8 or more, got {self.sigma}, {self.capacity}"
+            )
 
     def see(self, frame: int, points: Mapping[int, Float[np.ndarray, "3"]], joints: Mapping[int, Joint | None]) -> None:
         """Learn from a frame.
@@ -78,7 +83,7 @@ class LinkGroups:
             self._frames = np.append(self._frames, frame)
             self._age += 1
             self._since += 1
-            if len(self._frames) > self._capacity:
+            if len(self._frames) > self.capacity:
                 self._make_room()
         if self._since >= _REGROUP_FRAMES:
             self._since = 0
@@ -116,7 +121,7 @@ class LinkGroups:
             if theirs is None or point is None:
                 continue
             q = theirs.locate(point[None])
-            noise = float(np.hypot(self._sigma, theirs.spread(q)[0]))
+            noise = float(np.hypot(self.sigma, theirs.spread(q)[0]))
             if np.linalg.norm(point - theirs.at(q)[0]) < _TRUSTED_SIGMAS * noise:
                 lever = theirs.radius if theirs.kind is JointKind.REVOLUTE else 1.0
                 found.append((float(q[0]), lever**2))
@@ -140,42 +145,6 @@ class LinkGroups:
         for gone in (k, *(partners if len(partners) == 1 else ())):
             self._shared.pop(gone, None)
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All that was learned, as numeric arrays: what is restored from it goes on to the same bytes."""
-        state = {"keys": np.array(self._keys, np.int64), "frames": self._frames.copy(), "points": self._points.copy()}
-        state |= {"label": self._label.copy(), "age": self._age.copy()}
-        state["settings"] = np.array([self._sigma, self._capacity, self._since], np.float64)
-        for name, joints in (("own", self._own), ("shared", self._shared)):
-            for k, joint in joints.items():
-                state |= {f"{name}.{k}.{entry}": value for entry, value in joint.state().items()}
-        return state
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from what :meth:`state` gave.
-
-        Raises:
-            InputError: entries are missing or do not belong together.
-        """
-        missing = {"keys", "frames", "points", "label", "age", "settings"} - set(state)
-        if missing:
-            raise InputError(f"links: the state lacks {', '.join(sorted(missing))}; give all that state() gave")
-        m, k = len(state["frames"]), len(state["keys"])
-        if state["points"].shape != (m, k, 3) or state["label"].shape != (k,) or state["age"].shape != (k,):
-            raise InputError("links: frames, keys and points of the state do not belong together")
-        self._keys = [int(key) for key in state["keys"]]
-        self._frames, self._label, self._age = (np.array(state[n], np.int64) for n in ("frames", "label", "age"))
-        self._points = np.array(state["points"], np.float64)
-        sigma, capacity, since = state["settings"]
-        self._sigma, self._capacity, self._since = float(sigma), int(capacity), int(since)
-        found: dict[tuple[str, int], dict[str, np.ndarray]] = {}
-        for name, value in state.items():
-            which, _, rest = name.partition(".")
-            if rest:
-                key, _, entry = rest.partition(".")
-                found.setdefault((which, int(key)), {})[entry] = value
-        self._own = {key: Joint.restored(entries) for (which, key), entries in found.items() if which == "own"}
-        self._shared = {key: Joint.restored(entries) for (which, key), entries in found.items() if which == "shared"}
-
     def _column(self, k: int) -> None:
         if k in self._keys:
             return
@@ -192,7 +161,7 @@ class LinkGroups:
         never = seen & ~np.isfinite(self._points[:, :, 0]).any(axis=0)
         step = np.linalg.norm(row - self._points[-1], axis=-1)
         # A query that comes back after it was hidden tells something, too.
-        return bool(never.any() or (step > _KEEP_SIGMAS * self._sigma).any() or (np.isnan(step) & seen).any())
+        return bool(never.any() or (step > _KEEP_SIGMAS * self.sigma).any() or (np.isnan(step) & seen).any())
 
     def _make_room(self) -> None:
         """Without the frame whose neighbours are nearest to each other; the first and the last stay."""
@@ -204,7 +173,7 @@ class LinkGroups:
         moving = [at for at, k in enumerate(self._keys) if k in self._own and self._moved(self._own[k])]
         linked = np.zeros((len(self._keys), len(self._keys)), bool)
         if len(moving) > 1:
-            told = evidence(Tracks(self._points[:, moving], [self._own[self._keys[at]] for at in moving], self._sigma))
+            told = evidence(Tracks(self._points[:, moving], [self._own[self._keys[at]] for at in moving], self.sigma))
             linked[np.ix_(moving, moving)] = np.minimum(told, told.T) > _ENOUGH_EVIDENCE
         label = connected_components(linked, directed=False)[1].astype(np.int64)
         for at, k in enumerate(self._keys):
@@ -222,9 +191,9 @@ class LinkGroups:
         members = np.flatnonzero(self._label == self._label[waiting.argmax()])
         self._age[members] = 0
         keys = [self._keys[at] for at in members]
-        fitted = fit_link(Tracks(self._points[:, members], [self._own[k] for k in keys], self._sigma))
+        fitted = fit_link(Tracks(self._points[:, members], [self._own[k] for k in keys], self.sigma))
         if fitted is not None:
             self._shared |= dict(zip(keys, fitted, strict=True))
 
     def _moved(self, joint: Joint) -> bool:
-        return joint.kind is not JointKind.STATIC and way_length(joint) > _TRAVEL_SIGMAS * self._sigma
+        return joint.kind is not JointKind.STATIC and way_length(joint) > _TRAVEL_SIGMAS * self.sigma

@@ -3,7 +3,7 @@
 from quest.monitor.alarm import Alarm, Verdict
 from quest.monitor.calibration import Calibration
 from quest.monitor.conformal import Budget
-from quest.monitor.monitor import Monitor
+from quest.monitor.monitor import Monitor, MonitorState
 from quest.monitor.signals import SIGNALS, Signals
 
-__all__ = ["SIGNALS", "Alarm", "Budget", "Calibration", "Monitor", "Signals", "Verdict"]
+__all__ = ["SIGNALS", "Alarm", "Budget", "Calibration", "Monitor", "MonitorState", "Signals", "Verdict"]

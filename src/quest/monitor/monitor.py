@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float64, Int64
 
 from quest.errors import InputError
 from quest.monitor import memory as memories
@@ -19,7 +19,30 @@ from quest.monitor.signals import Signals
 
 _KNOWN_THRESHOLDS = 1000
 
-_ARRAYS = ("keys", "memory", "statistic", "restart", "origin", "clock", "texts")
+
+@dataclass
+class MonitorState:
+    """What the next verdict depends on; rows are queries, in the order of ``name``.
+
+    Attributes:
+        statistic: of each query.
+        name: by key, of the queries that are being watched.
+        open: alarms by key.
+        memory: of each query's signals.
+        restart: number, over the stream, of each query's last alarm that was cleared; 0 without any.
+        origin: the frame from which each query's blocks count.
+        frames: that were seen.
+        restarts: alarms that were cleared.
+    """
+
+    statistic: Float64[np.ndarray, "N Z"]
+    name: dict[int, str] = field(default_factory=dict)
+    open: dict[int, Alarm] = field(default_factory=dict)
+    memory: Float64[np.ndarray, "N R S"] = field(default_factory=lambda: memories.start(0))
+    restart: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    origin: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    frames: int = 0
+    restarts: int = 0
 
 
 class Monitor:
@@ -42,15 +65,7 @@ class Monitor:
         self.calibration = calibration
         self.budget = Budget(alpha, alpha_frames)
         self._thresholds: dict[tuple[int, int], Threshold] = {}
-        self._row: dict[int, int] = {}
-        self._name: dict[int, str] = {}
-        self._open: dict[int, Alarm] = {}
-        self._memory = memories.start(0)
-        self._statistic = np.zeros((0, calibration.statistic.size))
-        self._restart = np.zeros(0, np.int64)
-        self._origin = np.zeros(0, np.int64)
-        self._frames = 0
-        self._restarts = 0
+        self.state = MonitorState(statistic=np.zeros((0, calibration.statistic.size)))
 
     def watch(self, key: int, name: str) -> None:
         """Begin to watch a query; its next frame is its first.
@@ -62,14 +77,13 @@ class Monitor:
         Raises:
             InputError: the key is being watched already.
         """
-        if key in self._row:
+        if key in self.state.name:
             raise InputError(f"monitor: query {key} is being watched already; forget it first")
-        self._row[key] = len(self._row)
-        self._name[key] = name
-        self._memory = np.concatenate([self._memory, memories.start(1)])
-        self._statistic = np.concatenate([self._statistic, np.zeros((1, self._statistic.shape[1]))])
-        self._restart = np.append(self._restart, 0)
-        self._origin = np.append(self._origin, 0)
+        self.state.name[key] = name
+        state = self.state
+        state.memory = np.concatenate([state.memory, memories.start(1)])
+        state.statistic = np.concatenate([state.statistic, np.zeros((1, state.statistic.shape[1]))])
+        state.restart, state.origin = np.append(state.restart, 0), np.append(state.origin, 0)
 
     def forget(self, key: int) -> None:
         """Stop watching a query.
@@ -78,11 +92,10 @@ class Monitor:
             InputError: it is not being watched.
         """
         row = self._find(key)
-        for name in ("_memory", "_statistic", "_restart", "_origin"):
-            setattr(self, name, np.delete(getattr(self, name), row, axis=0))
-        self._row = {k: i for i, k in enumerate(k for k in self._row if k != key)}
-        del self._name[key]
-        self._open.pop(key, None)
+        for name in ("memory", "statistic", "restart", "origin"):
+            setattr(self.state, name, np.delete(getattr(self.state, name), row, axis=0))
+        del self.state.name[key]
+        self.state.open.pop(key, None)
 
     def rename(self, key: int, name: str) -> None:
         """Call a query by another name in alarms from now on, in an open one too.
@@ -91,13 +104,13 @@ class Monitor:
             InputError: it is not being watched.
         """
         self._find(key)
-        self._name[key] = name
-        if key in self._open:
-            self._open[key] = replace(self._open[key], name=name)
+        self.state.name[key] = name
+        if key in self.state.open:
+            self.state.open[key] = replace(self.state.open[key], name=name)
 
     def alarm(self, key: int) -> Alarm | None:
         """The open alarm of a query."""
-        return self._open.get(key)
+        return self.state.open.get(key)
 
     def clear(self, key: int) -> None:
         """The identity is right again: the alarm ends, and the statistic starts anew.
@@ -110,13 +123,13 @@ class Monitor:
             InputError: the query is not being watched.
         """
         row = self._find(key)
-        if self._open.pop(key, None) is not None:
-            self._restarts += 1
-            self._restart[row] = self._restarts
+        if self.state.open.pop(key, None) is not None:
+            self.state.restarts += 1
+            self.state.restart[row] = self.state.restarts
             if self.budget.frames is None:
-                self._origin[row] = self._frames
-        self._memory[row] = memories.forgive(self._memory[row])
-        self._statistic[row] = 0.0
+                self.state.origin[row] = self.state.frames
+        self.state.memory[row] = memories.forgive(self.state.memory[row])
+        self.state.statistic[row] = 0.0
 
     def step(self, keys: Sequence[int], signals: Signals, *, frame: int, stamp_s: float) -> Verdict:
         """Take in one frame.
@@ -138,90 +151,38 @@ class Monitor:
         rows = np.array([self._find(key) for key in keys], dtype=np.int64)
         calibrator = self.calibration.calibrator
         values = signals.values.astype(np.float64)
-        memory, features = calibrator.step(self._memory[rows], values)
+        memory, features = calibrator.step(self.state.memory[rows], values)
         logit = calibrator.logit(features)
         lost_p = probability(logit)
-        age = self.budget.since(self._frames - self._origin)
+        age = self.budget.since(self.state.frames - self.state.origin)
         # A block begins as a calibration stream did, from nothing: only so are its maxima comparable; also who rests.
-        self._statistic[age % self.calibration.block_frames == 0] = 0.0
-        state, statistic = self.calibration.statistic.update(self._statistic[rows], logit)
-        self._memory[rows], self._statistic[rows] = memory, state
+        self.state.statistic[age % self.calibration.block_frames == 0] = 0.0
+        state, statistic = self.calibration.statistic.update(self.state.statistic[rows], logit)
+        self.state.memory[rows], self.state.statistic[rows] = memory, state
         block = age[rows] // self.calibration.block_frames + 1
         raised = []
         for i, key in enumerate(keys):
-            limit = self._threshold(int(block[i]), int(self._restart[rows[i]]))
-            if key not in self._open and statistic[i] > limit.value:
+            limit = self._threshold(int(block[i]), int(self.state.restart[rows[i]]))
+            if key not in self.state.open and statistic[i] > limit.value:
                 why = self._reason(features[i], memory[i], values[i], float(lost_p[i]))
                 alarm = Alarm(
-                    self._name[key], int(key), int(frame), float(stamp_s), float(statistic[i]), limit.value,
+                    self.state.name[key], int(key), int(frame), float(stamp_s), float(statistic[i]), limit.value,
                     limit.alpha, why, limit.extrapolated,
                 )  # fmt: skip
-                self._open[key] = alarm
+                self.state.open[key] = alarm
                 raised.append(alarm)
-        self._frames += 1
+        self.state.frames += 1
         return Verdict(
             lost_p=lost_p.astype(np.float32),
             statistic=statistic.astype(np.float32),
-            open=tuple(self._open.get(key) for key in keys),
+            open=tuple(self.state.open.get(key) for key in keys),
             raised=tuple(raised),
         )
 
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that a continuation needs, as plain numeric arrays; texts are bytes of JSON."""
-        texts = {
-            "names": list(self._name.values()),
-            "open": [asdict(alarm) for alarm in self._open.values()],
-        }
-        return {
-            "keys": np.array(list(self._row), dtype=np.int64),
-            "memory": self._memory.copy(),
-            "statistic": self._statistic.copy(),
-            "restart": self._restart.copy(),
-            "origin": self._origin.copy(),
-            "clock": np.array([self._frames, self._restarts], dtype=np.int64),
-            "texts": np.frombuffer(json.dumps(texts).encode(), dtype=np.uint8).copy(),
-        }
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Continue from what :meth:`state` gave, as if nothing had happened in between.
-
-        Raises:
-            InputError: the state is of another monitor.
-        """
-        missing = [name for name in _ARRAYS if name not in state]
-        if missing:
-            raise InputError(f"monitor state: expected the arrays of Monitor.state(), {', '.join(missing)} are missing")
-        keys = [int(key) for key in state["keys"]]
-        shapes = {
-            "memory": memories.start(len(keys)).shape,
-            "statistic": (len(keys), self.calibration.statistic.size),
-            "restart": (len(keys),),
-            "origin": (len(keys),),
-            "clock": (2,),
-        }
-        for name, shape in shapes.items():
-            if state[name].shape != shape:
-                raise InputError(f"monitor state: expected {name} of shape {shape}, got {state[name].shape}")
-        try:
-            texts = json.loads(state["texts"].tobytes().decode())
-            names = dict(zip(keys, texts["names"], strict=True))
-            alarms = {raw["query"]: Alarm(**raw) for raw in texts["open"]}
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(
-                f"monitor state: expected the texts of Monitor.state(), they cannot be read ({error})"
-            ) from error
-        self._row = {key: i for i, key in enumerate(keys)}
-        self._name, self._open = names, alarms
-        self._memory = state["memory"].astype(np.float64)
-        self._statistic = state["statistic"].astype(np.float64)
-        self._restart = state["restart"].astype(np.int64)
-        self._origin = state["origin"].astype(np.int64)
-        self._frames, self._restarts = int(state["clock"][0]), int(state["clock"][1])
-
     def _find(self, key: int) -> int:
-        if key not in self._row:
+        if key not in self.state.name:
             raise InputError(f"monitor: query {key} is not being watched; call watch({key}, name) first")
-        return self._row[key]
+        return list(self.state.name).index(key)
 
     def _threshold(self, block: int, restart: int) -> Threshold:
         if len(self._thresholds) > _KNOWN_THRESHOLDS:  # a stream has no end

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -41,12 +40,22 @@ class Waiting:
     query: Query
     since: int
 
-    @classmethod
-    def from_json(cls, raw: Mapping[str, Any]) -> Waiting:
-        """What :func:`dataclasses.asdict` gave, after a passage through JSON, which knows no tuples."""
-        uv_px = raw["query"]["uv_px"]
-        query = Query(**{**raw["query"], "uv_px": None if uv_px is None else (uv_px[0], uv_px[1])})
-        return cls(raw["number"], query, raw["since"])
+
+@dataclass
+class BindingState:
+    """What queries of a stream are bound to, and which are not.
+
+    Attributes:
+        anchor: what the bound queries are bound to, in the order of binding; None before the first.
+        waiting: queries that have not found their entity.
+        discover: whether everything in the next frame is to be discovered.
+        numbered: how many numbers have been given.
+    """
+
+    anchor: Anchor | None = None
+    waiting: list[Waiting] = field(default_factory=list)
+    discover: bool = False
+    numbered: int = 0
 
 
 class Binding:
@@ -59,10 +68,7 @@ class Binding:
         queries: what to follow; None discovers entities in the first frame.
 
     Attributes:
-        anchor: what the bound queries are bound to, in the order of binding; None before the first.
-        waiting: queries that have not found their entity.
-        discover: whether everything in the next frame is to be discovered.
-        numbered: how many numbers have been given.
+        state: what queries are bound to, and which are not.
 
     Raises:
         InputError: a point query lies outside the image, or asks for an intent of a network that knows none.
@@ -71,10 +77,7 @@ class Binding:
     def __init__(
         self, network: QuestNetwork, config: TrackerConfig, letterbox: Letterbox, queries: Sequence[Query] | None
     ) -> None:
-        self.anchor: Anchor | None = None
-        self.waiting: list[Waiting] = []
-        self.discover = queries is None
-        self.numbered = 0
+        self.state = BindingState(discover=queries is None)
         self._network = network
         self._config = config
         self._letterbox = letterbox
@@ -117,12 +120,12 @@ class Binding:
                 raise InputError(
                     f"query {query.name!r}: frame {query.frame} has passed; the next frame is number {frame}"
                 )
-        self.waiting.append(Waiting(self._next_number(), query, max(frame, query.frame)))
-        return self.numbered - 1
+        self.state.waiting.append(Waiting(self._next_number(), query, max(frame, query.frame)))
+        return self.state.numbered - 1
 
     def names(self, following: Sequence[Following]) -> dict[int, str]:
         """Names by number of all queries that are followed or wait; empty where a name is not made up yet."""
-        return {w.number: w.query.name for w in self.waiting} | {f.query: f.name for f in following}
+        return {w.number: w.query.name for w in self.state.waiting} | {f.query: f.name for f in following}
 
     def find(self, query: int | str, following: Sequence[Following]) -> int:
         """The number of a query, by its number or name.
@@ -156,7 +159,7 @@ class Binding:
         if slots is not None:
             return self._bind_learned(frame, slots, following)
         found = self._bind_slots(frame, observed, frames, following)
-        due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
+        due = [w for w in self.state.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
             label = [LABELS.index(w.query.label) if w.query.label else UNKNOWN_LABEL for w in due]
             intent = [INTENTS.index(w.query.intent) if w.query.intent else UNKNOWN_INTENT for w in due]
@@ -169,26 +172,30 @@ class Binding:
 
     def wait(self) -> None:
         """A frame is ignored: labels and slots look one frame longer."""
-        self.waiting = [w if w.query.kind == "point" else replace(w, since=w.since + 1) for w in self.waiting]
+        self.state.waiting = [
+            w if w.query.kind == "point" else replace(w, since=w.since + 1) for w in self.state.waiting
+        ]
 
     def looking(self, frame: int) -> bool:
         """Whether anything may still bind in a frame or after it."""
-        return self.discover or any(w.query.kind == "point" or frame < w.since + PATIENCE for w in self.waiting)
+        return self.state.discover or any(
+            w.query.kind == "point" or frame < w.since + PATIENCE for w in self.state.waiting
+        )
 
     def keep(self, rows: Sequence[int]) -> None:
         """Drop the anchors of all rows but these."""
-        if self.anchor is not None:
-            index = torch.tensor(list(rows), dtype=torch.long, device=self.anchor.content.device)
-            self.anchor = self.anchor.select(index) if len(index) else None
+        if self.state.anchor is not None:
+            index = torch.tensor(list(rows), dtype=torch.long, device=self.state.anchor.content.device)
+            self.state.anchor = self.state.anchor.select(index) if len(index) else None
 
     def _next_number(self) -> int:
-        self.numbered += 1
-        return self.numbered - 1
+        self.state.numbered += 1
+        return self.state.numbered - 1
 
     def _begin(
         self, waiting: Waiting, name: str, label: str | None, *, slot: int | None = None, intent: str | None = None
     ) -> Following:
-        self.waiting = [w for w in self.waiting if w is not waiting]
+        self.state.waiting = [w for w in self.state.waiting if w is not waiting]
         # Of what nobody asked for to lift by, the network only thinks so.
         ground = Ground(self._config, fixed=waiting.query.intent == "lift")
         return Following(waiting.number, name, label, slot, ground, waiting.query.intent or intent)
@@ -200,8 +207,8 @@ class Binding:
     def _bind_slots(
         self, frame: int, observed: Observation, frames: FrameBatch, following: Sequence[Following]
     ) -> list[Following]:
-        looking = [w for w in self.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]
-        if not (looking or self.discover):
+        looking = [w for w in self.state.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]
+        if not (looking or self.state.discover):
             return []
         config = self._config
         candidates = find_candidates(self._network, frames, observed, radius_cells=config.slot_radius_cells)
@@ -211,7 +218,7 @@ class Binding:
         near = self._near(peaks.uv, frames, following)
         found: list[Following] = []
         chosen: list[int] = []
-        if self.discover:
+        if self.state.discover:
             apart = candidates.apart()[: self._network.config.slots]
             chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
             for i in chosen:
@@ -221,7 +228,7 @@ class Binding:
                 notes = ["lift"] * (intent[i] == "lift") + [f"or {other}" for other in others[:1]]
                 name = " ".join([f"{label[i]} {number}", *(f"({note})" for note in notes)])
                 found.append(self._begin(Waiting(number, Query.slot(), frame), name, label[i], intent=intent[i]))
-            self.discover = False
+            self.state.discover = False
         for waiting in looking:
             query = waiting.query
             fits = [
@@ -263,7 +270,7 @@ class Binding:
         point = frames.near_point_at(uv_px[:, None]).squeeze(1)
         valid = torch.ones_like(label, dtype=torch.bool)
         anchor = self._network.bind(observed, uv, point, label, valid, intent)
-        self.anchor = anchor if self.anchor is None else self.anchor.join(anchor)
+        self.state.anchor = anchor if self.state.anchor is None else self.state.anchor.join(anchor)
 
     def bind_again(self, observed: Observation, frames: FrameBatch, following: Sequence[Following]) -> None:
         """Bind what was seen in the frame before anew where it was, as the reference frame is another.
@@ -277,7 +284,7 @@ class Binding:
             following: the queries, in the order of the anchors.
         """
         rows = [k for k, f in enumerate(following) if f.answer is not None and f.answer.visible]
-        if self.anchor is None or not rows:
+        if self.state.anchor is None or not rows:
             return
         again = [following[k] for k in rows]
         uv_px = np.stack([f.answer.uv_px for f in again if f.answer is not None])
@@ -286,7 +293,7 @@ class Binding:
         intent = [INTENTS.index(f.intent) if f.intent else UNKNOWN_INTENT for f in again]
         self._join(observed, frames, again, uv, torch.tensor(label), torch.tensor(intent))
         order = [len(following) + rows.index(k) if k in rows else k for k in range(len(following))]
-        self.anchor = self.anchor.select(torch.tensor(order, device=self.anchor.content.device))
+        self.state.anchor = self.state.anchor.select(torch.tensor(order, device=self.state.anchor.content.device))
         for query in again:
             query.asked_px = None if query.mark_px is None else query.bound_px
 
@@ -296,20 +303,22 @@ class Binding:
         found: list[Following] = []
         free = sorted(range(len(label)), key=lambda i: -existence[i])
         free = [i for i in free if i not in {f.slot for f in following}]
-        if self.discover:
+        if self.state.discover:
             for i in [i for i in free if existence[i] > config.slot_threshold]:
                 number = self._next_number()
                 waiting = Waiting(number, Query.slot(), frame)
                 found.append(self._begin(waiting, f"{label[i]} {number}", label[i], slot=i))
                 free.remove(i)
-            self.discover = False
-        for waiting in [w for w in self.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE]:
+            self.state.discover = False
+        for waiting in [
+            w for w in self.state.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE
+        ]:
             fits = [i for i in free if waiting.query.label in (None, label[i])]
             if fits and existence[fits[0]] > config.prompt_threshold:
                 name = waiting.query.name or f"{label[fits[0]]} {waiting.number}"
                 found.append(self._begin(waiting, name, label[fits[0]], slot=fits[0]))
                 free.remove(fits[0])
-        due = [w for w in self.waiting if w.query.kind == "point" and w.since <= frame]
+        due = [w for w in self.state.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
             chosen = slots_at(slots, self._canvas(due), [w.query.label for w in due], [*following, *found])
             for waiting, slot in zip(due, chosen, strict=True):

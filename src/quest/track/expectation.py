@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 
 import numpy as np
@@ -58,16 +57,6 @@ class Expectation:
         self.turn += weight[1] * np.outer(row.turn_axis, row.turn_axis)
         self.foot += weight[2] * (point + row.foot)
         self.information += weight
-
-    def state(self) -> dict[str, np.ndarray]:
-        """All fields as arrays."""
-        return {f.name: np.array(getattr(self, f.name)) for f in fields(self)}
-
-    @classmethod
-    def restored(cls, state: Mapping[str, np.ndarray]) -> Expectation:
-        """Read what :meth:`state` gave."""
-        joined = {f.name: np.array(state[f.name]) for f in fields(cls)}
-        return cls(**{**joined, "rows": int(joined["rows"]), "logit": float(joined["logit"])})
 
     def prior(self) -> JointPrior:
         """The beliefs as one; errors of neighbouring frames are alike, so that many are worth no more than one."""

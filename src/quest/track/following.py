@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
+from copy import deepcopy
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32
 from torch import Tensor
 
@@ -18,7 +17,6 @@ from quest.track.settings import TrackerConfig
 from quest.types import State
 
 _SAFE_EVERY = 10
-_STATES = list(State)
 
 
 @dataclass(frozen=True)
@@ -120,7 +118,7 @@ class Following:
         """Keep a copy of what is known, now and then: nothing speaks against it."""
         self.since_safe += 1
         if self.place is not None and (self.since_safe >= _SAFE_EVERY or not self.safe):
-            self.safe.append(Safe(self.ground.copy(), self.place.copy()))
+            self.safe.append(Safe(deepcopy(self.ground), self.place.copy()))
             self.since_safe = 0
 
     def doubt(self) -> None:
@@ -128,7 +126,7 @@ class Following:
         self.doubted, self.good, self.belief = True, 0, None
         self.buried, self.refused = False, 0
         if self.safe:
-            self.ground, self.place = self.safe[0].ground.copy(), self.safe[0].place.copy()
+            self.ground, self.place = deepcopy(self.safe[0].ground), self.safe[0].place.copy()
             self.held = True
 
     def trust(self, place: Float[np.ndarray, "3"]) -> None:
@@ -137,98 +135,8 @@ class Following:
         self.buried, self.refused = False, 0
         self.place, self.held = place if np.isfinite(place).all() else self.place, False
 
-    def state(self) -> dict[str, np.ndarray]:
-        """All but names, as numeric arrays."""
-        slot = -1 if self.slot is None else self.slot
-        counts = [slot, self.held, self.buried, self.refused, self.since_safe, self.doubted, self.good]
-        found: dict[str, np.ndarray] = {"counts": np.array(counts, np.int64)}
-        found |= {f"ground.{key}": value for key, value in self.ground.state().items()}
-        if self.belief is not None:
-            found["belief"] = self.belief.probability.cpu().numpy()
-            found["cell_point"] = self.belief.cell_point.cpu().numpy()
-        if self.place is not None:
-            found["place"] = self.place
-        if self.home is not None:
-            found["home"] = self.home
-        if self.mark is not None:
-            found["mark"] = self.mark
-        if self.mark_px is not None:
-            found["mark_px"] = self.mark_px
-        if self.born is not None:
-            found["born"] = self.born.float().cpu().numpy()
-        if self.answer is not None:
-            answer = self.answer
-            found["answer.uv_px"], found["answer.point_world"] = answer.uv_px, answer.point_world
-            found["answer.signals"] = answer.signals
-            numbers = [answer.confidence, answer.visible, _STATES.index(answer.state), answer.lost_p]
-            found["answer.numbers"] = np.array(numbers, np.float64)
-        for i, safe in enumerate(self.safe):
-            found[f"safe{i}.place"] = safe.place
-            found |= {f"safe{i}.ground.{key}": value for key, value in safe.ground.state().items()}
-        return found
-
-    @classmethod
-    def restored(
-        cls,
-        words: Sequence[Any],
-        state: Mapping[str, np.ndarray],
-        *,
-        config: TrackerConfig,
-        device: torch.device,
-    ) -> Following:
-        """The query of which :meth:`state` was taken, and that had such a number, name, label and intent."""
-        query, name, label, intent = words
-        slot, held, buried, refused, since_safe, doubted, good = state["counts"].tolist()
-        belief = None
-        if "belief" in state:
-            belief = Belief(*(torch.from_numpy(state[key]).to(device) for key in ("belief", "cell_point")))
-        answer = None
-        if "answer.numbers" in state:
-            confidence, visible, number, lost_p = state["answer.numbers"].tolist()
-            answer = Answer(
-                uv_px=state["answer.uv_px"],
-                point_world=state["answer.point_world"],
-                confidence=confidence,
-                visible=bool(visible),
-                state=_STATES[int(number)],
-                lost_p=lost_p,
-                signals=state["answer.signals"],
-            )
-        safe = [
-            Safe(Ground.restored(config, part(state, f"safe{i}.ground.")), state[f"safe{i}.place"])
-            for i in range(2)
-            if f"safe{i}.place" in state
-        ]
-        return cls(
-            query=query,
-            name=name,
-            label=label,
-            intent=intent,
-            slot=None if slot < 0 else slot,
-            ground=Ground.restored(config, part(state, "ground.")),
-            belief=belief,
-            place=state.get("place"),
-            mark_px=state.get("mark_px"),
-            home=state.get("home"),
-            mark=state.get("mark"),
-            held=bool(held),
-            buried=bool(buried),
-            refused=refused,
-            born=torch.from_numpy(state["born"]).to(device) if "born" in state else None,
-            safe=deque(safe, maxlen=2),
-            since_safe=since_safe,
-            doubted=bool(doubted),
-            good=good,
-            answer=answer,
-        )
-
 
 def as_rows(places: Iterable[Float[np.ndarray, "3"] | None]) -> Float[np.ndarray, "K 3"]:
     """Places of queries as one array; NaN where one is not known."""
     unknown = np.full(3, np.nan)
     return np.array([unknown if place is None else place for place in places]).reshape(-1, 3)
-
-
-def part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
-    """The arrays of a state whose names begin with a prefix, without it."""
-    return {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}

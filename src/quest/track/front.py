@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -18,6 +18,7 @@ OFF_TURN = 0.1
 """What is farther than this from where a turn brings it, reference units, is not there."""
 
 
+@dataclass(eq=False)
 class Front:
     """What is known of the plane around a query.
 
@@ -25,14 +26,16 @@ class Front:
         sigma: standard deviation of a seen point per coordinate, reference units.
     """
 
-    def __init__(self, sigma: float) -> None:
-        self._sigma = sigma
-        self._hinge = HingeEstimator(sigma)
-        self._plane: Plane | None = None
-        self._normal: np.ndarray | None = None
-        self._unseen = 0.0
-        self._contradicted = 0
-        self._insisted = 0
+    sigma: float
+    _hinge: HingeEstimator = field(init=False)
+    _plane: Plane | None = field(default=None, init=False)
+    _normal: Float[np.ndarray, "3"] | None = field(default=None, init=False)
+    _unseen: float = field(default=0.0, init=False)
+    _contradicted: int = field(default=0, init=False)
+    _insisted: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        self._hinge = HingeEstimator(self.sigma)
 
     @property
     def joint(self) -> Joint | None:
@@ -104,7 +107,7 @@ class Front:
         return given_up
 
     def _give_up(self) -> None:
-        self._hinge, self._normal = HingeEstimator(self._sigma), None
+        self._hinge, self._normal = HingeEstimator(self.sigma), None
         self._contradicted = self._insisted = 0
 
     def learn(self, point: Float[np.ndarray, "3"]) -> None:
@@ -119,17 +122,3 @@ class Front:
             return None
         turned = self._hinge.turned(self._plane.normal)
         return float(joint.locate(own.rest[None])[0] + np.sign(joint.axis @ own.axis) * turned)
-
-    def state(self) -> dict[str, np.ndarray]:
-        """What the next frame depends on, as numeric arrays."""
-        found = {f"hinge.{key}": value for key, value in self._hinge.state().items()}
-        found["counts"] = np.array([self._unseen, self._contradicted, self._insisted])
-        return found if self._normal is None else {**found, "normal": self._normal}
-
-    def restore(self, state: Mapping[str, np.ndarray]) -> None:
-        """Go on where :meth:`state` was taken."""
-        prefix = "hinge."
-        self._hinge.restore({key.removeprefix(prefix): v for key, v in state.items() if key.startswith(prefix)})
-        self._unseen, contradicted, insisted = state["counts"].tolist()
-        self._contradicted, self._insisted, self._normal = int(contradicted), int(insisted), state.get("normal")
-        self._plane = None

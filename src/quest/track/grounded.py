@@ -6,8 +6,7 @@ Everything here is in the reference frame of the stream (see :mod:`quest.model.o
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -58,6 +57,7 @@ class Curve:
     spread: Float[np.ndarray, " M"]
 
 
+@dataclass(eq=False)
 class Ground:
     """The joint of one query and where along it the query may be.
 
@@ -67,16 +67,21 @@ class Ground:
             first seen, and only what the image shows plainly takes it away from there.
     """
 
-    def __init__(self, config: TrackerConfig, *, fixed: bool = False) -> None:
-        self.fixed = fixed
-        self._config = config
-        self._expectation = Expectation()
-        self._estimator = JointEstimator(config.point_sigma)
-        self._curves: tuple[Curve, ...] = ()
-        self._recent: deque[tuple[float, np.ndarray]] = deque(maxlen=_RECENT)
-        self._along: np.ndarray | None = None
-        self._hidden = 0.0
-        self.front = Front(config.point_sigma)
+    config: TrackerConfig
+    fixed: bool = field(default=False, kw_only=True)
+    front: Front = field(init=False)
+    _expectation: Expectation = field(default_factory=Expectation, init=False)
+    _estimator: JointEstimator = field(init=False)
+    _curves: tuple[Curve, ...] = field(default=(), init=False)
+    _recent: deque[tuple[float, Float[np.ndarray, "3"]]] = field(
+        default_factory=lambda: deque(maxlen=_RECENT), init=False
+    )
+    _along: Float[np.ndarray, " M"] | None = field(default=None, init=False)
+    _hidden: float = field(default=0.0, init=False)
+
+    def __post_init__(self) -> None:
+        self.front = Front(self.config.point_sigma)
+        self._estimator = JointEstimator(self.config.point_sigma)
 
     @property
     def joint(self) -> Joint | None:
@@ -116,14 +121,14 @@ class Ground:
 
     def favour(self, point: Float[np.ndarray, "C 3"]) -> Float[np.ndarray, " C"]:
         """How well points agree with the joint: log weights, at most 0, at least ``off_joint``."""
-        floor = _OFF_FIXED if self.fixed else self._config.off_joint
+        floor = _OFF_FIXED if self.fixed else self.config.off_joint
         if not self._curves:
             return np.zeros(len(point))
         total = np.full(len(point), floor)
         for curve in self._curves:
             # Squares by a matrix product: this runs for every cell, query and frame.
             square = np.square(point).sum(1)[:, None] - 2 * point @ curve.point.T + np.square(curve.point).sum(1)
-            variance = np.square(curve.spread) + self._config.joint_sigma**2
+            variance = np.square(curve.spread) + self.config.joint_sigma**2
             best = (-0.5 * square / variance + self._turned(curve)).max(axis=1) + curve.log_weight
             total = np.logaddexp(total, np.where(np.isnan(best), -np.inf, best))
         return np.minimum(total, 0.0)
@@ -137,12 +142,12 @@ class Ground:
         turned = self.front.turned(curve.joint)
         if turned is not None:
             # How the front stands tells more than where on it something is seen.
-            sigma = np.hypot(_TURN_SIGMA_RAD, self._config.point_sigma / max(curve.joint.radius, 1e-6))
+            sigma = np.hypot(_TURN_SIGMA_RAD, self.config.point_sigma / max(curve.joint.radius, 1e-6))
             gap = float(np.angle(np.exp(1j * (q[0] - turned))))
             share = _TURN_SIGMA_RAD**2 / sigma**2 if abs(gap) < 3 * sigma else 0.0
             q = np.array([turned + share * gap])
         on, spread = curve.joint.at(q)[0], float(curve.joint.spread(q)[0])
-        sigma = self._config.point_sigma
+        sigma = self.config.point_sigma
         share = spread**2 / (spread**2 + sigma**2)
         near = np.exp(-0.5 * np.square(np.linalg.norm(point - on) / np.hypot(spread, 2 * sigma)))
         # What is too far from the joint is not on it, unless the front of the link tells that it is.
@@ -155,7 +160,7 @@ class Ground:
         curve = self._best_curve
         q = curve.joint.locate(point[None])
         gap = np.linalg.norm(point - curve.joint.at(q)[0])
-        return float(gap / np.hypot(curve.joint.spread(q)[0], self._config.point_sigma))
+        return float(gap / np.hypot(curve.joint.spread(q)[0], self.config.point_sigma))
 
     def covered(self, before: Float[np.ndarray, "3"], frame: Evidence, elapsed: float) -> float:
         """Share of the places where a query can be now that lie behind something that is not its own link.
@@ -185,7 +190,7 @@ class Ground:
         if not self._curves or not known.any():
             return None
         curve = self._best_curve
-        sigma = np.hypot(curve.spread, self._config.joint_sigma)
+        sigma = np.hypot(curve.spread, self.config.joint_sigma)
         gap = np.linalg.norm(np.nan_to_num(point)[:, None] - curve.point[None], axis=-1) / sigma
         density = np.where(known, np.exp(-0.5 * np.square(gap)) @ self._predicted(before, elapsed), 0.0)
         return density / density.sum() if density.sum() > 1e-12 else None
@@ -214,7 +219,7 @@ class Ground:
         if not self._curves:
             return before
         curve, prior = self._best_curve, self._predicted(before, elapsed, moving=buried)
-        score = self._config.hidden_trust * np.nan_to_num(frame.ratio(curve.point))
+        score = self.config.hidden_trust * np.nan_to_num(frame.ratio(curve.point))
         if buried:
             # What seems to show it adds nothing: frames are alike, and a look-alike would soon outweigh everything.
             score = np.where(self._buried(frame), 0.0, np.clip(score, _LOG_MISSED, 0.0))
@@ -225,43 +230,11 @@ class Ground:
         score = np.where(frame.room(curve.point) > tolerance, score + _LOG_FREE_SPACE, score)
         likelihood = (1 - seen) * _normalised(score)
         if np.isfinite(point).all():
-            gap = np.linalg.norm(curve.point - point, axis=1) / np.hypot(curve.spread, 2 * self._config.point_sigma)
+            gap = np.linalg.norm(curve.point - point, axis=1) / np.hypot(curve.spread, 2 * self.config.point_sigma)
             likelihood += seen * np.exp(-0.5 * gap.min() ** 2) * _normalised(-0.5 * np.square(gap))
         posterior = prior * (likelihood + 1e-9)
         self._along, self._hidden = posterior / posterior.sum(), self._held_for(before) + elapsed
         return curve.joint.at(np.array([self._along @ curve.q]))[0]
-
-    def copy(self) -> Ground:
-        """The same, which learns by itself from now on."""
-        return Ground.restored(self._config, self.state())
-
-    def state(self) -> dict[str, np.ndarray]:
-        """Everything that its answers depend on, as numeric arrays."""
-        found = {f"expectation.{key}": value for key, value in self._expectation.state().items()}
-        found |= {f"estimator.{key}": value for key, value in self._estimator.state().items()}
-        found["recent"] = np.array([point for _, point in self._recent]).reshape(-1, 3)
-        found["recent_at"] = np.array([now for now, _ in self._recent])
-        found |= {"hidden": np.array(self._hidden), "fixed": np.array(self.fixed)}
-        found |= {f"front.{key}": value for key, value in self.front.state().items()}
-        return found if self._along is None else {**found, "along": self._along}
-
-    @classmethod
-    def restored(cls, config: TrackerConfig, state: Mapping[str, np.ndarray]) -> Ground:
-        """Go on where :meth:`state` was taken."""
-        ground = cls(config, fixed=bool(state["fixed"]))
-        parts: dict[str, dict[str, np.ndarray]] = {"expectation": {}, "estimator": {}, "front": {}}
-        for key, value in state.items():
-            owner, _, name = key.partition(".")
-            parts.setdefault(owner, {})[name] = value
-        ground._expectation = Expectation.restored(parts["expectation"])
-        ground._estimator.restore(parts["estimator"])
-        ground.front.restore(parts["front"])
-        prior = ground._estimator.prior
-        if prior is not None:
-            ground._curves = ground._make_curves(prior)
-        ground._recent.extend(zip(state["recent_at"].tolist(), state["recent"], strict=True))
-        ground._along, ground._hidden = state.get("along"), float(state["hidden"])
-        return ground
 
     def _on_turn(self, point: np.ndarray) -> bool:
         """Whether a sight is where the link's turn brings the query, as far as that is known."""
@@ -299,7 +272,7 @@ class Ground:
                 What was never seen to move does neither: the sign of a joint that is only believed means nothing.
         """
         curve = self._best_curve
-        sigma = self._config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1) * elapsed
+        sigma = self.config.along_sigma * (2 if curve.joint.kind is JointKind.REVOLUTE else 1) * elapsed
         hidden = self._held_for(before)
         if hidden and self._along is not None:
             start = self._along
@@ -335,7 +308,7 @@ class Ground:
             return (_curve(joint, 0.0),)
         weights = {JointKind.REVOLUTE: prior.revolute_probability, JointKind.PRISMATIC: 1 - prior.revolute_probability}
         return tuple(
-            _curve(joint_from_prior(prior, joint.rest, kind=k, rest_sigma=self._config.point_sigma), float(np.log(w)))
+            _curve(joint_from_prior(prior, joint.rest, kind=k, rest_sigma=self.config.point_sigma), float(np.log(w)))
             for k, w in weights.items()
         )
 

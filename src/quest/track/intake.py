@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -37,6 +37,30 @@ class Arrival(Enum):
     DUPLICATE = "duplicate"
 
 
+@dataclass
+class IntakeState:
+    """What the next frame of a stream depends on.
+
+    Attributes:
+        reference: the reference frame; None before the first frame.
+        elapsed: time since the frame before in frames of 30 per second, within 1 to 10.
+        now: time of the newest frame in frames of 30 per second: the sum of what passed between frames, at least 1
+            each, however long it was.
+        flags: degradations of the newest frame, in words.
+        stamp_s: of the newest frame; None before the first.
+        pose: ``cam_from_world`` of the newest frame that had one.
+        digest: of the colours of the newest frame.
+    """
+
+    reference: Reference | None = None
+    elapsed: float = 1.0
+    now: float = 0.0
+    flags: tuple[str, ...] = ()
+    stamp_s: float | None = None
+    pose: Float[np.ndarray, "4 4"] | None = None
+    digest: str = ""
+
+
 class Intake:
     """Checks the frames of one stream and prepares them.
 
@@ -47,24 +71,13 @@ class Intake:
 
     Attributes:
         letterbox: between the source image and the network's input.
-        reference: the reference frame; None before the first frame.
-        elapsed: time since the frame before in frames of 30 per second, within 1 to 10.
-        now: time of the newest frame in frames of 30 per second: the sum of what passed between frames, at least 1
-            each, however long it was.
-        flags: degradations of the newest frame, in words.
+        state: what the next frame depends on.
     """
 
     def __init__(self, network: QuestNetwork, camera: Camera, *, device: torch.device) -> None:
         self.letterbox = Letterbox(camera, network.config.encoder.image_size)
-        self.reference: Reference | None = None
-        self.elapsed = 1.0
-        self.now = 0.0
-        self.flags: tuple[str, ...] = ()
+        self.state = IntakeState()
         self._framer = Framer(network, self.letterbox.camera, device=device)
-        self._device = device
-        self._stamp_s: float | None = None
-        self._pose: np.ndarray | None = None
-        self._digest = b""
         self._features: Tensor | None = None
 
     def check(
@@ -109,25 +122,25 @@ class Intake:
 
         A stamp that lies more than five seconds back means that the clock began anew.
         """
-        before = self._stamp_s
-        self.flags = ()
+        before = self.state.stamp_s
+        self.state.flags = ()
         if before is not None and stamp_s < before:
             if before - stamp_s <= _CLOCK_RESTART_S:
-                self.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
+                self.state.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
                 return Arrival.LATE
-            self.flags = (f"clock went back by {before - stamp_s:.1f} s",)
-        digest = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16).digest()
-        same = digest == self._digest
+            self.state.flags = (f"clock went back by {before - stamp_s:.1f} s",)
+        digest = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16).hexdigest()
+        same = digest == self.state.digest
         if same and stamp_s == before:
-            self.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
+            self.state.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
             return Arrival.DUPLICATE
         if not same:
             self._features = None
         since = 0.0 if before is None else stamp_s - before
         # Rounded, because stamps are: a 30th of a second is one frame, however it was written down.
         passed = max(1.0, round(since * _FRAMES_PER_S, 3))
-        self.elapsed, self.now = min(passed, _MOST_FRAMES), self.now + passed
-        self._stamp_s, self._digest = stamp_s, digest
+        self.state.elapsed, self.state.now = min(passed, _MOST_FRAMES), self.state.now + passed
+        self.state.stamp_s, self.state.digest = stamp_s, digest
         return Arrival.NEW
 
     def prepare(
@@ -142,26 +155,28 @@ class Intake:
         """
         median_m = None if depth_m is None else _implausible(depth_m)
         if median_m is not None:
-            self.flags += (f"depth ignored: {median_m:.3g} m in the median",)
+            self.state.flags += (f"depth ignored: {median_m:.3g} m in the median",)
             depth_m = None
         depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
         pose = torch.from_numpy(self._pose_of(cam_from_world))
         if not (depth > 0).any():
-            self.flags += (NO_DEPTH_FLAG,)
-        renewed = self.reference is None or (not self.reference.has_depth and self._framer.shows_depth(depth))
+            self.state.flags += (NO_DEPTH_FLAG,)
+        renewed = self.state.reference is None or (
+            not self.state.reference.has_depth and self._framer.shows_depth(depth)
+        )
         if renewed:
-            if self.reference is not None:
-                self.flags += (DEPTH_BEGINS_FLAG,)
-            self.reference = self._framer.reference(depth, pose)
-        assert self.reference is not None
+            if self.state.reference is not None:
+                self.state.flags += (DEPTH_BEGINS_FLAG,)
+            self.state.reference = self._framer.reference(depth, pose)
+        assert self.state.reference is not None
         # The same picture again is not looked at again.
-        frames = self._framer.frame(self.letterbox.rgb(rgb), depth, pose, self.reference, features=self._features)
+        frames = self._framer.frame(self.letterbox.rgb(rgb), depth, pose, self.state.reference, features=self._features)
         self._features = frames.features
         return frames, renewed
 
     @property
     def _has_depth(self) -> bool:
-        return self.reference is not None and self.reference.has_depth
+        return self.state.reference is not None and self.state.reference.has_depth
 
     def _pose_of(self, cam_from_world: np.ndarray | None) -> np.ndarray:
         """The frame's pose; where a posed stream misses one, the last one.
@@ -169,41 +184,15 @@ class Intake:
         A stream whose poses begin late was taken to stand still until then.
         """
         if cam_from_world is not None:
-            if self._pose is None and self.reference is not None:
-                self.reference = replace(self.reference, cam_from_world=torch.from_numpy(nearest_rigid(cam_from_world)))
-                self.flags += ("poses begin: world points were in the camera's axes before",)
-            self._pose = nearest_rigid(cam_from_world)
-        elif self._pose is not None:
-            self.flags += ("no pose: that of the frame before is used",)
-        return np.eye(4) if self._pose is None else self._pose
-
-    def state(self) -> dict[str, np.ndarray]:
-        """What the next frame depends on, as numeric arrays."""
-        found: dict[str, np.ndarray] = {"digest": np.frombuffer(self._digest, np.uint8), "now": np.array(self.now)}
-        if self._stamp_s is not None:
-            found["stamp_s"] = np.array(self._stamp_s)
-        if self._pose is not None:
-            found["pose"] = self._pose
-        if self.reference is not None:
-            found["reference.cam_from_world"] = self.reference.cam_from_world.numpy()
-            found["reference.center"] = self.reference.center.cpu().numpy()
-            found["reference.scale"] = self.reference.scale.cpu().numpy()
-            found["reference.has_depth"] = np.array(self.reference.has_depth)
-        return found
-
-    def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on where :meth:`state` was taken."""
-        self._digest, self._features, self.now = state["digest"].tobytes(), None, float(state["now"])
-        self._stamp_s = float(state["stamp_s"]) if "stamp_s" in state else None
-        self._pose = state.get("pose")
-        self.reference = None
-        if "reference.scale" in state:
-            self.reference = Reference(
-                torch.from_numpy(state["reference.cam_from_world"]),
-                torch.from_numpy(state["reference.center"]).to(self._device),
-                torch.from_numpy(state["reference.scale"]).to(self._device),
-                bool(state["reference.has_depth"]),
-            )
+            if self.state.pose is None and self.state.reference is not None:
+                self.state.reference = replace(
+                    self.state.reference, cam_from_world=torch.from_numpy(nearest_rigid(cam_from_world))
+                )
+                self.state.flags += ("poses begin: world points were in the camera's axes before",)
+            self.state.pose = nearest_rigid(cam_from_world)
+        elif self.state.pose is not None:
+            self.state.flags += ("no pose: that of the frame before is used",)
+        return np.eye(4) if self.state.pose is None else self.state.pose
 
 
 def _implausible(depth_m: Float32[np.ndarray, "H W"]) -> float | None:

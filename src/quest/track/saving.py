@@ -1,68 +1,121 @@
-"""Streams as bytes: saved, kept anywhere, and gone on with later or elsewhere."""
+"""State as bytes: a tree of dataclasses, containers, arrays and numbers becomes a safetensors file and a tree again."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
-from typing import Any
+from collections import deque
+from dataclasses import fields, is_dataclass
+from enum import Enum
+from types import NoneType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
-from safetensors.numpy import load, save
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-10"
+FORMAT = "quest-stream-11"
 _KEY = "quest-stream"
+_T = TypeVar("_T")
 
 
-@dataclass(frozen=True)
-class SavedStream:
-    """A stream outside of a process.
+def save(tree: object) -> bytes:
+    """A tree as a safetensors file; the same tree gives the same bytes.
 
-    Attributes:
-        maker: weights, settings and camera that it belongs to.
-        alpha: of its alarms; None without.
-        alpha_frames: that alpha is for; None for the whole stream.
-        words: its state that JSON can hold.
-        arrays: the rest of its state.
+    Args:
+        tree: dataclasses, lists, tuples, deques, dicts, arrays, tensors, enums, numbers, texts and None, nested freely.
     """
-
-    maker: dict[str, Any]
-    alpha: float | None
-    alpha_frames: int | None
-    words: dict[str, Any]
-    arrays: dict[str, np.ndarray]
-
-    def to_bytes(self) -> bytes:
-        """A safetensors file; the same state gives the same bytes."""
-        header = {"format": FORMAT} | {f.name: getattr(self, f.name) for f in fields(self) if f.name != "arrays"}
-        arrays = {key: np.asarray(value, order="C") for key, value in self.arrays.items()}
-        # One entry: the order of several is not fixed.
-        return save(arrays, metadata={_KEY: json.dumps(header, sort_keys=True, default=_plain)})
-
-    @classmethod
-    def from_bytes(cls, data: bytes) -> SavedStream:
-        """Read what :meth:`to_bytes` gave.
-
-        Raises:
-            InputError: the bytes are torn or are no saved stream.
-        """
-        try:
-            arrays = load(data)
-            length = int.from_bytes(data[:8], "little")
-            header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
-        except (SafetensorError, KeyError, ValueError) as error:
-            raise InputError(
-                f"saved stream: expected the bytes of Stream.save(), got {len(data)} bytes that are not ({error})"
-            ) from error
-        if header.get("format") != FORMAT:
-            raise InputError(f"saved stream: expected format {FORMAT!r}, got {header.get('format')!r}")
-        return cls(header["maker"], header["alpha"], header["alpha_frames"], header["words"], arrays)
+    tensors: dict[str, Tensor] = {}
+    header = {"format": FORMAT, "tree": _flatten(tree, "tree", tensors)}
+    # One entry: the order of several is not fixed.
+    return save_tensors(tensors, metadata={_KEY: json.dumps(header, sort_keys=True)})
 
 
-def _plain(value: Any) -> Any:
-    """A number of numpy as Python's: what cameras and queries were given."""
+def load(data: bytes, kind: type[_T], *, device: torch.device | str = "cpu") -> _T:
+    """The tree that :func:`save` was given.
+
+    Args:
+        data: what it gave.
+        kind: type of the tree; the annotations of dataclasses tell the types of what they hold.
+        device: where tensors go. Those in double precision stay on the CPU, because not every device has it.
+
+    Raises:
+        InputError: the bytes are corrupt, of another format, or hold another kind of tree.
+    """
+    try:
+        tensors = load_tensors(data)
+        length = int.from_bytes(data[:8], "little")
+        header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
+        if header["format"] == FORMAT:
+            return _unflatten(kind, header["tree"], tensors, torch.device(device))
+    except (SafetensorError, KeyError, ValueError, TypeError) as error:
+        raise InputError(
+            f"saved stream: expected the bytes of Tracker.save(), got {len(data)} bytes that are not ({error})"
+        ) from error
+    raise InputError(f"saved stream: expected format {FORMAT!r}, got {header['format']!r}")
+
+
+def _flatten(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:
+    """A value as JSON; arrays and tensors are put aside under their path."""
+    if isinstance(value, np.ndarray):
+        tensors[path] = torch.from_numpy(np.array(value, order="C"))
+        return {"array": path}
+    if isinstance(value, Tensor):
+        tensors[path] = value.detach().cpu().clone(memory_format=torch.contiguous_format)
+        return {"tensor": path}
+    if isinstance(value, Enum):
+        return value.value
     if isinstance(value, np.generic):
         return value.item()
-    raise TypeError(f"{type(value).__name__} is no number")
+    if is_dataclass(value):
+        return {f.name: _flatten(getattr(value, f.name), f"{path}.{f.name}", tensors) for f in fields(value)}
+    if isinstance(value, dict):
+        return [[key, _flatten(item, f"{path}.{key}", tensors)] for key, item in value.items()]
+    if isinstance(value, deque):
+        return {"maxlen": value.maxlen, "items": _flatten(list(value), path, tensors)}
+    if isinstance(value, list | tuple):
+        return [_flatten(item, f"{path}.{i}", tensors) for i, item in enumerate(value)]
+    return value
+
+
+def _unflatten(kind: Any, node: Any, tensors: dict[str, Tensor], device: torch.device) -> Any:
+    """What :func:`_flatten` was given, by its type."""
+
+    def item(kind: Any, node: Any) -> Any:
+        return _unflatten(kind, node, tensors, device)
+
+    origin, args = get_origin(kind), get_args(kind)
+    if node is None:
+        return None
+    if isinstance(node, dict) and len(node) == 1 and "array" in node:
+        return tensors[node["array"]].numpy()
+    if isinstance(node, dict) and len(node) == 1 and "tensor" in node:
+        tensor = tensors[node["tensor"]]
+        return tensor if tensor.dtype == torch.float64 else tensor.to(device)
+    if NoneType in args:
+        return item(next(arg for arg in args if arg is not NoneType), node)
+    if is_dataclass(kind):
+        return _made(kind, {name: item(of, node[name]) for name, of in get_type_hints(kind).items()})
+    if origin is dict:
+        return {key: item(args[1], value) for key, value in node}
+    if origin is deque:
+        return deque((item(args[0], value) for value in node["items"]), node["maxlen"])
+    if origin is list:
+        return [item(args[0], value) for value in node]
+    if origin is tuple:
+        kinds = args[:1] * len(node) if args[1:] == (...,) else args
+        return tuple(item(of, value) for of, value in zip(kinds, node, strict=True))
+    return kind(node) if isinstance(kind, type) and issubclass(kind, Enum) else node
+
+
+def _made(kind: Any, values: dict[str, Any]) -> Any:
+    """A dataclass of such fields; those that its constructor does not take are set afterwards."""
+    made = kind(**{f.name: values[f.name] for f in fields(kind) if f.init})
+    for f in fields(kind):
+        if not f.init:
+            setattr(made, f.name, values[f.name])
+    return made

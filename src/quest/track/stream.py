@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, fields, replace
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -14,14 +13,14 @@ from torch import Tensor
 
 from quest.errors import InputError
 from quest.grounding import LinkGroups
-from quest.model.decoder import Anchor, Prediction
+from quest.model.decoder import Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
-from quest.monitor import SIGNALS, Alarm, Budget, Monitor, Signals, Verdict
-from quest.track.binding import Binding, Waiting
+from quest.monitor import SIGNALS, Alarm, Budget, Monitor, MonitorState, Signals, Verdict
+from quest.track.binding import Binding, BindingState
 from quest.track.expectation import joint_rows
-from quest.track.following import Answer, Following, part
-from quest.track.intake import Arrival, Intake
+from quest.track.following import Answer, Following
+from quest.track.intake import Arrival, Intake, IntakeState
 from quest.track.lifting import lift_near
 from quest.track.marks import beside, marked
 from quest.track.matching import match
@@ -40,10 +39,35 @@ _DOUBTED_ABOVE = 0.95
 nearer in the mean, wrong as it may be: what is lost has often only drifted, and what is taken back is left behind."""
 
 
+@dataclass
+class Memory:
+    """Everything that the next answers depend on, in bounded size; callbacks are left out.
+
+    Attributes:
+        intake: of the frames that came.
+        binding: of the queries' anchors, and of queries without one.
+        ring: the newest T frames as observed.
+        monitor: None where nothing is watched.
+        following: queries that have found their entity.
+        links: which of them share a joint.
+        frame: index of the next frame.
+        stamp_s: time of the newest frame.
+        has_depth: whether the newest frame brought any depth.
+    """
+
+    intake: IntakeState
+    binding: BindingState
+    ring: deque[Observation]
+    monitor: MonitorState | None
+    following: list[Following] = field(default_factory=list)
+    links: LinkGroups = field(default_factory=lambda: LinkGroups(SIGMA))
+    frame: int = 0
+    stamp_s: float = 0.0
+    has_depth: bool = False
+
+
 class Stream:
     """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
-
-    The memory is a ring of T observed frames and, per query, an anchor, a belief, a joint and what the monitor needs.
 
     Args:
         network: trained network in evaluation mode.
@@ -76,13 +100,25 @@ class Stream:
         self._monitor = monitor
         self._intake = Intake(network, camera, device=device)
         self._binding = Binding(network, config, self._intake.letterbox, queries)
-        self._ring: deque[Observation] = deque(maxlen=network.config.window)
-        self._following: list[Following] = []
-        self._links = LinkGroups(SIGMA)
+        self._memory = Memory(
+            self._intake.state,
+            self._binding.state,
+            deque(maxlen=network.config.window),
+            None if monitor is None else monitor.state,
+        )
         self._callbacks: list[Callable[[Alarm], None]] = []
-        self._t = 0
-        self._stamp_s, self._has_depth = 0.0, False
         self._raised: tuple[Alarm, ...] = ()
+
+    @property
+    def memory(self) -> Memory:
+        """Everything that the next answers depend on; set it to go on where another stream of this tracker was."""
+        return self._memory
+
+    @memory.setter
+    def memory(self, memory: Memory) -> None:
+        self._memory, self._intake.state, self._binding.state = memory, memory.intake, memory.binding
+        if self._monitor is not None and memory.monitor is not None:
+            self._monitor.state = memory.monitor
 
     @property
     def camera(self) -> Camera:
@@ -97,17 +133,17 @@ class Stream:
     @property
     def frame(self) -> int:
         """Index of the next frame; point queries that are added now begin there or later."""
-        return self._t
+        return self._memory.frame
 
     @property
     def unbound(self) -> tuple[Query, ...]:
         """Queries that have not found their entity, and point queries whose frame has not come."""
-        return tuple(w.query for w in self._binding.waiting)
+        return tuple(w.query for w in self._binding.state.waiting)
 
     @property
     def looking(self) -> bool:
         """Whether a query may still find its entity: labels and slots look for it in the first frames alone."""
-        return self._binding.looking(self._t)
+        return self._binding.looking(self._memory.frame)
 
     def add(self, query: Query) -> int:
         """Follow one more entity from the next frame on; returns the query's number.
@@ -115,7 +151,7 @@ class Stream:
         Raises:
             InputError: a point query lies outside the image or in a frame that has passed, or its name is taken.
         """
-        return self._binding.ask(query, frame=self._t, following=self._following)
+        return self._binding.ask(query, frame=self._memory.frame, following=self._memory.following)
 
     def retire(self, query: int | str) -> None:
         """Follow a query no longer, by its number or name.
@@ -123,15 +159,15 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits.
         """
-        number = self._binding.find(query, self._following)
-        rows = [i for i, f in enumerate(self._following) if f.query != number]
-        if len(rows) < len(self._following):
+        number = self._binding.find(query, self._memory.following)
+        rows = [i for i, f in enumerate(self._memory.following) if f.query != number]
+        if len(rows) < len(self._memory.following):
             self._binding.keep(rows)
-            self._links.forget(number)
+            self._memory.links.forget(number)
             if self._monitor is not None:
                 self._monitor.forget(number)
-        self._following = [self._following[i] for i in rows]
-        self._binding.waiting = [w for w in self._binding.waiting if w.number != number]
+        self._memory.following = [self._memory.following[i] for i in rows]
+        self._binding.state.waiting = [w for w in self._binding.state.waiting if w.number != number]
 
     def rename(self, query: int | str, name: str) -> None:
         """Call a query by another name in all answers from now on.
@@ -139,16 +175,17 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits, or another has the new name.
         """
-        number = self._binding.find(query, self._following)
-        if name in {other for k, other in self._binding.names(self._following).items() if k != number}:
+        number = self._binding.find(query, self._memory.following)
+        if name in {other for k, other in self._binding.names(self._memory.following).items() if k != number}:
             raise InputError(f"query {query!r}: another query is called {name!r} already; choose another name")
-        for following in self._following:
+        for following in self._memory.following:
             if following.query == number:
                 following.name = name
                 if self._monitor is not None:
                     self._monitor.rename(number, name)
-        self._binding.waiting = [
-            replace(w, query=replace(w.query, name=name)) if w.number == number else w for w in self._binding.waiting
+        self._binding.state.waiting = [
+            replace(w, query=replace(w.query, name=name)) if w.number == number else w
+            for w in self._binding.state.waiting
         ]
 
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
@@ -177,117 +214,74 @@ class Stream:
             InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
                 rigid; the stream stays as it was.
         """
-        intake, self._raised = self._intake, ()
+        intake, memory, self._raised = self._intake, self._memory, ()
         stamp_s = float(stamp_s)
-        intake.check(self._t, rgb, depth_m, stamp_s, cam_from_world)
+        intake.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
         if intake.admit(rgb, stamp_s) is not Arrival.NEW:
-            self._t += 1
+            memory.frame += 1
             self._binding.wait()
             return self._state()
         with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
             frames, renewed = intake.prepare(rgb, depth_m, cam_from_world)
             if renewed:
                 # Coordinates change with the reference, so nothing observed before may be mixed with it.
-                self._ring.clear()
-                self._links = LinkGroups(SIGMA)
-                for following in self._following:
+                memory.ring.clear()
+                memory.links = LinkGroups(SIGMA)
+                for following in memory.following:
                     following.forget_places(self._config)
             observed, slots = self._network.observe(frames), None
             if renewed:
-                self._binding.bind_again(observed, frames, self._following)
+                self._binding.bind_again(observed, frames, memory.following)
             learned = self._network.config.queries == "learned"
-            while not learned and len(self._ring) < self._network.config.window - 1:
-                self._ring.append(observed)
-            self._ring.append(observed)
+            while not learned and len(memory.ring) < self._network.config.window - 1:
+                memory.ring.append(observed)
+            memory.ring.append(observed)
             if learned:
-                slots = decode_slots(self._network, Observation.stack(list(self._ring)), frames)
-            for found in self._binding.bind(self._t, observed, frames, self._following, slots):
-                self._following.append(found)
+                slots = decode_slots(self._network, Observation.stack(list(memory.ring)), frames)
+            for found in self._binding.bind(memory.frame, observed, frames, memory.following, slots):
+                memory.following.append(found)
                 if self._monitor is not None:
                     self._monitor.watch(found.query, found.name)
-            self._stamp_s, self._has_depth = stamp_s, bool((frames.depth_m > 0).any())
+            memory.stamp_s, memory.has_depth = stamp_s, bool((frames.depth_m > 0).any())
             self._answer(frames, slots)
-        self._t += 1
+        self._memory.frame += 1
         for alarm in self._raised:
             for callback in self._callbacks:
                 callback(alarm)
         return self._state()
 
-    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the next answers depend on: numeric arrays, and what JSON can hold.
-
-        Callbacks are left out.
-        """
-        arrays = {f"intake.{key}": value for key, value in self._intake.state().items()}
-        arrays |= {f"links.{key}": value for key, value in self._links.state().items()}
-        for i, observed in enumerate(self._ring):
-            arrays |= {f"ring{i}.{f.name}": _numpy(getattr(observed, f.name)) for f in fields(Observation)}
-        if self._binding.anchor is not None:
-            arrays |= {f"anchor.{f.name}": _numpy(getattr(self._binding.anchor, f.name)) for f in fields(Anchor)}
-        for i, query in enumerate(self._following):
-            arrays |= {f"query{i}.{key}": value for key, value in query.state().items()}
-        if self._monitor is not None:
-            arrays |= {f"monitor.{key}": value for key, value in self._monitor.state().items()}
-        words = {
-            "frame": self._t,
-            "stamp_s": self._stamp_s,
-            "has_depth": self._has_depth,
-            "flags": list(self._intake.flags),
-            "discover": self._binding.discover,
-            "numbered": self._binding.numbered,
-            "waiting": [asdict(w) for w in self._binding.waiting],
-            "following": [[f.query, f.name, f.label, f.intent] for f in self._following],
-        }
-        return arrays, words
-
-    def restore(self, arrays: Mapping[str, np.ndarray], words: Mapping[str, Any]) -> None:
-        """Go on where :meth:`state` was taken, in a stream of the same network, settings and camera."""
-        device = self._device
-        self._t, self._stamp_s, self._has_depth = words["frame"], words["stamp_s"], words["has_depth"]
-        self._intake.restore(part(arrays, "intake."))
-        self._links.restore(part(arrays, "links."))
-        self._intake.flags = tuple(words["flags"])
-        self._ring.clear()
-        for i in range(self._network.config.window):
-            observed = part(arrays, f"ring{i}.")
-            if observed:
-                self._ring.append(Observation(**{k: torch.from_numpy(v).to(device) for k, v in observed.items()}))
-        anchor = part(arrays, "anchor.")
-        binding = self._binding
-        binding.anchor = Anchor(**{k: torch.from_numpy(v).to(device) for k, v in anchor.items()}) if anchor else None
-        binding.discover, binding.numbered = words["discover"], words["numbered"]
-        binding.waiting = [Waiting.from_json(waiting) for waiting in words["waiting"]]
-        self._following = [
-            Following.restored(words, part(arrays, f"query{i}."), config=self._config, device=device)
-            for i, words in enumerate(words["following"])
-        ]
-        if self._monitor is not None:
-            self._monitor.restore(part(arrays, "monitor."))
-
     def _answer(self, frames: FrameBatch, slots: Slots | None) -> None:
         """Place every query in the newest frame, judge it, and keep the answers."""
-        following = self._following
+        memory, following = self._memory, self._memory.following
         if slots is not None and following:
-            self._keep(*place_slots(slots, following, has_depth=self._has_depth), no_signals(len(following)))
-        if slots is not None or not following or self._binding.anchor is None:
+            self._keep(*place_slots(slots, following, has_depth=memory.has_depth), no_signals(len(following)))
+        if slots is not None or not following or memory.binding.anchor is None:
             return
-        window = Observation.stack(list(self._ring))
+        window = Observation.stack(list(memory.ring))
         prediction = match(
-            self._network, self._config, self._binding.anchor, window, frames, following, elapsed=self._intake.elapsed
+            self._network,
+            self._config,
+            memory.binding.anchor,
+            window,
+            frames,
+            following,
+            elapsed=memory.intake.elapsed,
         )
         candidate = as_array(lift_near(prediction, frames, self._config.lift_tolerance))
         placer = Placer(
             following, prediction, frames, network=self._network.config, config=self._config,
-            picture_px=self._intake.letterbox.picture_px, elapsed=self._intake.elapsed, now=self._intake.now,
+            picture_px=self._intake.letterbox.picture_px, elapsed=memory.intake.elapsed, now=memory.intake.now,
         )  # fmt: skip
         placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
         if self._config.ground:
-            share(self._links, self._t, following, placed)
+            share(memory.links, memory.frame, following, placed)
         placed = replace(placed, room=placer.room(placed.judged))
         shown = replace(placed, point=marked(following, placed.point, prediction, frames))
         uv, judged_uv = (self._project(p, frames, prediction) for p in (shown.point, placed.judged))
         uv = beside(following, uv, shown.point, size=self._network.config.encoder.image_size)
-        signals = measure(self._network, self._binding.anchor, self._ring[-1], prediction, placed, judged_uv, following)
+        signals = measure(
+            self._network, memory.binding.anchor, memory.ring[-1], prediction, placed, judged_uv, following
+        )
         for k, query in enumerate(following):
             query.move(placed.point[k], held=bool(placed.held[k]), embedding=prediction.embedding[0, 0, k])
         self._keep(uv, shown, as_array(prediction.right_logit[0, 0].sigmoid()), signals)
@@ -306,17 +300,19 @@ class Stream:
         signals: Signals,
     ) -> None:
         """Judge the answers and keep them; begin or end recoveries; note what alarms were raised."""
-        size, following = self._network.config.encoder.image_size, self._following
+        size, following = self._network.config.encoder.image_size, self._memory.following
         uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
         inside = np.all((uv_px >= 0) & (uv_px <= (self.camera.width, self.camera.height)), axis=-1)
-        assert self._intake.reference is not None
-        world = to_world(placed.point, self._intake.reference)
-        world = world if self._has_depth else np.full_like(world, np.nan)
+        assert self._intake.state.reference is not None
+        world = to_world(placed.point, self._intake.state.reference)
+        world = world if self._memory.has_depth else np.full_like(world, np.nan)
         verdict = None
         # Also of those that are found in this very frame: the answer is where they were held.
         doubted = [query.doubted for query in following]
         if self._monitor is not None:
-            verdict = self._monitor.step([f.query for f in following], signals, frame=self._t, stamp_s=self._stamp_s)
+            verdict = self._monitor.step(
+                [f.query for f in following], signals, frame=self._memory.frame, stamp_s=self._memory.stamp_s
+            )
             self._recover(verdict, placed)
         for k, query in enumerate(following):
             visible = bool(placed.seen[k] > 0.5 and inside[k] and not (doubted[k] or query.doubted))
@@ -341,7 +337,7 @@ class Stream:
         right.
         """
         assert self._monitor is not None
-        for k, query in enumerate(self._following):
+        for k, query in enumerate(self._memory.following):
             right = bool(verdict.lost_p[k] < self._config.found_below) and not placed.held[k]
             alarm = verdict.open[k]
             if alarm is None:
@@ -353,7 +349,7 @@ class Stream:
                 if not placed.held[k] and verdict.lost_p[k] > _DOUBTED_ABOVE:
                     query.doubt()
                 continue
-            known = np.isfinite(placed.judged[k]).all() or not self._has_depth
+            known = np.isfinite(placed.judged[k]).all() or not self._memory.has_depth
             query.good = query.good + 1 if right and known else 0
             if query.good >= self._config.found_frames:
                 query.trust(placed.judged[k])
@@ -364,10 +360,10 @@ class Stream:
 
     def _state(self) -> StreamState:
         """The newest answers of all queries."""
-        rows = [(f, f.answer) for f in self._following if f.answer is not None]
+        rows = [(f, f.answer) for f in self._memory.following if f.answer is not None]
         answers = [answer for _, answer in rows]
-        reference, flags = self._intake.reference, self._intake.flags
-        joints = tuple(world_joint(self._links.joint(f.query) or f.ground.joint, reference) for f, _ in rows)
+        reference, flags = self._intake.state.reference, self._intake.state.flags
+        joints = tuple(world_joint(self._memory.links.joint(f.query) or f.ground.joint, reference) for f, _ in rows)
 
         def stacked(name: str, *shape: int) -> np.ndarray:
             return np.array([getattr(a, name) for a in answers], np.float32).reshape(len(answers), *shape)
@@ -380,8 +376,8 @@ class Stream:
             confidence=stacked("confidence"),
             visible=np.array([a.visible for a in answers], bool),
             state=tuple(a.state for a in answers),
-            stamp_s=self._stamp_s,
-            has_depth=self._has_depth,
+            stamp_s=self._memory.stamp_s,
+            has_depth=self._memory.has_depth,
             query=tuple(f.query for f, _ in rows),
             joint=joints,
             q=np.array(
@@ -392,9 +388,3 @@ class Stream:
             signals=Signals(stacked("signals", len(SIGNALS))),
             flags=flags,
         )
-
-
-def _numpy(tensor: Tensor) -> np.ndarray:
-    values = tensor.detach().cpu()
-    # numpy has no bfloat16; the network takes the same numbers in float32 and rounds them back.
-    return (values.float() if values.dtype == torch.bfloat16 else values).numpy()

@@ -5,9 +5,8 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -20,16 +19,37 @@ from quest.model.precision import fast_bfloat16
 from quest.model.weights import load_network
 from quest.monitor import Budget, Calibration, Monitor
 from quest.track.intake import NO_DEPTH_FLAG, Intake
-from quest.track.saving import SavedStream
+from quest.track.saving import load as restored
+from quest.track.saving import save
 from quest.track.settings import REVISION, TrackerConfig
 from quest.track.state import StreamState
-from quest.track.stream import Stream
+from quest.track.stream import Memory, Stream
 from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
 PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are NaN"
 NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
+
+
+@dataclass(frozen=True)
+class Maker:
+    """What a saved stream must be restored with."""
+
+    weights_hash: str | None
+    settings: TrackerConfig
+    revision: int
+    calibration_hash: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class SavedStream:
+    """A stream outside of a process; without a budget nothing is watched."""
+
+    maker: Maker
+    budget: Budget | None
+    memory: Memory
 
 
 class Tracker:
@@ -124,25 +144,24 @@ class Tracker:
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
-        arrays, words = stream.state()
-        alpha, frames = (None, None) if stream.budget is None else (stream.budget.alpha, stream.budget.frames)
-        return SavedStream(self._maker(stream.camera, alpha), alpha, frames, words, arrays).to_bytes()
+        alpha = None if stream.budget is None else stream.budget.alpha
+        return save(SavedStream(self._maker(stream.camera, alpha), stream.budget, stream.memory))
 
     def restore(self, data: bytes) -> Stream:
         """Go on with a stream that :meth:`save` gave, as if nothing had happened in between.
 
         Raises:
-            InputError: the bytes are torn, or belong to other weights or settings.
+            InputError: the bytes are corrupt, or belong to other weights or settings.
         """
-        saved = SavedStream.from_bytes(data)
-        camera = Camera(**saved.maker["camera"])
-        if saved.maker != self._maker(camera, saved.alpha):
+        saved = restored(data, SavedStream, device=self.device)
+        alpha, frames = (None, None) if saved.budget is None else (saved.budget.alpha, saved.budget.frames)
+        if saved.maker != self._maker(saved.maker.camera, alpha):
             raise InputError(
                 "saved stream: it belongs to other weights, settings or calibration, or to another revision of the "
                 "tracker; load those that it was made with"
             )
-        stream = self.stream(camera, (), alpha=saved.alpha, alpha_frames=saved.alpha_frames)
-        stream.restore(saved.arrays, saved.words)
+        stream = self.stream(saved.maker.camera, (), alpha=alpha, alpha_frames=frames)
+        stream.memory = saved.memory
         return stream
 
     def track(
@@ -178,16 +197,10 @@ class Tracker:
         tracks = collect(states, queries)
         return tracks if stream.budget is not None else replace(tracks, lost_p=None, alarm=None)
 
-    def _maker(self, camera: Camera, alpha: float | None) -> dict[str, Any]:
-        """What a saved stream must be restored with."""
+    def _maker(self, camera: Camera, alpha: float | None) -> Maker:
         watched = "" if alpha is None or self.calibration is None else self.calibration.to_json()
-        return {
-            "weights": self.weights_hash,
-            "settings": self.config.to_json(),
-            "revision": REVISION,
-            "monitor": hashlib.sha256(watched.encode()).hexdigest(),
-            "camera": asdict(camera),
-        }
+        monitor = hashlib.sha256(watched.encode()).hexdigest()
+        return Maker(self.weights_hash, self.config, REVISION, monitor, camera)
 
 
 def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool = True) -> Tracker:
