@@ -8,14 +8,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+import tyro
 from rich.console import Console
 from rich.markup import escape
 
 from quest.errors import ConfigError, ObjectError
+from quest.sim.cameras import CAMERA_MOTIONS, MIXED
 
 if TYPE_CHECKING:
     from quest.sim.settings import TakeSettings
     from quest.sim.suites import Suite
+
+    CameraMotion = str
+else:
+    CameraMotion = tyro.extras.literal_type_from_choices((*CAMERA_MOTIONS, MIXED))
 
 FRAMES_WITH_GRIPPER = 90
 """Frames that each joint gets if a gripper has to come and go."""
@@ -65,7 +71,7 @@ class Generate:
     """Frames of the motion script that each joint gets; default: 60, with a gripper 90."""
     frames: int | None = None
     """Frames in which the joints open and close again and again; default: each once, in suite long 10000."""
-    camera: Literal["static", "orbit", "handheld", "pan", "mixed"] | None = None
+    camera: CameraMotion | None = None
     """How cameras move; default: static."""
     azimuth: tuple[float, float] | None = None
     """Least and greatest direction of the first camera pose, degrees: 0 is the front; default: -60 60."""

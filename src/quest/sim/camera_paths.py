@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from quest.sim.motion import FRAMES_PER_S, minimum_jerk
+from quest.sim.profiles import FRAMES_PER_S, minimum_jerk
 
 _LEG_FRAMES = 300
 _DRIFT_HZ = (0.1, 2.0)

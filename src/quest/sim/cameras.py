@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -18,8 +19,8 @@ ELEVATION_DEG = (5.0, 50.0)
 FLAT_ELEVATION_DEG = (20.0, 65.0)
 """For objects that lie flat, of which a low camera would see an edge only."""
 FIELD_OF_VIEW_DEG = (40.0, 60.0)
-CAMERA_MOTIONS = ("static", "orbit", "handheld", "pan")
-"""What ``mixed`` draws from."""
+MIXED = "mixed"
+"""Every camera draws one of :data:`CAMERA_MOTIONS`."""
 
 _DISTINCT_DEG = 18.0
 
@@ -87,9 +88,7 @@ class CameraStyle:
     """Where cameras stand and how they move.
 
     Attributes:
-        motion: ``static``; ``orbit`` (turns about the object, eased, aimed at it, everything stays in the image);
-            ``handheld`` (a person's drift and tremor); ``pan`` (the base stands, a robot's head looks about);
-            ``mixed`` (every camera draws one of these).
+        motion: one of :data:`CAMERA_MOTIONS`, or :data:`MIXED`.
         azimuth_deg: range of the direction to the camera at the first frame; 0 is the front, positive towards +y.
         elevation_deg: range of its height above the horizon at the first frame; None: by the object, higher for one
             that lies flat.
@@ -99,7 +98,7 @@ class CameraStyle:
             horizon, up to the top) or ``any`` (either one, or down from the top).
     """
 
-    motion: Literal["static", "orbit", "handheld", "pan", "mixed"] = "static"
+    motion: str = "static"
     azimuth_deg: tuple[float, float] = AZIMUTH_DEG
     elevation_deg: tuple[float, float] | None = None
     mirrored: bool = False
@@ -107,9 +106,9 @@ class CameraStyle:
     turn: Literal["around", "over", "any"] = "any"
 
     def __post_init__(self) -> None:
-        if self.motion not in (*CAMERA_MOTIONS, "mixed"):
+        if self.motion not in (*CAMERA_MOTIONS, MIXED):
             raise ConfigError(
-                f"camera motion: expected one of {', '.join((*CAMERA_MOTIONS, 'mixed'))}, got {self.motion!r}"
+                f"camera motion: expected one of {', '.join((*CAMERA_MOTIONS, MIXED))}, got {self.motion!r}"
             )
         if self.turn not in ("around", "over", "any"):
             raise ConfigError(f"camera orbit: expected a turn around, over or any, got {self.turn!r}")
@@ -127,106 +126,33 @@ class CameraStyle:
             )
 
 
-def sample_cameras(
-    points: Float[np.ndarray, "N 3"],
-    count: int,
-    rng: np.random.Generator,
-    *,
-    width: int,
-    height: int,
-    style: CameraStyle = CameraStyle(),
-) -> list[PosedCamera]:
-    """Cameras, by default in the front hemisphere (+x), that see all ``points``, about 18 degrees apart or more.
+@dataclass(frozen=True)
+class PathRequest:
+    """One camera that is to move.
 
-    Args:
-        points: world points that must stay inside the image: the object on the origin, in all its joint states.
-        count: how many cameras.
-        rng: what they are drawn from.
+    Attributes:
+        points: world points that it is to see: the object on the origin, in all its joint states.
+        direction: unit vector from the object to the camera at the first frame.
+        frames: how many frames the path has.
+        rng: what the path is drawn from.
+        style: the style of all cameras.
         width: image width, pixels.
         height: image height, pixels.
-        style: where they stand; how they move does not matter here.
     """
-    directions = _directions(points, count, rng, style)
-    return [_aimed(points, d, rng, width=width, height=height) for d in directions]
 
+    points: Float[np.ndarray, "N 3"]
+    direction: Float[np.ndarray, "3"]
+    frames: int
+    rng: np.random.Generator
+    style: CameraStyle
+    width: int
+    height: int
 
-def sample_camera_paths(
-    points: Float[np.ndarray, "N 3"],
-    count: int,
-    frames: int,
-    rng: np.random.Generator,
-    *,
-    style: CameraStyle,
-    width: int,
-    height: int,
-) -> list[CameraPath]:
-    """Cameras that stand as those of :func:`sample_cameras` and move as the style says; also while nothing else moves.
-
-    Static cameras are those of :func:`sample_cameras` and see all ``points``; so does an orbit at every frame. A
-    handheld camera may cut a little off at the image's borders. A head that pans keeps the centre of the points in the
-    image, and most of them. No azimuth goes beyond 70 degrees, up to which distractors hide nothing, except where the
-    style asks for it.
-
-    Args:
-        points: world points that must stay inside the image: the object on the origin, in all its joint states.
-        count: how many cameras.
-        frames: how many frames each path has.
-        rng: what they are drawn from.
-        style: where they stand and how they move.
-        width: image width, pixels.
-        height: image height, pixels.
-
-    Raises:
-        ConfigError: there is no frame.
-    """
-    if frames < 1:
-        raise ConfigError(f"camera paths: expected at least one frame, got {frames}")
-    directions = _directions(points, count, rng, style)
-    if style.motion == "mixed":
-        motions = [CAMERA_MOTIONS[int(rng.integers(len(CAMERA_MOTIONS)))] for _ in directions]
-    else:
-        motions = [style.motion] * count
-    paths = []
-    for direction, motion in zip(directions, motions, strict=True):
-        if motion == "static":
-            posed = _aimed(points, direction, rng, width=width, height=height)
-            paths.append(CameraPath.standing(posed, frames))
-        elif motion == "orbit":
-            paths.append(_orbit(points, direction, frames, rng, style, width=width, height=height))
-        elif motion == "handheld":
-            posed = _aimed(points, direction, rng, width=width, height=height, fill_range=_HANDHELD_FILL)
-            paths.append(_handheld(points, posed, frames, rng))
-        else:
-            posed = _aimed(points, direction, rng, width=width, height=height, fill_range=_PAN_FILL)
-            paths.append(_pan(points, posed, frames, rng))
-    return paths
-
-
-def bump(path: CameraPath, frame: int, rng: np.random.Generator) -> CameraPath:
-    """The same camera, knocked at a frame: within three frames it has turned by 2 to 4 degrees and shifted a little.
-
-    It rings for a moment and stays displaced. What was close to the image's border may leave the image.
-
-    Args:
-        path: a camera at every frame.
-        frame: the first frame that is displaced.
-        rng: what the displacement is drawn from.
-
-    Raises:
-        ConfigError: the frame is not one of the path's, or its first.
-    """
-    if not 1 <= frame < len(path):
-        raise ConfigError(f"camera bump: expected a frame from 1 to {len(path) - 1}, got {frame}")
-    # A knock turns a mount about its foot rather than about the line of sight.
-    axis = rng.normal(size=3) * (1.0, 1.0, 0.5)
-    turn = np.deg2rad(rng.uniform(*_BUMP_TURN_DEG)) * axis / np.linalg.norm(axis)
-    side = rng.normal(size=3)
-    distance = float(np.linalg.norm(path.cam_from_world[frame, :3, 3]))
-    shift = rng.uniform(*_BUMP_SHIFT) * distance * side / np.linalg.norm(side)
-    response = jolt(len(path), frame, rng)[:, None]
-    moved = displaced(path.cam_from_world, response * turn, response * shift)
-    moved[:frame] = path.cam_from_world[:frame]
-    return CameraPath(path.camera, moved)
+    def aimed(self, fill_range: tuple[float, float]) -> PosedCamera:
+        """A camera that sees all points, which fill so much of the image."""
+        return _aimed(
+            self.points, self.direction, self.rng, width=self.width, height=self.height, fill_range=fill_range
+        )
 
 
 def _elevation_range(points: Float[np.ndarray, "N 3"], style: CameraStyle) -> tuple[float, float]:
@@ -295,18 +221,15 @@ def _aimed(
     return PosedCamera(Camera(focal, focal, width / 2, height / 2, width, height), cam_from_world)
 
 
-def _orbit(
-    points: Float[np.ndarray, "N 3"],
-    direction: Float[np.ndarray, "3"],
-    frames: int,
-    rng: np.random.Generator,
-    style: CameraStyle,
-    *,
-    width: int,
-    height: int,
-) -> CameraPath:
-    """A camera at a constant distance, large enough for all points at every frame, that turns about their middle."""
-    (from_azimuth, to_azimuth), (from_elevation, to_elevation) = _orbit_ends(points, direction, rng, style)
+def _static(request: PathRequest) -> CameraPath:
+    """The camera stands still."""
+    return CameraPath.standing(request.aimed(_FILL), request.frames)
+
+
+def _orbit(request: PathRequest) -> CameraPath:
+    """The camera turns about the middle of all points, eased, at a distance at which all stay in the image."""
+    points, rng, width, height = request.points, request.rng, request.width, request.height
+    (from_azimuth, to_azimuth), (from_elevation, to_elevation) = _orbit_ends(request)
     focal = max(width, height) / 2 / np.tan(rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG)) / 2)
     slope = rng.uniform(*_ORBIT_FILL) * np.array([width, height]) / 2 / focal
     low, high = points.min(axis=0), points.max(axis=0)
@@ -319,7 +242,7 @@ def _orbit(
     )[1]:
         local = (points - aim) @ rotation.T
         distance = max(distance, float((np.abs(local[:, :2]) / slope - local[:, 2:]).max()), float(-local[:, 2].min()))
-    progress = there_and_back(frames, rng)
+    progress = there_and_back(request.frames, rng)
     towards, rotation = look(
         from_azimuth + progress * (to_azimuth - from_azimuth),
         from_elevation + progress * (to_elevation - from_elevation),
@@ -328,10 +251,9 @@ def _orbit(
     return CameraPath(Camera(focal, focal, width / 2, height / 2, width, height), _poses(rotation, eye))
 
 
-def _orbit_ends(
-    points: Float[np.ndarray, "N 3"], direction: Float[np.ndarray, "3"], rng: np.random.Generator, style: CameraStyle
-) -> tuple[tuple[float, float], tuple[float, float]]:
+def _orbit_ends(request: PathRequest) -> tuple[tuple[float, float], tuple[float, float]]:
     """First and last azimuth, first and last elevation, radians."""
+    direction, rng, style = request.direction, request.rng, request.style
     azimuth = float(np.arctan2(direction[1], direction[0]))
     elevation = float(np.arcsin(np.clip(direction[2], -1, 1)))
     limit = np.deg2rad(max(CAMERA_AZIMUTH_DEG, *np.abs(style.azimuth_deg)))
@@ -341,7 +263,7 @@ def _orbit_ends(
         sides = [s for s in (-1.0, 1.0) if abs(azimuth + s * sweep) <= limit] or [-1.0, 1.0]
         side = sides[int(rng.integers(len(sides)))]
         start = float(np.clip(azimuth, *sorted((-side * limit, side * (limit - sweep)))))
-        low, high = np.deg2rad(_elevation_range(points, style))
+        low, high = np.deg2rad(_elevation_range(request.points, style))
         end = float(np.clip(elevation + rng.uniform(-0.2, 0.2), low, high))
         return (start, start + side * sweep), (elevation, end)
     side_view = rng.uniform(0.0, min(np.deg2rad(10), np.pi / 2 - sweep))
@@ -350,20 +272,20 @@ def _orbit_ends(
     return (azimuth, end), heights if turn == "over" else heights[::-1]
 
 
-def _handheld(
-    points: Float[np.ndarray, "N 3"], posed: PosedCamera, frames: int, rng: np.random.Generator
-) -> CameraPath:
-    """A person holds the camera: how unsteadily is drawn, shifts grow with the distance."""
-    distance = _distance(points, posed)
-    shake = hand_shake(frames, rng)
+def _handheld(request: PathRequest) -> CameraPath:
+    """A person holds the camera, with drift and tremor: how unsteadily is drawn, shifts grow with the distance."""
+    rng, posed = request.rng, request.aimed(_HANDHELD_FILL)
+    distance = _distance(request.points, posed)
+    shake = hand_shake(request.frames, rng)
     turn = np.deg2rad(rng.uniform(*_SHAKE_TURN_DEG)) * shake[:, :3]
     shift = rng.uniform(*_SHAKE_SHIFT) * distance * shake[:, 3:]
-    path = CameraPath.standing(posed, frames)
+    path = CameraPath.standing(posed, request.frames)
     return CameraPath(path.camera, displaced(path.cam_from_world, turn, shift))
 
 
-def _pan(points: Float[np.ndarray, "N 3"], posed: PosedCamera, frames: int, rng: np.random.Generator) -> CameraPath:
-    """A camera before a neck: the head pans and tilts between glances at points of the object."""
+def _pan(request: PathRequest) -> CameraPath:
+    """A robot's base stands; its head, which carries the camera, pans and tilts between glances at the object."""
+    points, rng, posed = request.points, request.rng, request.aimed(_PAN_FILL)
     start = posed.cam_from_world[:3, :3]
     azimuth, elevation = np.arctan2(-start[2, 1], -start[2, 0]), np.arcsin(np.clip(-start[2, 2], -1, 1))
     (towards,), (level,) = look(np.array([azimuth]), np.array([elevation]))
@@ -376,7 +298,7 @@ def _pan(points: Float[np.ndarray, "N 3"], posed: PosedCamera, frames: int, rng:
     pan = np.arctan2(seen[:, 1], seen[:, 0]) - azimuth
     tilt = np.arcsin(seen[:, 2] / np.linalg.norm(seen, axis=1)) - elevation
     targets = np.stack(((pan + np.pi) % (2 * np.pi) - np.pi, tilt), axis=-1)
-    angles = fixations(targets, frames, rng)
+    angles = fixations(targets, request.frames, rng)
     half = np.array([posed.camera.width, posed.camera.height]) / 2 / posed.camera.fx
     while True:
         facing, rotation = look(azimuth + angles[:, 0], elevation + angles[:, 1])
@@ -398,3 +320,105 @@ def _poses(rotation: Float[np.ndarray, "S 3 3"], eye: Float[np.ndarray, "S 3"]) 
     poses[:, :3, :3] = rotation
     poses[:, :3, 3] = -(rotation @ eye[:, :, None])[..., 0]
     return poses
+
+
+CAMERA_MOTIONS: dict[str, Callable[[PathRequest], CameraPath]] = {
+    "static": _static,
+    "orbit": _orbit,
+    "handheld": _handheld,
+    "pan": _pan,
+}
+"""How a camera may move, by name; a new motion is a function and a line here."""
+
+
+def sample_cameras(
+    points: Float[np.ndarray, "N 3"],
+    count: int,
+    rng: np.random.Generator,
+    *,
+    width: int,
+    height: int,
+    style: CameraStyle = CameraStyle(),
+) -> list[PosedCamera]:
+    """Cameras, by default in the front hemisphere (+x), that see all ``points``, about 18 degrees apart or more.
+
+    Args:
+        points: world points that must stay inside the image: the object on the origin, in all its joint states.
+        count: how many cameras.
+        rng: what they are drawn from.
+        width: image width, pixels.
+        height: image height, pixels.
+        style: where they stand; how they move does not matter here.
+    """
+    directions = _directions(points, count, rng, style)
+    return [_aimed(points, d, rng, width=width, height=height) for d in directions]
+
+
+def sample_camera_paths(
+    points: Float[np.ndarray, "N 3"],
+    count: int,
+    frames: int,
+    rng: np.random.Generator,
+    *,
+    style: CameraStyle,
+    width: int,
+    height: int,
+) -> list[CameraPath]:
+    """Cameras that stand as those of :func:`sample_cameras` and move as the style says; also while nothing else moves.
+
+    Static cameras are those of :func:`sample_cameras` and see all ``points``; so does an orbit at every frame. A
+    handheld camera may cut a little off at the image's borders. A head that pans keeps the centre of the points in the
+    image, and most of them. No azimuth goes beyond 70 degrees, up to which distractors hide nothing, except where the
+    style asks for it.
+
+    Args:
+        points: world points that must stay inside the image: the object on the origin, in all its joint states.
+        count: how many cameras.
+        frames: how many frames each path has.
+        rng: what they are drawn from.
+        style: where they stand and how they move.
+        width: image width, pixels.
+        height: image height, pixels.
+
+    Raises:
+        ConfigError: there is no frame.
+    """
+    if frames < 1:
+        raise ConfigError(f"camera paths: expected at least one frame, got {frames}")
+    directions = _directions(points, count, rng, style)
+    names = list(CAMERA_MOTIONS)
+    if style.motion == MIXED:
+        motions = [names[int(rng.integers(len(names)))] for _ in directions]
+    else:
+        motions = [style.motion] * count
+    return [
+        CAMERA_MOTIONS[motion](PathRequest(points, direction, frames, rng, style, width, height))
+        for direction, motion in zip(directions, motions, strict=True)
+    ]
+
+
+def bump(path: CameraPath, frame: int, rng: np.random.Generator) -> CameraPath:
+    """The same camera, knocked at a frame: within three frames it has turned by 2 to 4 degrees and shifted a little.
+
+    It rings for a moment and stays displaced. What was close to the image's border may leave the image.
+
+    Args:
+        path: a camera at every frame.
+        frame: the first frame that is displaced.
+        rng: what the displacement is drawn from.
+
+    Raises:
+        ConfigError: the frame is not one of the path's, or its first.
+    """
+    if not 1 <= frame < len(path):
+        raise ConfigError(f"camera bump: expected a frame from 1 to {len(path) - 1}, got {frame}")
+    # A knock turns a mount about its foot rather than about the line of sight.
+    axis = rng.normal(size=3) * (1.0, 1.0, 0.5)
+    turn = np.deg2rad(rng.uniform(*_BUMP_TURN_DEG)) * axis / np.linalg.norm(axis)
+    side = rng.normal(size=3)
+    distance = float(np.linalg.norm(path.cam_from_world[frame, :3, 3]))
+    shift = rng.uniform(*_BUMP_SHIFT) * distance * side / np.linalg.norm(side)
+    response = jolt(len(path), frame, rng)[:, None]
+    moved = displaced(path.cam_from_world, response * turn, response * shift)
+    moved[:frame] = path.cam_from_world[:frame]
+    return CameraPath(path.camera, moved)

@@ -16,10 +16,9 @@ from jaxtyping import Float
 
 from quest.errors import ConfigError
 from quest.sim.articulation import Articulation
-from quest.sim.profiles import PROFILES, ProfileKind, draw_profile, joint_profile, minimum_jerk
+from quest.sim.profiles import FRAMES_PER_S, PROFILES, ProfileKind, draw_profile, joint_profile, minimum_jerk
 
 HOLD_FRAMES = 8
-FRAMES_PER_S = 30.0
 _MOVES_AT_LEAST = 3
 _LONG_SHARE = (0.7, 1.5)
 _PAUSE_OFTEN = 0.3

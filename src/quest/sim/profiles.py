@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 ProfileKind = Literal["human", "robot", "creep"]
+FRAMES_PER_S = 30.0
 PROFILES: tuple[ProfileKind, ...] = ("human", "robot", "creep")
 
 _AMPLITUDE = (0.6, 1.0)

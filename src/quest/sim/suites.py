@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from quest.errors import ConfigError
-from quest.sim.cameras import CameraStyle
+from quest.sim.cameras import CAMERA_MOTIONS, CameraStyle
 from quest.sim.motion import MotionStyle
 from quest.sim.sensor import SENSORS, SensorModel
 from quest.sim.settings import TakeSettings
@@ -130,7 +130,9 @@ SUITES: dict[str, tuple[Suite, ...]] = {
         Suite("shift", "viewpoint", _with(cameras=_ODD_VIEWPOINT)),
     ),
     "moving": tuple(
-        Suite("moving", motion, _with(cameras=CameraStyle(motion=motion))) for motion in ("orbit", "handheld", "pan")
+        Suite("moving", motion, _with(cameras=CameraStyle(motion=motion)))
+        for motion in CAMERA_MOTIONS
+        if motion != "static"
     ),
     "gripper": (Suite("gripper", settings=_with(gripper=True, frames_per_joint=90)),),
     "long": (Suite("long", settings=_with(frames=10_000), level=2),),
