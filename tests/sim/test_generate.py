@@ -170,6 +170,22 @@ def test_same_seed_same_arrays_other_seed_other_arrays(cabinet: SimObject, rende
         assert not np.array_equal(first[name], other[name]), name
 
 
+@pytest.mark.render
+def test_images_may_be_wider_than_high(cabinet: SimObject, renderer: Renderer) -> None:
+    settings = TakeSettings(views=1, size=(64, 48), every=8, frames_per_joint=24)
+    take = generate_take(cabinet, 1, 5, renderer=renderer, settings=settings)
+    view = take.views[0]
+    assert view.clip.rgb.shape == (len(take), 48, 64, 3)
+    assert view.clip.depth_m is not None
+    assert view.clip.depth_m.shape == view.link_id.shape == (len(take), 48, 64)
+    uv, depth = true_pixels_and_depths(take, view, 0)
+    np.testing.assert_allclose(view.uv_px[0], uv, atol=1e-3)
+    seen = view.visible[0]
+    assert seen.any()
+    x, y = view.uv_px[0, seen].astype(int).T
+    np.testing.assert_allclose(view.clip.depth_m[0, y, x], depth[seen], atol=0.05)
+
+
 def test_impossible_levels(cabinet: SimObject) -> None:
     for level in (0, 3):
         with pytest.raises(ObjectError, match=r"number of joints .* \(2\), got"):
@@ -184,7 +200,7 @@ def test_what_is_behind_a_door_moves_after_it(tmp_path: Path) -> None:
     assert all(0 not in choose_joints(thing, 2, np.random.default_rng(seed)) for seed in range(10))
 
 
-@pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 8}, {"every": 0}, {"every": 9}])
+@pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 8}, {"size": (64, 8)}, {"every": 0}, {"every": 9}])
 def test_settings_out_of_range(wrong: dict) -> None:
     with pytest.raises(ConfigError):
         TakeSettings(**wrong)
@@ -247,7 +263,7 @@ def test_killed_run_leaves_whole_takes_and_goes_on(tmp_path: Path, renderer: Ren
         objects_root=tmp_path / "objects",
         takes_per_object=len(there) + 2,
         views=1,
-        size=48,
+        size=(48,),
         every=8,
         frames_per_joint=24,
     )

@@ -11,6 +11,7 @@ from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CameraStyle
 from quest.sim.plan import ObjectShelf, parse_object, plan_takes, procedural_objects
 from quest.sim.procedural import CATEGORIES
+from quest.sim.settings import TakeSettings
 from quest.sim.suites import find_suites
 from tests.sim.small_objects import write_cabinet
 
@@ -90,6 +91,7 @@ def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
         "--out a --suite occlusion --hidden 60 --look-alike --objects partnet:1",
         "--out a --suite lockers --procedural 4 --level 2",
         "--out a --suite noise --variant 5 stereo --procedural 4",
+        "--out a --procedural 4 --size 640 480",
         "--out s3://bucket/takes --procedural 2 --camera orbit --motion robot --overlap 0.5 --sensor stereo --physics",
         "--out a --procedural 2 --camera orbit --azimuth -40.0 40.0 --elevation 30.0 80.0",
     ],
@@ -107,6 +109,12 @@ def test_cameras_of_a_suite_move_where_the_arguments_say() -> None:
     command = Generate(out="a", procedural=1, suite="moving", variant=("pan",), elevation=(30.0, 80.0))
     (suite,) = command._suites()
     assert suite.settings.cameras == CameraStyle(motion="pan", elevation_deg=(30.0, 80.0))
+
+
+def test_one_number_is_the_side_of_a_square() -> None:
+    given: tuple[tuple[int, ...], ...] = ((), (64,), (64, 64), (64, 48))
+    sizes = [Generate(out="a", size=size)._settings(TakeSettings()).size for size in given]
+    assert sizes == [224, 64, 64, (64, 48)]
 
 
 @pytest.mark.parametrize(
@@ -139,6 +147,8 @@ def test_cameras_of_a_suite_move_where_the_arguments_say() -> None:
         ({"procedural": 1, "suite": "lockers", "camera": "pan"}, "stands still"),
         ({"procedural": 1, "suite": "long", "gripper": True}, "gripper"),
         ({"procedural": 1, "frames": 30}, "more frames"),
+        ({"procedural": 1, "size": (640, 480, 3)}, "WIDTH HEIGHT"),
+        ({"procedural": 1, "size": (640, 8)}, "got 3 of 640 x 8"),
     ],
 )
 def test_settings_that_cannot_be(tmp_path: Path, words: dict, named: str) -> None:

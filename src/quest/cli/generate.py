@@ -65,8 +65,8 @@ class Generate:
     """Keep every n-th frame of the motion script (1 to 8); default: 1."""
     views: int | None = None
     """Cameras per take; default: 3, in suites 1."""
-    size: int | None = None
-    """Width and height of the images, pixels; default: 224."""
+    size: tuple[int, ...] = ()
+    """Width and height of the images, pixels, or one number for square ones; default: 224."""
     frames_per_joint: int | None = None
     """Frames of the motion script that each joint gets; default: 60, with a gripper 90."""
     frames: int | None = None
@@ -173,9 +173,11 @@ class Generate:
 
         given = {
             name: getattr(self, name)
-            for name in ("views", "size", "every", "frames_per_joint", "frames")
+            for name in ("views", "every", "frames_per_joint", "frames")
             if getattr(self, name) is not None
         }
+        if self.size:
+            given["size"] = self._size()
         cameras = {"motion": self.camera, "azimuth_deg": self.azimuth, "elevation_deg": self.elevation}
         if said := {name: value for name, value in cameras.items() if value is not None}:
             given["cameras"] = dataclasses.replace(preset.cameras, **said)
@@ -196,6 +198,13 @@ class Generate:
             broad_materials=self.mix == "broad",
             **given,
         )
+
+    def _size(self) -> int | tuple[int, int]:
+        """Side of square images, or width and height."""
+        sides = self.size if len(set(self.size)) > 1 else self.size[:1]
+        if not 1 <= len(self.size) <= 2:
+            raise ConfigError(f"generate: expected --size SIDE or --size WIDTH HEIGHT, got {len(self.size)} numbers")
+        return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
     def _chosen(self, category: str | None) -> list[tuple[str, str]]:
         """Source and id of every object that the arguments name; all of a category if that is given."""

@@ -111,8 +111,8 @@ def stage_occlusion(
             len(script),
             camera_rng,
             style=settings.cameras,
-            width=settings.size,
-            height=settings.size,
+            width=settings.width,
+            height=settings.height,
         )
         camera = path.at(0)
         stage = stage or renderer.stage(sim_object, [camera])  # geometry matters, not light

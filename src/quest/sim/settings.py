@@ -20,7 +20,7 @@ class TakeSettings:
 
     Attributes:
         views: how many cameras.
-        size: width and height of the images, pixels.
+        size: width and height of the images, pixels; one number for square ones.
         every: keep every n-th frame of the motion script.
         frames_per_joint: frames of the script that each joint gets; takes in which things are hidden have scripts of
             their own.
@@ -38,7 +38,7 @@ class TakeSettings:
     """
 
     views: int = 3
-    size: int = 224
+    size: int | tuple[int, int] = 224
     every: int = 1
     frames_per_joint: int = 60
     frames: int | None = None
@@ -53,8 +53,10 @@ class TakeSettings:
     stretch: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.views < 1 or self.size < 16:
-            raise ConfigError(f"take: expected at least 1 view of 16 pixels, got {self.views} of {self.size}")
+        if self.views < 1 or min(self.width, self.height) < 16:
+            raise ConfigError(
+                f"take: expected at least 1 view of 16 x 16 pixels, got {self.views} of {self.width} x {self.height}"
+            )
         if not 1 <= self.every <= HOLD_FRAMES:
             raise ConfigError(f"take: expected to keep every 1st to {HOLD_FRAMES}th frame, got every {self.every}")
         if self.frames is not None and self.frames <= self.frames_per_joint:
@@ -71,6 +73,16 @@ class TakeSettings:
             raise ConfigError(
                 f"take: unknown disturbance {self.disturbance!r}; expected one of {', '.join(DISTURBANCES)}"
             )
+
+    @property
+    def width(self) -> int:
+        """Width of the images, pixels."""
+        return self.size if isinstance(self.size, int) else self.size[0]
+
+    @property
+    def height(self) -> int:
+        """Height of the images, pixels."""
+        return self.size if isinstance(self.size, int) else self.size[1]
 
     @property
     def digest(self) -> str:

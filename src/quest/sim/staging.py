@@ -205,8 +205,8 @@ def _cameras(
             frames,
             rng,
             style=settings.cameras,
-            width=settings.size,
-            height=settings.size,
+            width=settings.width,
+            height=settings.height,
         )
         cameras = [path.at(0) for path in paths]
         if stage is None:
