@@ -13,6 +13,7 @@ PUBLIC = [
     "Camera",
     "Clip",
     "Frame",
+    "Joints",
     "Query",
     "QuestError",
     "State",
@@ -21,6 +22,7 @@ PUBLIC = [
     "Tracker",
     "Tracks",
     "load",
+    "read",
 ]
 
 COMMANDS = ["data", "doctor", "eval", "eval-monitor", "generate", "monitor", "objects", "track", "train", "weights"]
@@ -68,4 +70,6 @@ def test_tracker_door():
     """What DESIGN promises of the tracker: one door for clips, one for streams."""
     assert list(inspect.signature(quest.Tracker.track).parameters)[:3] == ["self", "clip", "queries"]
     assert list(inspect.signature(quest.Tracker.stream).parameters)[:3] == ["self", "camera", "queries"]
+    assert list(inspect.signature(quest.Clip.from_arrays).parameters)[:3] == ["rgb", "depth_m", "camera"]
+    assert all(callable(getattr(quest.Tracks, name)) for name in ("to_pandas", "save", "select"))
     assert next(iter(inspect.signature(quest.load).parameters.values())).default == "quest-s16"

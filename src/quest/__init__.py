@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from quest.errors import QuestError
-from quest.types import LABELS, Camera, Clip, Frame, Query, State, Tracks
+from quest.types import LABELS, Camera, Clip, Frame, Joints, Query, State, Tracks
 
 if TYPE_CHECKING:
+    from quest.data.read import read
     from quest.track import Stream, StreamState, Tracker, load
 
 __version__ = "0.1.0"
@@ -16,6 +17,7 @@ __all__ = [
     "Camera",
     "Clip",
     "Frame",
+    "Joints",
     "Query",
     "QuestError",
     "State",
@@ -24,11 +26,16 @@ __all__ = [
     "Tracker",
     "Tracks",
     "load",
+    "read",
 ]
 
 
 def __getattr__(name: str) -> object:
-    """The tracker is imported when it is first asked for, because it brings torch."""
+    """The tracker and the readers are imported when they are first asked for, because they bring torch and more."""
+    if name == "read":
+        from quest.data.read import read
+
+        return read
     if name in {"Stream", "StreamState", "Tracker", "load"}:
         from quest import track
 

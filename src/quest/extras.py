@@ -24,6 +24,7 @@ EXTRA_OF = {
     "tensorboard": "train",
     "onnx": "train",
     "rerun": "viz",
+    "pandas": "pandas",
     "mcap": "ros",
     "mcap_ros2": "ros",
     "rosbags": "ros",

@@ -9,17 +9,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from quest.errors import InputError
+from quest.extras import require
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 LABELS = ("handle", "knob", "rim", "front")
 """Labels of the entities that a tracker follows, in the order of the network's outputs."""
 INTENTS = ("open", "lift")
 """What one takes hold of an entity for: to move its joint, or to lift the whole thing by its base."""
+GUESSED_CAMERA = "camera guessed: a focal length as long as the longer side (53 degrees); give the camera or fov_deg"
+_FRAMES_PER_S = 30.0
+_SHOWN = 12
 
 
 class State(StrEnum):
@@ -70,6 +78,32 @@ class Camera:
         fx, cx, fy, cy = np.asarray(matrix, dtype=np.float64)[[0, 0, 1, 1], [0, 2, 1, 2]].tolist()
         return cls(fx, fy, cx + 0.5, cy + 0.5, width, height)
 
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov_deg: float | int | None = None) -> Camera:
+        """Camera of unknown intrinsics: square pixels, and the principal point in the middle.
+
+        Args:
+            width: image width, pixels.
+            height: image height, pixels.
+            fov_deg: field of view along the longer side, degrees. None is a guess that suits most webcams and phones: a
+                focal length as long as the longer side, which is 53 degrees.
+
+        Raises:
+            InputError: the field of view is not between 1 and 178 degrees.
+        """
+        longer = float(max(width, height))
+        if fov_deg is None:
+            focal = longer
+        elif 1 <= fov_deg <= 178:
+            focal = longer / 2 / float(np.tan(np.radians(fov_deg) / 2))
+        else:
+            raise InputError(f"camera: expected a field of view of 1 to 178 degrees, got {fov_deg}")
+        return cls(focal, focal, width / 2, height / 2, width, height)
+
+    def __repr__(self) -> str:
+        numbers = f"fx {self.fx:.1f}, fy {self.fy:.1f}, cx {self.cx:.1f}, cy {self.cy:.1f}"
+        return f"Camera({self.width} x {self.height} px, {numbers})"
+
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
         """Intrinsic matrix in this project's half-integer convention."""
@@ -104,6 +138,7 @@ class Clip:
         depth_m: depth along +z in metres, 0 where missing; None without a depth sensor.
         stamp_s: times in seconds, not decreasing.
         cam_from_world: pose per frame; identities if unknown.
+        notes: what is less than it could be, in words, such as a camera that was guessed.
     """
 
     name: str
@@ -112,6 +147,7 @@ class Clip:
     depth_m: Float32[np.ndarray, "T H W"] | None
     stamp_s: Float[np.ndarray, " T"]
     cam_from_world: Float[np.ndarray, "T 4 4"]
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 4 or self.rgb.shape[3] != 3 or self.rgb.dtype != np.uint8:
@@ -133,13 +169,126 @@ class Clip:
         if not finite or (np.diff(self.stamp_s) < 0).any():
             raise InputError(f"clip {self.name!r}: stamps and poses must be finite, times not falling; sort the frames")
 
+    @classmethod
+    def from_arrays(
+        cls,
+        rgb: Any,
+        depth_m: Any = None,
+        camera: Any = None,
+        *,
+        stamp_s: Any = None,
+        cam_from_world: Any = None,
+        fps: float | int | None = None,
+        fov_deg: float | int | None = None,
+        name: str = "clip",
+    ) -> Clip:
+        """A clip from arrays in memory, checked as a recording on disk is.
+
+        Arrays may be those of NumPy, tensors of PyTorch on any device, or lists of frames.
+
+        Args:
+            rgb: colours, [T, H, W, 3], as uint8 or as floats from 0 to 1.
+            depth_m: depth along +z in metres, [T, H, W]; what is not finite or not positive counts as missing. None
+                without a depth sensor.
+            camera: intrinsics as a :class:`Camera`, or the 3 x 3 matrix that OpenCV and ROS give. None makes one from
+                ``fov_deg``, or guesses (see :meth:`Camera.from_fov`) and says so in ``notes``.
+            stamp_s: times in seconds, [T], not decreasing; by default frames follow each other at ``fps``.
+            cam_from_world: pose per frame, [T, 4, 4], or [4, 4] for a camera that stands still; identities by default,
+                which make the camera the world.
+            fps: frames per second, where there are no times; 30 by default.
+            fov_deg: field of view along the longer side in degrees, where there is no camera.
+            name: what to call the clip in files and tables.
+
+        Raises:
+            InputError: shapes or types are not as expected or contradict each other, times decrease, or there are no
+                frames; as RecordingError if the depth is in the wrong units (millimetres, say).
+        """
+        from quest.data.frame_source import check_units, clean_depth
+
+        what = f"clip {name!r}"
+        colours = _colours(_array(rgb, f"{what}: colours"), what)
+        t, h, w = colours.shape[:3]
+        if stamp_s is not None and fps is not None:
+            raise InputError(f"{what}: times come from stamp_s or from fps, not from both; give one of them")
+        fps = _FRAMES_PER_S if fps is None else fps
+        if not 0 < fps < np.inf:
+            raise InputError(f"{what}: expected fps > 0, got {fps}")
+        stamps = np.arange(t) / fps if stamp_s is None else _array(stamp_s, f"{what}: stamp_s").astype(np.float64)
+        poses = np.eye(4) if cam_from_world is None else _array(cam_from_world, f"{what}: cam_from_world")
+        poses = np.array(np.broadcast_to(poses, (t, 4, 4)) if poses.shape == (4, 4) else poses, dtype=np.float64)
+        depth = None if depth_m is None else _array(depth_m, f"{what}: depth")
+        if depth is not None and depth.shape != (t, h, w):
+            raise InputError(f"{what}: expected depth of shape {(t, h, w)}, as the colours, got {depth.shape}")
+        depth = None if depth is None else clean_depth(depth)
+        notes = (GUESSED_CAMERA,) if camera is None and fov_deg is None else ()
+        clip = cls(name, _camera(camera, w, h, fov_deg, what), colours, depth, stamps, poses, notes)
+        if depth is not None:
+            check_units(depth, what, 1.0)
+        return clip
+
     def __len__(self) -> int:
         return len(self.rgb)
+
+    def __repr__(self) -> str:
+        length_s = float(self.stamp_s[-1] - self.stamp_s[0])
+        depth = "no depth" if self.depth_m is None else "depth"
+        moves = "camera moves" if (self.cam_from_world != self.cam_from_world[0]).any() else "camera stands still"
+        size = f"{self.camera.width} x {self.camera.height} px"
+        notes = "".join(f"; {note}" for note in self.notes)
+        return f"Clip({self.name!r}, {len(self)} frames of {size}, {length_s:.2f} s, {depth}, {moves}{notes})"
 
     def frame(self, t: int) -> Frame:
         """Frame ``t``."""
         depth = None if self.depth_m is None else self.depth_m[t]
         return Frame(self.rgb[t], depth, float(self.stamp_s[t]), self.cam_from_world[t])
+
+
+def _array(values: Any, what: str) -> np.ndarray:
+    """An array from what a caller has: an array, a tensor on any device, or a list of frames."""
+    try:
+        # A tensor is told by this method, because this module does without PyTorch.
+        return np.asarray(values.detach().cpu().numpy() if hasattr(values, "detach") else values)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{what} cannot be read as one array ({error}); give NumPy arrays or tensors") from error
+
+
+def _colours(rgb: np.ndarray, what: str) -> UInt8[np.ndarray, "T H W 3"]:
+    """Colours of uint8, from these or from floats in [0, 1]."""
+    advice = "give them as [T, H, W, 3]"
+    if rgb.ndim == 3:
+        one = rgb.shape[2] == 3
+        advice = "this looks like one frame: rgb[None]" if one else "this looks grey: np.stack([grey] * 3, axis=-1)"
+    elif rgb.ndim == 4 and rgb.shape[3] == 4:
+        advice = "leave the alpha channel out: rgb[..., :3]"
+    elif rgb.ndim == 4 and rgb.shape[1] == 3:
+        advice = "the channels come second: rgb.transpose(0, 2, 3, 1), or rgb.permute(0, 2, 3, 1) of a tensor"
+    if rgb.ndim != 4 or rgb.shape[3] != 3:
+        raise InputError(f"{what}: expected colours of shape [T, H, W, 3], got {list(rgb.shape)}; {advice}")
+    if rgb.dtype.kind == "f" and rgb.size:
+        low, high = float(rgb.min()), float(rgb.max())
+        if not (low >= 0 and high <= 1):  # also where one is NaN
+            raise InputError(
+                f"{what}: expected colours of uint8, or floats from 0 to 1, got floats from {low:.3g} to {high:.3g}; "
+                "for 0 to 255 convert them: rgb.astype(np.uint8)"
+            )
+        rgb = np.rint(rgb * 255).astype(np.uint8)
+    elif rgb.dtype != np.uint8:
+        raise InputError(f"{what}: expected colours of uint8, or floats from 0 to 1, got {rgb.dtype}; convert them")
+    return np.ascontiguousarray(rgb)
+
+
+def _camera(camera: Any, width: int, height: int, fov_deg: float | int | None, what: str) -> Camera:
+    """A camera, from intrinsics, a matrix, a field of view, or nothing."""
+    if camera is not None and fov_deg is not None:
+        raise InputError(f"{what}: the field of view comes from camera or from fov_deg; give one of them")
+    if camera is None:
+        return Camera.from_fov(width, height, fov_deg)
+    if isinstance(camera, Camera):
+        return camera
+    matrix = _array(camera, f"{what}: camera")
+    if matrix.shape != (3, 3):
+        raise InputError(f"{what}: expected a quest.Camera or a 3 x 3 matrix, got shape {list(matrix.shape)}")
+    return Camera.from_opencv(matrix.astype(np.float64), width=width, height=height)
 
 
 @dataclass(frozen=True)
@@ -173,6 +322,13 @@ class Query:
         if self.frame < 0:
             raise InputError(f"query: expected a frame index >= 0, got {self.frame}")
 
+    def __repr__(self) -> str:
+        words = {"name": self.name, "label": self.label, "intent": self.intent}
+        given = [f"{key}={value!r}" for key, value in words.items() if value]
+        if self.uv_px is not None:
+            given = [str(self.frame), *(f"{value:g}" for value in self.uv_px), *given]
+        return f"Query.{self.kind}({', '.join(given)})"
+
     @classmethod
     def slot(cls, name: str = "") -> Query:
         """Follow whatever entity the network discovers."""
@@ -191,21 +347,95 @@ class Query:
 
 @dataclass(frozen=True)
 class Joints:
-    """The joints that explain K tracks, in the world.
+    """The joints that explain K tracks, as known at the end, in the world.
+
+    The coordinate ``q`` of a joint is 0 about where its entity was seen first and grows the way it then went: radians
+    about the axis (right-handed, within half a turn either way), or metres along it.
 
     Attributes:
         kind: ``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen.
         axis: unit direction of sliding, or of the axis of turning; NaN where there is none.
-        origin: metres: a point of the axis of turning, or of the path of sliding; NaN where unknown.
+        origin: metres: the point of the axis of turning that is nearest to the path, a point of the path of sliding, or
+            the place of what is static; NaN where unknown.
+        q_min_seen: smallest coordinate that was seen; NaN without a joint that moves.
+        q_max_seen: largest one; NaN likewise.
+        q: coordinate per frame; NaN likewise, and where the tracker knew no world point. Of a query that was asked for
+            by a pixel, it is that of the network's own point beside it, which the same joint moves.
+        covariance: of small errors of ``axis`` (3, radians) and ``origin`` (3, metres) together, in world axes. Only
+            what is across the axis counts: its length is 1, and a shift along the axis of turning, or along the path of
+            sliding, changes nothing, so that a moving joint's matrix has rank 4. Of a static one the part of the axis
+            is NaN; all is NaN where the kind is unknown. It is the inverse of the normal equations at the end of the
+            fit, scaled by the noise of a point that the tracker assumes, or by the residuals where these are larger.
+            A wrong kind, or a point that is not of the entity, is not in it.
     """
 
     kind: tuple[str, ...]
     axis: Float32[np.ndarray, "K 3"]
     origin: Float32[np.ndarray, "K 3"]
+    q_min_seen: Float32[np.ndarray, " K"]
+    q_max_seen: Float32[np.ndarray, " K"]
+    q: Float32[np.ndarray, "T K"]
+    covariance: Float32[np.ndarray, "K 6 6"]
+
+    @classmethod
+    def unknown(cls, frames: int, queries: int) -> Joints:
+        """Joints of which nothing is known."""
+        return cls(
+            kind=("unknown",) * queries,
+            axis=np.full((queries, 3), np.nan, np.float32),
+            origin=np.full((queries, 3), np.nan, np.float32),
+            q_min_seen=np.full(queries, np.nan, np.float32),
+            q_max_seen=np.full(queries, np.nan, np.float32),
+            q=np.full((frames, queries), np.nan, np.float32),
+            covariance=np.full((queries, 6, 6), np.nan, np.float32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def __repr__(self) -> str:
+        return f"Joints({', '.join(self.describe(k) for k in range(len(self)))})"
+
+    def describe(self, k: int, t: int | None = None) -> str:
+        """A joint in a few words: see :func:`joint_words`.
+
+        Args:
+            k: the query.
+            t: a frame, to say where on the joint the entity is in it.
+        """
+        q = None if t is None else float(self.q[t, k])
+        return joint_words(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
 
     def select(self, queries: np.ndarray) -> Joints:
         """The joints of some queries only."""
-        return Joints(tuple(self.kind[i] for i in queries), self.axis[queries], self.origin[queries])
+        return Joints(
+            kind=tuple(self.kind[i] for i in queries),
+            axis=self.axis[queries],
+            origin=self.origin[queries],
+            q_min_seen=self.q_min_seen[queries],
+            q_max_seen=self.q_max_seen[queries],
+            q=self.q[:, queries],
+            covariance=self.covariance[queries],
+        )
+
+
+def joint_words(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
+    """Kind of a joint and the range that was seen, in degrees or metres: ``revolute 0 to 34 deg``.
+
+    Args:
+        kind: as in :class:`Joints`.
+        q_min_seen: radians or metres.
+        q_max_seen: radians or metres.
+        q: where on it something is, which then comes first, with the range in brackets; NaN is ``?``.
+    """
+    if kind not in ("prismatic", "revolute"):
+        return kind
+    factor, digits, unit = (180 / np.pi, 0, "deg") if kind == "revolute" else (1.0, 2, "m")
+    seen = f"{factor * q_min_seen:z.{digits}f} to {factor * q_max_seen:z.{digits}f}"
+    if q is None:
+        return f"{kind} {seen} {unit}"
+    now = f"{factor * q:z.{digits}f}" if np.isfinite(q) else "?"
+    return f"{kind} {now} {unit} ({seen})"
 
 
 @dataclass(frozen=True)
@@ -242,6 +472,50 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.uv_px)
+
+    def __repr__(self) -> str:
+        k = len(self.names)
+        lines = [f"Tracks({len(self)} frames, {k} {'query' if k == 1 else 'queries'})"]
+        lines += [f"  {self.describe(i)}" for i in range(min(k, _SHOWN))]
+        return "\n".join(lines if k <= _SHOWN else [*lines, f"  and {k - _SHOWN} more"])
+
+    def describe(self, k: int) -> str:
+        """A track in one line: its name, how often it was seen, its joint and its state at the end.
+
+        Args:
+            k: the query.
+        """
+        found = np.isfinite(self.uv_px[:, k]).all(axis=-1)
+        if not found.any():
+            return f"{self.names[k]}: not found"
+        joint = "" if self.joints is None else f", {self.joints.describe(k)}"
+        seen = f"seen in {self.visible[found, k].mean():.0%} of {found.sum()} frames"
+        return f"{self.names[k]}: {seen}{joint}, {self.state[-1, k]} at the end"
+
+    def save(self, path: str | Path) -> None:
+        """Write the tracks; what is there already is replaced.
+
+        Args:
+            path: a folder, which gets ``tracks.parquet`` and, with joints, ``joints.json``; or a file that ends in
+                ``.parquet``, which gets all in one table.
+
+        Raises:
+            InputError: the path names a file of another kind.
+        """
+        from quest.data.tracks_file import save_tracks
+
+        save_tracks(self, path)
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row per frame and query, with the columns of ``tracks.parquet``; NaN or None where nothing is known.
+
+        Raises:
+            MissingExtraError: the extra ``pandas`` is not installed.
+        """
+        from quest.data.tracks_file import tracks_table
+
+        require("pandas")
+        return tracks_table(self).to_pandas()
 
     def select(self, queries: list[int] | np.ndarray) -> Tracks:
         """The same tracks of some queries only."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from quest.data.tracks_file import SCHEMA, read_tracks, write_tracks
-from quest.errors import InputError
+from quest.data.tracks_file import SCHEMA, read_tracks, write_joints, write_tracks
+from quest.errors import InputError, MissingExtraError
 from quest.types import Joints, State, Tracks
 
 
@@ -20,6 +22,8 @@ def tracks() -> Tracks:
     rng = np.random.default_rng(0)
     uv_px, point = rng.normal(size=(5, 3, 2)), rng.normal(size=(5, 3, 3))
     uv_px[:2, 1], point[:2, 1], point[3, 0] = np.nan, np.nan, np.nan
+    covariance = np.full((3, 6, 6), np.nan, np.float32)
+    covariance[0], covariance[1, 3:, 3:] = rng.normal(size=(6, 6)), np.eye(3)
     return Tracks(
         names=("link_0/handle", "slot-1", ""),
         labels=("handle", None, "rim"),
@@ -36,6 +40,10 @@ def tracks() -> Tracks:
             kind=("revolute", "static", "unknown"),
             axis=np.array([[0, 0, 1], [np.nan] * 3, [np.nan] * 3], np.float32),
             origin=np.array([[0.1, 2, 3], [1, 1, 1], [np.nan] * 3], np.float32),
+            q_min_seen=np.array([-0.1, np.nan, np.nan], np.float32),
+            q_max_seen=np.array([1.2, np.nan, np.nan], np.float32),
+            q=np.where(np.arange(3) == 0, rng.uniform(size=(5, 3)), np.nan).astype(np.float32),
+            covariance=covariance,
         ),
     )
 
@@ -48,8 +56,8 @@ def assert_same(found: Tracks, expected: Tracks) -> None:
     assert (found.joints is None) == (expected.joints is None)
     if found.joints is not None and expected.joints is not None:
         assert found.joints.kind == expected.joints.kind
-        np.testing.assert_array_equal(found.joints.axis, expected.joints.axis)
-        np.testing.assert_array_equal(found.joints.origin, expected.joints.origin)
+        for name in ("axis", "origin", "q_min_seen", "q_max_seen", "q", "covariance"):
+            np.testing.assert_array_equal(getattr(found.joints, name), getattr(expected.joints, name))
 
 
 def test_tracks_come_back(tracks: Tracks, tmp_path: Path):
@@ -78,12 +86,58 @@ def test_columns_that_other_programs_read(tracks: Tracks, tmp_path: Path):
     assert rows[3]["y_m"] == tracks.point_world[1, 0, 1]
 
 
+def test_a_folder_gets_the_joints_as_well(tracks: Tracks, tmp_path: Path):
+    tracks.save(tmp_path / "out")
+    assert_same(read_tracks(tmp_path / "out" / "tracks.parquet"), tracks)
+    whole = json.loads((tmp_path / "out" / "joints.json").read_text(encoding="utf-8"))
+    assert whole["stamp_s"] == tracks.stamp_s.tolist()
+    turning, still, unknown = whole["joints"]
+    assert tracks.joints is not None
+    assert (turning["name"], turning["label"], turning["kind"]) == ("link_0/handle", "handle", "revolute")
+    assert turning["axis"] == [0, 0, 1]
+    assert (turning["q_min_seen"], turning["q_max_seen"]) == (-0.1, 1.2)
+    np.testing.assert_allclose(turning["q"], tracks.joints.q[:, 0], rtol=1e-5)
+    np.testing.assert_allclose(turning["covariance"], tracks.joints.covariance[0], rtol=1e-5)
+    assert (still["kind"], still["axis"], still["q"], still["covariance"][0]) == ("static", None, None, None)
+    assert still["covariance"][3] == [None, None, None, 1, 0, 0]
+    assert {unknown[name] for name in ("axis", "origin_m", "q_min_seen", "q_max_seen", "covariance", "q")} == {None}
+
+
+def test_where_tracks_can_be_saved(tracks: Tracks, tmp_path: Path):
+    tracks.save(tmp_path / "mine.parquet")
+    assert_same(read_tracks(tmp_path / "mine.parquet"), tracks)
+    replace(tracks, joints=None).save(tmp_path / "plain")
+    assert [path.name for path in tmp_path.joinpath("plain").iterdir()] == ["tracks.parquet"]
+    for name in ("tracks.csv", "mine.parquet/deeper.json"):
+        with pytest.raises(InputError, match=r"expected a folder, or a file that ends in \.parquet"):
+            tracks.save(tmp_path / name)
+    with pytest.raises(InputError, match="have none"):
+        write_joints(replace(tracks, joints=None), tmp_path / "joints.json")
+
+
+def test_tables_of_pandas(tracks: Tracks, monkeypatch: pytest.MonkeyPatch):
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        with pytest.raises(MissingExtraError, match=r"\[pandas\]"):
+            tracks.to_pandas()
+    pytest.importorskip("pandas")
+    table = tracks.to_pandas()
+    assert list(table.columns) == SCHEMA.names
+    assert len(table) == 15
+    last = table[(table["name"] == "link_0/handle") & (table["frame"] == 4)]
+    assert tracks.joints is not None
+    assert last["q"].item() == tracks.joints.q[4, 0]
+    assert table["x_px"].isna().sum() == 2
+
+
 @pytest.mark.parametrize(("frames", "queries"), [(5, 0), (0, 3), (1, 1)])
 def test_small_tracks(tracks: Tracks, tmp_path: Path, frames: int, queries: int):
     small = tracks.select(list(range(queries)))
     per_frame = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm")
     cut = {name: getattr(small, name)[:frames] for name in per_frame}
-    small = replace(small, **cut, stamp_s=small.stamp_s[:frames])
+    assert small.joints is not None
+    joints = replace(small.joints, q=small.joints.q[:frames])
+    small = replace(small, **cut, stamp_s=small.stamp_s[:frames], joints=joints)
     write_tracks(small, tmp_path / "tracks.parquet")
     assert_same(read_tracks(tmp_path / "tracks.parquet"), small)
 
@@ -115,7 +169,7 @@ def test_other_version_and_lost_rows(tracks: Tracks, tmp_path: Path):
     pq.write_table(table.slice(0, 7), path)
     with pytest.raises(InputError, match="7 rows for 5 frames of 3 queries"):
         read_tracks(path)
-    raw = table.schema.metadata[b"quest-tracks"].replace(b'"version": 2', b'"version": 99')
+    raw = table.schema.metadata[b"quest-tracks"].replace(b'"version": 3', b'"version": 99')
     pq.write_table(table.replace_schema_metadata({b"quest-tracks": raw}), path)
-    with pytest.raises(InputError, match="format version 99, expected 2"):
+    with pytest.raises(InputError, match="format version 99, expected 3"):
         read_tracks(path)

@@ -11,14 +11,24 @@ import torch
 from jaxtyping import TypeCheckError
 
 from quest.data.cut import cut_clip
+from quest.data.recording import read_recording, write_recording
 from quest.errors import ConfigError, InputError, WeightsError
+from quest.grounding import Joint, JointKind
 from quest.model.config import NetworkConfig
 from quest.model.decoder import HeatmapHead
 from quest.model.weights import save_network
 from quest.track import StreamState, Tracker, load
 from quest.track.settings import REVISION
-from quest.track.tracker import NO_DEPTH_FLAG, NOTHING_FOUND_FLAG, PARTLY_NO_DEPTH_FLAG, collect, pick_device
-from quest.types import LABELS, Clip, Query, State, Tracks
+from quest.track.tracker import (
+    NO_DEPTH_FLAG,
+    NOTHING_FOUND_FLAG,
+    PARTLY_NO_DEPTH_FLAG,
+    PARTLY_WITHHELD_FLAG,
+    WITHHELD_FLAG,
+    collect,
+    pick_device,
+)
+from quest.types import GUESSED_CAMERA, LABELS, Clip, Query, State, Tracks
 from tests.tiny import BAD_INPUT, DEFAULT, PAPER
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
@@ -96,6 +106,108 @@ def test_what_is_not_watched_has_no_alarms(clip: Clip):
     assert unwatched.lost_p is unwatched.alarm is None
     assert watched.lost_p is not None
     assert watched.alarm is not None
+
+
+@pytest.mark.parametrize("alarming", [False, True])
+def test_without_depth_nothing_is_said_of_losses(clip: Clip, alarming: bool):
+    """The monitor is calibrated for depth only: with depth it says what it says, without any it is not asked."""
+    tracker = make_tracker()
+    tracker.calibration = make_calibration(alarming=alarming)
+    dark = tracker.track(replace(clip, depth_m=None), POINTS)
+    assert dark.lost_p is not None
+    assert np.isnan(dark.lost_p).all()
+    assert dark.alarm is not None
+    assert not dark.alarm.any()
+    assert dark.frame_flags == (NO_DEPTH_FLAG, WITHHELD_FLAG)
+    # As if there were no monitor.
+    assert_same(dark, tracker.track(replace(clip, depth_m=None), POINTS, alpha=None))
+    seen = tracker.track(clip, POINTS)
+    assert WITHHELD_FLAG not in seen.frame_flags
+    assert seen.lost_p is not None
+    assert np.isfinite(seen.lost_p).all()
+    late = tracker.track(without_depth(clip, slice(0, 2)), POINTS)
+    assert late.lost_p is not None
+    assert np.isfinite(late.lost_p).all(axis=1).tolist() == [False] * 2 + [True] * 4
+    assert PARTLY_WITHHELD_FLAG in late.frame_flags
+    assert np.isfinite(tracker.track(without_depth(clip, slice(2, 4)), POINTS).lost_p).all()  # type: ignore[arg-type]
+
+
+def test_a_stream_says_that_p_lost_is_withheld(clip: Clip):
+    tracker, frame = make_tracker(), clip.frame(0)
+    assert WITHHELD_FLAG not in tracker.stream(clip.camera, POINTS).step(frame.rgb, None, 0.0).flags
+    tracker.calibration = make_calibration(alarming=True)
+    stream = tracker.stream(clip.camera, POINTS)
+    state = stream.step(frame.rgb, None, 0.0)
+    assert WITHHELD_FLAG in state.flags
+    assert np.isnan(state.lost_p).all()
+    again = tracker.restore(tracker.save(stream))
+    for each in (stream, again):
+        assert WITHHELD_FLAG in each.step(clip.rgb[1], None, 0.1).flags
+        assert WITHHELD_FLAG not in each.step(frame.rgb, frame.depth_m, 0.2).flags
+
+
+def test_whatever_can_be_read_can_be_tracked(clip: Clip, tmp_path: Path):
+    write_recording(clip, tmp_path / "mine", rgb="png")
+    tracker = make_tracker()
+    assert_same(tracker.track(tmp_path / "mine", POINTS), tracker.track(read_recording(tmp_path / "mine"), POINTS))
+    arrays = Clip.from_arrays(clip.rgb)
+    for frames in (clip.rgb, torch.from_numpy(clip.rgb)):
+        tracks = tracker.track(frames, POINTS)
+        assert_same(tracks, tracker.track(arrays, POINTS))
+        assert tracks.frame_flags[0] == GUESSED_CAMERA
+
+
+def test_joints_of_a_clip(clip: Clip):
+    tracker = make_tracker()
+    tracks = tracker.track(clip, [*POINTS, Query.point(5, 3, 3)])
+    joints = tracks.joints
+    assert joints is not None
+    assert joints.q.shape == (6, 3)
+    for k, kind in enumerate(joints.kind):
+        moves = kind in ("prismatic", "revolute")
+        assert np.isfinite(joints.axis[k]).all() == moves
+        assert np.isfinite(joints.q[:, k]).any() == moves
+        assert np.isfinite([joints.q_min_seen[k], joints.q_max_seen[k]]).all() == moves
+        assert np.isfinite(joints.covariance[k, 3:, 3:]).all() == (kind != "unknown")
+    assert joints.select(np.array([1])).q.shape == (6, 1)
+    dark = tracker.track(replace(clip, depth_m=None), POINTS).joints
+    assert dark is not None
+    assert dark.kind == ("unknown", "unknown")
+    assert np.isnan(dark.covariance).all()
+
+
+def test_where_on_its_joint_a_query_was():
+    """A drawer that is seen to slide: before the joint is known it is told from where the drawer was."""
+    axis, rest = np.array([0.0, 0.6, 0.8]), np.array([0.1, 0.2, 1.0])
+    covariance = np.diag([0.01, 0.01, 0.001, 0.001])
+    slide = Joint(JointKind.PRISMATIC, axis, rest, rest, 0.0, 0.3, covariance, 0.01, 20)
+    still = Joint(JointKind.STATIC, axis, rest + 0.02 * axis, rest + 0.02 * axis, 0.0, 0.0, np.eye(3), 0.01, 2)
+    back = replace(slide, axis=-axis, rest=rest + 0.1 * axis)
+    clip, states = make_clip(frames=4), []
+    stream = make_tracker().stream(clip.camera, POINTS[:1])
+    for t, (joint, q) in enumerate([(still, np.nan), (back, 0.05), (slide, 0.2), (slide, 0.3)]):
+        frame = clip.frame(t)
+        state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        states.append(replace(state, joint=(joint,), q=np.array([q], np.float32)))
+    joints = collect(states, POINTS[:1]).joints
+    assert joints is not None
+    np.testing.assert_allclose(joints.q[:, 0], [0.02, 0.05, 0.2, 0.3], atol=1e-6)
+    assert (joints.q_min_seen[0], joints.q_max_seen[0]) == pytest.approx((0.0, 0.3))
+    assert repr(joints) == "Joints(prismatic 0.00 to 0.30 m)"
+
+
+def test_answers_are_printed_in_few_lines(clip: Clip):
+    tracker = make_tracker(config=replace(EAGER, prompt_threshold=1.0))
+    assert repr(tracker) == "Tracker('quest', unnamed weights, on cpu, no monitor)"
+    lines = repr(tracker.track(clip, [*POINTS, Query.semantic("knob")])).splitlines()
+    assert lines[0] == "Tracks(6 frames, 3 queries)"
+    assert lines[1].startswith("  a: seen in ")
+    assert lines[3] == "  knob: not found"
+    frame = clip.frame(0)
+    state = repr(tracker.stream(clip.camera, POINTS).step(frame.rgb, None, 0.0)).splitlines()
+    assert state[0] == "StreamState(0.000 s, 2 queries)"
+    assert state[1].startswith("  a: ")
+    assert state[3] == f"  note: {NO_DEPTH_FLAG}"
 
 
 def test_before_a_point_is_asked_there_is_no_answer(clip: Clip):

@@ -16,11 +16,10 @@ from typing import Literal
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Shaped, UInt8
 
 from quest.data.camera_file import CameraFile, check_depth_scale, write_camera
 from quest.data.folder import open_folder, read_scale
-from quest.data.frame_source import PLAUSIBLE_DEPTH_M, FrameSource, Parts, check_units, clean_depth
+from quest.data.frame_source import PLAUSIBLE_DEPTH_M, FrameSource, Parts, clean_depth
 from quest.data.video import frame_rate, write_video
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Clip
@@ -30,7 +29,6 @@ __all__ = [
     "FrameSource",
     "Parts",
     "clean_depth",
-    "clip_from_arrays",
     "open_recording",
     "read_recording",
     "write_recording",
@@ -155,43 +153,6 @@ def _open_bag(source: Path, camera: Path | Camera | None, depth_scale_m: float |
 
 def _as_path(camera: str | Path | Camera | None) -> Path | Camera | None:
     return Path(camera) if isinstance(camera, str) else camera
-
-
-def clip_from_arrays(
-    rgb: UInt8[np.ndarray, "T H W 3"],
-    depth_m: Shaped[np.ndarray, "T H W"] | None,
-    camera: Camera,
-    *,
-    name: str = "clip",
-    frames_per_s: float | int = 30.0,
-    stamp_s: Float[np.ndarray, " T"] | None = None,
-    cam_from_world: Float[np.ndarray, "T 4 4"] | None = None,
-) -> Clip:
-    """A clip from arrays in memory, checked as a recording on disk is.
-
-    Args:
-        rgb: colours.
-        depth_m: depth along +z in metres; what is not finite or not positive counts as missing. None without depth.
-        camera: intrinsics.
-        name: name of the clip.
-        frames_per_s: frame rate, where no time stamps are given.
-        stamp_s: times in seconds, not decreasing.
-        cam_from_world: pose per frame; identities by default.
-
-    Raises:
-        InputError: shapes contradict each other, times decrease, there are no frames or no frame rate; as
-            RecordingError if the depth is in the wrong units (millimetres, say).
-    """
-    frames = len(rgb)
-    if stamp_s is None and not 0 < frames_per_s < np.inf:
-        raise InputError(f"clip {name!r}: expected frames_per_s > 0, got {frames_per_s}")
-    stamps = np.arange(frames) / frames_per_s if stamp_s is None else np.asarray(stamp_s, dtype=np.float64)
-    poses = np.tile(np.eye(4), (frames, 1, 1)) if cam_from_world is None else cam_from_world
-    clean = None if depth_m is None else clean_depth(depth_m)
-    clip = Clip(name, camera, rgb, clean, stamps, poses)
-    if clean is not None:
-        check_units(clean, f"clip {name!r}", 1.0)
-    return clip
 
 
 def write_recording(

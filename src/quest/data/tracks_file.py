@@ -1,9 +1,11 @@
-"""Tracks on disk: Parquet, one row per frame and query, readable by any table tool."""
+"""Tracks on disk: Parquet, one row per frame and query, readable by any table tool; joints also as JSON."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +15,8 @@ from quest.errors import InputError
 from quest.types import Joints, State, Tracks
 from quest.whole_file import whole_file
 
-VERSION = 2
+VERSION = 3
+JOINTS_VERSION = 1
 _METADATA_KEY = b"quest-tracks"
 
 SCHEMA = pa.schema(
@@ -33,10 +36,46 @@ SCHEMA = pa.schema(
         ("state", pa.string()),
         ("lost_p", pa.float32()),
         ("alarm", pa.bool_()),
+        ("q", pa.float32()),
     ]
 )
-"""Columns: pixels in the source image, metres in the world frame; null where there is no position, and where a tracker
-does not say how probably it is lost or whether it alarms."""
+"""Columns: pixels in the source image, metres in the world frame, ``q`` on the joint in radians or metres; null where
+there is none, and where a tracker does not say how probably it is lost or whether it alarms."""
+
+
+def save_tracks(tracks: Tracks, path: str | Path) -> None:
+    """Write tracks into a folder, as ``tracks.parquet`` and ``joints.json``, or into one file of Parquet.
+
+    Raises:
+        InputError: the path names a file of another kind.
+    """
+    path = Path(path)
+    if path.suffix == ".parquet":
+        write_tracks(tracks, path)
+        return
+    if path.is_file() or (path.suffix and not path.is_dir()):
+        raise InputError(f"tracks {path}: expected a folder, or a file that ends in .parquet; name one of these")
+    write_tracks(tracks, path / "tracks.parquet")
+    if tracks.joints is not None:
+        write_joints(tracks, path / "joints.json")
+
+
+def write_joints(tracks: Tracks, path: str | Path) -> None:
+    """Write the joints of tracks as JSON (``docs/tracker.md`` lists its fields), all or nothing.
+
+    Raises:
+        InputError: the tracks have no joints.
+    """
+    joints = tracks.joints
+    if joints is None:
+        raise InputError(f"joints {path}: these tracks have none; a tracker that is grounded in joints gives them")
+    rows = [
+        {"query": k, "name": tracks.names[k], "label": tracks.labels[k], **row, "q": _plain(joints.q[:, k], digits=6)}
+        for k, row in enumerate(_joints_to_json(joints, digits=6))
+    ]
+    whole = {"version": JOINTS_VERSION, "stamp_s": [float(stamp) for stamp in tracks.stamp_s], "joints": rows}
+    with whole_file(Path(path)) as partial:
+        partial.write_text(json.dumps(whole, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def write_tracks(tracks: Tracks, path: str | Path) -> None:
@@ -45,6 +84,12 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
     Rows are ordered by frame, then query. Names, labels, time stamps, frame flags and joints are in the metadata, so
     that tracks without queries come back whole.
     """
+    with whole_file(Path(path)) as partial, partial.open("wb") as file:  # not by its path, which may be no UTF-8
+        pq.write_table(tracks_table(tracks), file, compression="zstd")
+
+
+def tracks_table(tracks: Tracks) -> pa.Table:
+    """Tracks as a table with the columns of :data:`SCHEMA`, one row per frame and query."""
     frames, queries = tracks.uv_px.shape[:2]
     frame, query = (index.ravel() for index in np.indices((frames, queries), dtype=np.int32))
     uv_px, point = tracks.uv_px.reshape(-1, 2), tracks.point_world.reshape(-1, 3)
@@ -64,6 +109,7 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
         "state": [str(state) for state in tracks.state.ravel()],
         "lost_p": [None] * len(frame) if tracks.lost_p is None else tracks.lost_p.ravel(),
         "alarm": [None] * len(frame) if tracks.alarm is None else tracks.alarm.ravel(),
+        "q": [None] * len(frame) if tracks.joints is None else tracks.joints.q.ravel(),
     }
     arrays = [pa.array(columns[field.name], type=field.type, from_pandas=True) for field in SCHEMA]
     metadata = {
@@ -76,8 +122,7 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
         "joints": None if tracks.joints is None else _joints_to_json(tracks.joints),
     }
     schema = SCHEMA.with_metadata({_METADATA_KEY: json.dumps(metadata).encode()})
-    with whole_file(Path(path)) as partial, partial.open("wb") as file:  # not by its path, which may be no UTF-8
-        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def read_tracks(path: str | Path) -> Tracks:
@@ -132,22 +177,49 @@ def read_tracks(path: str | Path) -> Tracks:
         frame_flags=tuple(metadata["frame_flags"]),
         lost_p=column("lost_p").astype(np.float32) if metadata["watched"] else None,
         alarm=column("alarm").astype(bool) if metadata["watched"] else None,
-        joints=None if metadata["joints"] is None else _joints_from_json(metadata["joints"]),
+        joints=None if metadata["joints"] is None else _joints_from_json(metadata["joints"], column("q")),
     )
 
 
-def _joints_to_json(joints: Joints) -> list[dict]:
-    """One entry per query; JSON has no NaN."""
-    rows = zip(joints.kind, joints.axis, joints.origin, strict=True)
-    return [{"kind": k, "axis": _finite(a), "origin_m": _finite(o)} for k, a, o in rows]
+def _joints_to_json(joints: Joints, *, digits: int | None = None) -> list[dict[str, Any]]:
+    """One entry per query, without its coordinates."""
+    return [
+        {
+            "kind": kind,
+            "axis": _plain(joints.axis[k], digits),
+            "origin_m": _plain(joints.origin[k], digits),
+            "q_min_seen": _plain(joints.q_min_seen[k], digits),
+            "q_max_seen": _plain(joints.q_max_seen[k], digits),
+            "covariance": _plain(joints.covariance[k], digits),
+        }
+        for k, kind in enumerate(joints.kind)
+    ]
 
 
-def _finite(vector: np.ndarray) -> list[float] | None:
-    return [float(v) for v in vector] if np.isfinite(vector).all() else None
+def _plain(values: np.ndarray, digits: int | None = None) -> Any:
+    """Nested lists of numbers, null where they are NaN, as JSON has none; one null where all of several are.
+
+    Args:
+        values: of any shape.
+        digits: significant ones; all by default.
+    """
+    if values.ndim == 0:
+        number = float(values) if digits is None else float(f"{values:.{digits}g}")
+        return number if np.isfinite(number) else None
+    return [_plain(value, digits) for value in values] if np.isfinite(values).any() or not values.size else None
 
 
-def _joints_from_json(rows: list[dict]) -> Joints:
-    def stacked(name: str) -> np.ndarray:
-        return np.array([row[name] or [np.nan] * 3 for row in rows], np.float32).reshape(len(rows), 3)
+def _joints_from_json(rows: list[dict[str, Any]], q: np.ndarray) -> Joints:
+    joints = Joints.unknown(*q.shape)
+    for k, row in enumerate(rows):
+        joints.axis[k] = _numbers(row["axis"])
+        joints.origin[k] = _numbers(row["origin_m"])
+        joints.q_min_seen[k] = _numbers(row["q_min_seen"])
+        joints.q_max_seen[k] = _numbers(row["q_max_seen"])
+        if row["covariance"] is not None:
+            joints.covariance[k] = [[np.nan] * 6 if line is None else _numbers(line) for line in row["covariance"]]
+    return replace(joints, kind=tuple(row["kind"] for row in rows), q=q.astype(np.float32))
 
-    return Joints(tuple(row["kind"] for row in rows), stacked("axis"), stacked("origin_m"))
+
+def _numbers(values: float | list[float | None] | None) -> np.ndarray:
+    return np.array(values, np.float32)  # null becomes NaN

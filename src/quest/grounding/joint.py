@@ -64,6 +64,21 @@ class Joint:
             return float("nan")
         return float(np.sqrt(np.trace(self.covariance[:2, :2]) / 2))
 
+    @property
+    def line_covariance(self) -> Float[np.ndarray, "6 6"]:
+        """Covariance of small errors of ``axis`` (3, radians) and ``origin`` (3, units of length) together.
+
+        It is :attr:`covariance` in the track's own axes, as far as it is about the axis: of rank 4, because errors
+        along the axis are none. Of a static joint the part of the axis is NaN.
+        """
+        if self.kind is JointKind.STATIC:
+            found = np.full((6, 6), np.nan)
+            found[3:, 3:] = self.covariance
+            return found
+        across = np.zeros((6, 4))
+        across[:3, :2] = across[3:, 2:] = perpendicular(self.axis)
+        return across @ self.covariance[:4, :4] @ across.T
+
     def describe(self, unit: str = "m") -> str:
         """One line for people; ``unit`` is the name of the track's unit of length."""
         if self.kind is JointKind.STATIC:

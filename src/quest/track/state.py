@@ -55,3 +55,14 @@ class StreamState:
     alarm: tuple[Alarm | None, ...]
     signals: Signals
     flags: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        lines = [
+            f"StreamState({self.stamp_s:.3f} s, {len(self.query)} {'query' if len(self.query) == 1 else 'queries'})"
+        ]
+        for k, name in enumerate(self.names):
+            x, y = self.uv_px[k]
+            lost = f", P(lost) {self.lost_p[k]:.2f}" if np.isfinite(self.lost_p[k]) else ""
+            alarm = "" if self.alarm[k] is None else ", ALARM"
+            lines.append(f"  {name}: {self.state[k]} at ({x:.1f}, {y:.1f}) px{lost}{alarm}")
+        return "\n".join(lines + [f"  note: {flag}" for flag in self.flags])

@@ -33,6 +33,8 @@ from quest.track.state import StreamState
 from quest.track.world import along_joint, to_world, world_joint
 from quest.types import Camera, Query, State
 
+WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is calibrated on frames with depth, and none had any so far"
+
 _LOST_ABOVE = 0.5
 _DOUBTED_ABOVE = 0.95
 """Probability of a loss above which a query goes back to where it was right. Below it the answer of the newest frame is
@@ -309,7 +311,7 @@ class Stream:
         verdict = None
         # Also of those that are found in this very frame: the answer is where they were held.
         doubted = [query.doubted for query in following]
-        if self._monitor is not None:
+        if self._monitor is not None and not self._withheld:
             verdict = self._monitor.step(
                 [f.query for f in following], signals, frame=self._memory.frame, stamp_s=self._memory.stamp_s
             )
@@ -355,6 +357,12 @@ class Stream:
                 query.trust(placed.judged[k])
                 self._monitor.clear(query.query)
 
+    @property
+    def _withheld(self) -> bool:
+        """Whether P(lost) would say nothing: it is calibrated for streams with depth, and there was none so far."""
+        reference = self._intake.state.reference
+        return self._monitor is not None and reference is not None and not reference.has_depth
+
     def _alarm(self, query: Following) -> Alarm | None:
         return None if self._monitor is None else self._monitor.alarm(query.query)
 
@@ -363,6 +371,7 @@ class Stream:
         rows = [(f, f.answer) for f in self._memory.following if f.answer is not None]
         answers = [answer for _, answer in rows]
         reference, flags = self._intake.state.reference, self._intake.state.flags
+        flags = (*flags, WITHHELD_FLAG) if self._withheld else flags
         joints = tuple(world_joint(self._memory.links.joint(f.query) or f.ground.joint, reference) for f, _ in rows)
 
         def stacked(name: str, *shape: int) -> np.ndarray:

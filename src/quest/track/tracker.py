@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from quest.data.read import read
 from quest.errors import ConfigError, InputError, WeightsError
-from quest.grounding import JointKind
+from quest.grounding import Joint, JointKind
 from quest.model.discovery import Peaks, find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.precision import fast_bfloat16
@@ -23,12 +24,13 @@ from quest.track.saving import load as restored
 from quest.track.saving import save
 from quest.track.settings import REVISION, TrackerConfig
 from quest.track.state import StreamState
-from quest.track.stream import Memory, Stream
+from quest.track.stream import WITHHELD_FLAG, Memory, Stream
 from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
 PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are NaN"
+PARTLY_WITHHELD_FLAG = "no P(lost) and no alarms in the frames until depth began: the monitor is calibrated for depth"
 NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
 
 
@@ -80,6 +82,11 @@ class Tracker:
         self.weights_hash = weights_hash
         self.calibration = calibration
         self._autocast = fast_bfloat16(device)
+
+    def __repr__(self) -> str:
+        weights = "unnamed weights" if self.weights_hash is None else f"weights {self.weights_hash[:8]}"
+        monitor = "no monitor" if self.calibration is None else "monitored"
+        return f"Tracker({self.name!r}, {weights}, on {self.device}, {monitor})"
 
     def with_config(self, config: TrackerConfig, *, name: str) -> Tracker:
         """A tracker that shares this one's network under other settings.
@@ -166,7 +173,7 @@ class Tracker:
 
     def track(
         self,
-        clip: Clip,
+        clip: Clip | str | Path | np.ndarray | torch.Tensor,
         queries: Sequence[Query] | None = None,
         *,
         alpha: float | None = DEFAULT_ALPHA,
@@ -175,15 +182,22 @@ class Tracker:
         """Track a whole clip: the stream's step in a loop.
 
         Args:
-            clip: the frames.
+            clip: the frames; or what :func:`quest.read` reads, by its path; or colours alone, [T, H, W, 3], as an array
+                or tensor that :meth:`quest.Clip.from_arrays` takes.
             queries: what to follow; None discovers entities in the first frame.
             alpha: as in :meth:`stream`.
             alpha_frames: as in :meth:`stream`; ``len(clip)`` shares alpha among all parts of the clip alike.
 
         Raises:
-            InputError: a point query lies outside the clip, or two queries have one name.
+            InputError: a point query lies outside the clip, or two queries have one name; or the frames are not as
+                expected.
+            TakeError: a path names a take that cannot be read.
             ConfigError: alpha is no probability, or there are no frames.
         """
+        if isinstance(clip, str | Path):
+            clip = read(clip)
+        elif not isinstance(clip, Clip):
+            clip = Clip.from_arrays(clip)
         stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
         for query in queries or ():
             if query.frame >= len(clip):
@@ -195,6 +209,7 @@ class Tracker:
             frame = clip.frame(t)
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
         tracks = collect(states, queries)
+        tracks = replace(tracks, frame_flags=(*clip.notes, *tracks.frame_flags))
         return tracks if stream.budget is not None else replace(tracks, lost_p=None, alarm=None)
 
     def _maker(self, camera: Camera, alpha: float | None) -> Maker:
@@ -277,10 +292,14 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
         state[i, rows] = [value.value for value in s.state]
     with_depth = [s.has_depth for s in states]
     flags = [] if all(with_depth) else [PARTLY_NO_DEPTH_FLAG if any(with_depth) else NO_DEPTH_FLAG]
+    withheld = [WITHHELD_FLAG in s.flags for s in states]
+    flags += [WITHHELD_FLAG] if all(withheld) else [PARTLY_WITHHELD_FLAG] if any(withheld) else []
     lost = [names[i] for i in range(k) if i not in last.query]
     flags += [f"query {name!r} found no entity: lost in every frame" for name in lost]
     flags += [NOTHING_FOUND_FLAG] if queries is None and not k else []
-    told = Counter(flag.partition(":")[0] for s in states for flag in s.flags if flag != NO_DEPTH_FLAG)
+    told = Counter(
+        flag.partition(":")[0] for s in states for flag in s.flags if flag not in (NO_DEPTH_FLAG, WITHHELD_FLAG)
+    )
     flags += [f"{what}: {count} of {t} frames" for what, count in told.items()]
     stamps = np.array([s.stamp_s for s in states])
     return Tracks(
@@ -295,17 +314,29 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
         frame_flags=tuple(flags),
         lost_p=lost_p,
         alarm=alarm,
-        joints=_joints(last, k),
+        joints=_joints(states, k),
     )
 
 
-def _joints(last: StreamState, queries: int) -> Joints:
-    """The joints of the last frame as arrays in the order of the queries."""
-    kind = ["unknown"] * queries
-    axis, origin = (np.full((queries, 3), np.nan, np.float32) for _ in range(2))
-    for i, joint in zip(last.query, last.joint, strict=True):
-        if joint is not None:
-            kind[i], axis[i], origin[i] = joint.kind.value, joint.axis, joint.origin
-            if joint.kind is JointKind.STATIC:
-                axis[i] = np.nan
-    return Joints(tuple(kind), axis, origin)
+def _joints(states: Sequence[StreamState], queries: int) -> Joints:
+    """The joints of the last frame as arrays in the order of the queries, and where on them each frame was."""
+    last, found = states[-1], Joints.unknown(len(states), queries)
+    kind = list(found.kind)
+    for k, joint in zip(last.query, last.joint, strict=True):
+        if joint is None:
+            continue
+        kind[k], found.origin[k], found.covariance[k] = joint.kind.value, joint.origin, joint.line_covariance
+        if joint.kind is not JointKind.STATIC:
+            found.axis[k], found.q_min_seen[k], found.q_max_seen[k] = joint.axis, joint.lower, joint.upper
+            found.q[:, k] = [_coordinate(joint, state, k) for state in states]
+    return replace(found, kind=tuple(kind))
+
+
+def _coordinate(joint: Joint, state: StreamState, query: int) -> float:
+    """Where a query was in a frame, on a joint that became known later: from where it was on the joint of then."""
+    row = state.query.index(query) if query in state.query else None
+    then = None if row is None else state.joint[row]
+    if row is None or then is None or not np.isfinite(state.point_world[row]).all():
+        return float("nan")
+    place = then.rest[None] if then.kind is JointKind.STATIC else then.at(state.q[row : row + 1].astype(np.float64))
+    return float(joint.locate(place)[0])
