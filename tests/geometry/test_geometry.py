@@ -12,6 +12,7 @@ from torch import Tensor
 
 from quest.geometry import invert, lift, lift_depth, project, scale_camera, transform
 from quest.types import Camera
+from tests.tolerances import DOUBLE
 
 CAMERA = Camera(fx=310.0, fy=290.0, cx=170.0, cy=110.0, width=320, height=240)
 
@@ -46,7 +47,7 @@ points = st.lists(st.tuples(real(-5, 5), real(-5, 5), real(0.05, 50)), min_size=
 
 @given(cameras(), points)
 def test_lift_undoes_project(camera: Camera, point: Tensor):
-    torch.testing.assert_close(lift(project(point, camera), point[:, 2], camera), point, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(lift(project(point, camera), point[:, 2], camera), point, **DOUBLE)
 
 
 @given(cameras(), points)
@@ -57,16 +58,16 @@ def test_project_agrees_with_the_matrix(camera: Camera, point: Tensor):
 
 @given(motions(), points)
 def test_inverse_undoes_a_motion(motion: Tensor, point: Tensor):
-    torch.testing.assert_close(transform(invert(motion), transform(motion, point)), point, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(invert(motion) @ motion, torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-9)
-    torch.testing.assert_close(invert(invert(motion)), motion, rtol=1e-9, atol=1e-9)
+    torch.testing.assert_close(transform(invert(motion), transform(motion, point)), point, **DOUBLE)
+    torch.testing.assert_close(invert(motion) @ motion, torch.eye(4, dtype=torch.float64), **DOUBLE)
+    torch.testing.assert_close(invert(invert(motion)), motion, **DOUBLE)
 
 
 @given(motions(), motions(), points)
 def test_motions_compose(second: Tensor, first: Tensor, point: Tensor):
     together = transform(second @ first, point)
-    torch.testing.assert_close(transform(second, transform(first, point)), together, rtol=1e-9, atol=1e-9)
-    torch.testing.assert_close(invert(second @ first), invert(first) @ invert(second), rtol=1e-9, atol=1e-8)
+    torch.testing.assert_close(transform(second, transform(first, point)), together, **DOUBLE)
+    torch.testing.assert_close(invert(second @ first), invert(first) @ invert(second), **DOUBLE)
 
 
 @given(motions(), points)
@@ -89,7 +90,7 @@ def test_scaled_camera_sees_scaled_pixels(camera: Camera, point: Tensor, scale: 
     width, height = math.ceil(camera.width * scale + left) + 1, math.ceil(camera.height * scale + top) + 1
     scaled = scale_camera(camera, scale=scale, pad_left_px=left, pad_top_px=top, width=width, height=height)
     expected = project(point, camera) * scale + torch.tensor([left, top], dtype=torch.float64)
-    torch.testing.assert_close(project(point, scaled), expected, rtol=1e-9, atol=1e-6)
+    torch.testing.assert_close(project(point, scaled), expected, **DOUBLE)
 
 
 @pytest.mark.parametrize("z", [0.0, -1.0, -1e-9, math.nan])

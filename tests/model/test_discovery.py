@@ -15,6 +15,7 @@ from quest.model.observation import FrameBatch, Observation
 from quest.types import LABELS, Take
 from tests.synthetic import make_take
 from tests.tiny import make_frames, make_network
+from tests.tolerances import NETWORK
 
 
 def see(take: Take, t: int) -> tuple[FrameBatch, Observation]:
@@ -29,7 +30,7 @@ def test_a_mirrored_frame_is_a_frame_of_the_mirrored_take():
         got, expected = _mirrored(make_network(), see(take, 5)[0]), see(mirror_take(take), 5)[0]
     for f in fields(FrameBatch):
         if f.name != "enlarged":
-            torch.testing.assert_close(getattr(got, f.name), getattr(expected, f.name), rtol=1e-4, atol=1e-4)
+            torch.testing.assert_close(getattr(got, f.name), getattr(expected, f.name), **NETWORK)
 
 
 def test_in_the_mirror_image_the_mirrored_peaks_are_found():

@@ -12,6 +12,7 @@ from torch import Tensor
 from quest.errors import WeightsError
 from quest.model.encoder import Encoder, EncoderConfig, resize_patch_kernel, resize_position
 from quest.train.dataset import load_initial_encoder
+from tests.tolerances import NETWORK
 
 CONFIG = EncoderConfig(image_size=64, patch_size=16, width=32, depth=1, heads=2)
 
@@ -63,7 +64,7 @@ def test_an_enlarged_image_has_tokens_of_its_smaller_parts():
     torch.testing.assert_close(seen[0].mean((2, 3)), encoder_input(encoder, rgb).mean((2, 3)), rtol=0, atol=0.02)
     smooth = torch.full((1, 64, 64, 3), 100, dtype=torch.uint8)
     expected = larger(torch.full((1, 128, 128, 3), 100, dtype=torch.uint8))
-    torch.testing.assert_close(encoder(smooth, enlarge=2), expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(encoder(smooth, enlarge=2), expected, **NETWORK)
 
 
 def encoder_input(encoder: Encoder, rgb: Tensor) -> Tensor:

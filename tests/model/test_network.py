@@ -17,6 +17,7 @@ from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.types import INTENTS, LABELS
 from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+from tests.tolerances import NETWORK, NETWORK_DEEP
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 
@@ -48,7 +49,7 @@ def answers(network: QuestNetwork, anchor: Anchor, frames: FrameBatch) -> dict[s
 def assert_same(got: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
     for name in expected:
         torch.testing.assert_close(
-            got[name], expected[name], rtol=1e-3, atol=1e-5, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}"
+            got[name], expected[name], **NETWORK_DEEP, equal_nan=True, msg=lambda m, n=name: f"{n}: {m}"
         )
 
 
@@ -142,7 +143,7 @@ def test_binding_does_not_mix_queries():
     label, valid = torch.zeros(2, 3, dtype=torch.long), torch.ones(2, 3, dtype=torch.bool)
     together = network.bind(observed, uv, nan, label, valid).content
     alone = network.bind(observed, uv[:, 1:2], nan[:, 1:2], label[:, 1:2], valid[:, 1:2]).content
-    torch.testing.assert_close(together[:, 1:2], alone, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(together[:, 1:2], alone, **NETWORK)
 
 
 def test_label_place_and_depth_reach_the_anchor():
@@ -259,7 +260,7 @@ def test_bilinear_samples_against_a_plain_loop():
                 for dx in (0, 1):
                     weight = (1 - abs(x - x0 - dx)) * (1 - abs(y - y0 - dy))
                     total += weight * cells[b, (y0 + dy) * 4 + x0 + dx]
-            torch.testing.assert_close(got[b, k], total, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(got[b, k], total, **NETWORK)
 
 
 def test_slots_are_peaks_best_first_and_apart():

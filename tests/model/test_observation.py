@@ -12,6 +12,7 @@ from quest.model.config import NetworkConfig
 from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
 from quest.types import Camera
 from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+from tests.tolerances import NETWORK, PIXEL_MOVED
 
 
 def test_cell_depth_against_a_plain_loop():
@@ -61,7 +62,7 @@ def test_to_reference_is_undone_by_projection():
     back = project(cam, Camera(80.0, 80.0, 32.0, 32.0, 64, 64))
     seen = depth > 0
     assert seen.any()
-    torch.testing.assert_close(back[seen], uv[seen], rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(back[seen], uv[seen], **PIXEL_MOVED)
 
 
 def test_places_are_exact_where_the_network_computes_in_bfloat16():
@@ -138,7 +139,7 @@ def test_neither_batch_nor_time_mix(config: NetworkConfig):
         alone = network.observe(one(frames, 1).during(slice(2, 3)))
     for name in Observation.__dataclass_fields__:
         expected = getattr(together, name)[1:2, 2:3]
-        torch.testing.assert_close(getattr(alone, name), expected, rtol=1e-4, atol=1e-5, equal_nan=True)
+        torch.testing.assert_close(getattr(alone, name), expected, **NETWORK, equal_nan=True)
 
 
 def test_stack_undoes_during():
@@ -167,6 +168,6 @@ def test_pixels_of_lifted_points_are_the_pixels():
     frames = make_frames()
     uv_px = 64 * torch.rand(2, 4, 5, 2, generator=torch.Generator().manual_seed(1))
     point = frames.to_reference(uv_px, torch.full((2, 4, 5), 1.3))
-    torch.testing.assert_close(frames.from_reference(point), uv_px, rtol=1e-4, atol=1e-3)
+    torch.testing.assert_close(frames.from_reference(point), uv_px, **PIXEL_MOVED)
     behind = frames.to_reference(uv_px, torch.full((2, 4, 5), 1.3)) - torch.tensor([0.0, 0.0, 100.0])
     assert frames.from_reference(behind).isnan().all()

@@ -9,6 +9,7 @@ from torch import Tensor
 from quest.errors import ConfigError, WeightsError
 from quest.track.belief import Belief, moved, update
 from quest.track.settings import TrackerConfig
+from tests.tolerances import NETWORK, NETWORK_DEEP
 
 SIDE = 8
 CONFIG = TrackerConfig(move_sigma=0.15, jump=0.02, temperature=1.5)
@@ -82,7 +83,7 @@ def test_against_a_plain_loop():
         )
         prior += (1 - CONFIG.jump) * before.probability[0, i] * (-0.5 * (gap / CONFIG.move_sigma) ** 2).softmax(-1)
     expected = (seen * (logits[0] / CONFIG.temperature).log_softmax(-1)).exp() * prior
-    torch.testing.assert_close(after.probability[0], expected / expected.sum(), rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(after.probability[0], expected / expected.sum(), **NETWORK_DEEP)
 
 
 def test_follows_a_peak_that_moves():
@@ -122,7 +123,7 @@ def test_queries_do_not_meet():
     first, second = torch.randn(3, SIDE * SIDE), torch.randn(3, SIDE * SIDE)
     together = step(step(None, first), second)
     alone = step(step(None, first[1:2]), second[1:2])
-    torch.testing.assert_close(together.probability[1:2], alone.probability, rtol=1e-4, atol=1e-6)
+    torch.testing.assert_close(together.probability[1:2], alone.probability, **NETWORK)
 
 
 def test_a_moving_camera_is_accounted_for():

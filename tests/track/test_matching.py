@@ -9,6 +9,7 @@ import torch
 from quest.model.decoder import HeatmapHead
 from quest.model.observation import Observation, cell_centres
 from quest.types import Query
+from tests.tolerances import NETWORK_DEEP
 from tests.track.clips import make_clip, make_tracker
 
 POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
@@ -36,7 +37,7 @@ def test_a_query_that_binds_counts_its_frame_once():
             near = (cell_px - uv_px).norm(dim=-1) < 16
             got, scores = one.belief.probability[0, near], logits[0, 0, k, near]
             expected = (seen[k] * scores / tracker.config.temperature).softmax(-1)
-            torch.testing.assert_close(got / got.sum(), expected, rtol=1e-3, atol=1e-6)
+            torch.testing.assert_close(got / got.sum(), expected, **NETWORK_DEEP)
             assert one.belief.probability[0, (cell_px - uv_px).norm(dim=-1) < 16 + 3 * 4].sum() > 0.95
 
 

@@ -15,6 +15,7 @@ from quest.track import Tracker, TrackerConfig
 from quest.track.tracker import NOTHING_FOUND_FLAG
 from quest.types import LABELS, Clip, Query, State
 from tests.tiny import PAPER
+from tests.tolerances import PIXEL, PIXEL_MOVED, POINT
 from tests.track.clips import EAGER, make_clip, make_tracker, without_depth
 
 
@@ -146,12 +147,12 @@ def test_a_pixel_without_depth_is_held(clip: Clip):
     x, y = whole.uv_px[3, 0].astype(int)
     depth[3, y, x] = 0
     tracks = make(confidence=[3.0] * 5).track(replace(clip, depth_m=depth))
-    np.testing.assert_allclose(tracks.point_world[3, 0], whole.point_world[2, 0], atol=1e-5)
+    np.testing.assert_allclose(tracks.point_world[3, 0], whole.point_world[2, 0], **POINT)
     assert tracks.state[3, 0] == State.HELD
     assert not tracks.visible[3, 0]
-    np.testing.assert_allclose(tracks.uv_px[3, 0], whole.uv_px[3, 0], atol=1e-4)
+    np.testing.assert_allclose(tracks.uv_px[3, 0], whole.uv_px[3, 0], **PIXEL)
     assert (tracks.state[[2, 4], 0] == State.TRACKING).all()
-    np.testing.assert_allclose(tracks.point_world[4], whole.point_world[4], atol=1e-5)
+    np.testing.assert_allclose(tracks.point_world[4], whole.point_world[4], **POINT)
 
 
 def test_before_there_was_any_point_nothing_is_held(clip: Clip):
@@ -184,7 +185,7 @@ def test_a_window_is_decoded_as_it_was_trained(clip: Clip):
             x = network.embed(network.slots(1), Observation.stack(list(stream.memory.ring)))
             uv = network.head(x).uv[0, -1]  # type: ignore[call-arg]
         slots = [f.slot for f in stream.memory.following]
-        np.testing.assert_allclose(state.uv_px, 64 * uv[slots].numpy(), atol=1e-3)
+        np.testing.assert_allclose(state.uv_px, 64 * uv[slots].numpy(), **PIXEL_MOVED)
 
 
 def test_saved_streams_go_on(clip: Clip):

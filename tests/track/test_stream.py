@@ -17,6 +17,7 @@ from quest.monitor import SIGNALS, Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
 from quest.track.events import Events
 from quest.types import Clip, Query, State
+from tests.tolerances import PIXEL_MOVED, POINT
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
 POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
@@ -126,10 +127,10 @@ def test_poses_that_begin_late_move_nothing(clip: Clip):
         frame = clip.frame(t)
         expected = still.step(frame.rgb, frame.depth_m, frame.stamp_s)
         state = late.step(frame.rgb, frame.depth_m, frame.stamp_s, None if t < 3 else turned)
-        np.testing.assert_allclose(state.uv_px, expected.uv_px, atol=1e-3)
+        np.testing.assert_allclose(state.uv_px, expected.uv_px, **PIXEL_MOVED)
         told = "poses begin" in " ".join(state.flags)
         assert told == (t == 3)
-    np.testing.assert_allclose(state.point_world, expected.point_world @ turned[:3, :3], atol=1e-4)
+    np.testing.assert_allclose(state.point_world, expected.point_world @ turned[:3, :3], **POINT)
 
 
 def test_poses_are_rigid_up_to_rounding(clip: Clip):

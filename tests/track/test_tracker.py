@@ -30,6 +30,7 @@ from quest.track.tracker import (
 )
 from quest.types import GUESSED_CAMERA, LABELS, Clip, Query, State, Tracks
 from tests.tiny import BAD_INPUT, DEFAULT, PAPER
+from tests.tolerances import PIXEL, PIXEL_MOVED, POINT, POINT_MOVED
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
 BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
@@ -76,8 +77,8 @@ def test_stream_equals_clip(config: NetworkConfig, queries: tuple[Query, ...] | 
 def test_the_future_is_not_used(config: NetworkConfig, clip: Clip):
     tracker = make_tracker(config)
     whole, start = tracker.track(clip, POINTS), tracker.track(cut_clip(clip, slice(0, 3)), POINTS)
-    np.testing.assert_allclose(whole.uv_px[:3], start.uv_px, atol=1e-4)
-    np.testing.assert_allclose(whole.point_world[:3], start.point_world, atol=1e-4)
+    np.testing.assert_allclose(whole.uv_px[:3], start.uv_px, **PIXEL)
+    np.testing.assert_allclose(whole.point_world[:3], start.point_world, **POINT)
 
 
 def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
@@ -223,14 +224,14 @@ def test_before_a_point_is_asked_there_is_no_answer(clip: Clip):
 def test_hidden_entities_are_held_where_they_were_seen(clip: Clip):
     """With a threshold that nothing reaches, every entity stays at the point where it was bound."""
     tracks = make_tracker(config=replace(EAGER, hold_below=1.0, ground=False)).track(clip, POINTS)
-    np.testing.assert_allclose(tracks.point_world[-1], tracks.point_world[0], atol=1e-5)
+    np.testing.assert_allclose(tracks.point_world[-1], tracks.point_world[0], **POINT)
     free = make_tracker(config=replace(EAGER, hold_below=0.0, ground=False)).track(clip, POINTS)
-    np.testing.assert_allclose(tracks.point_world[0], free.point_world[0], atol=1e-5)
+    np.testing.assert_allclose(tracks.point_world[0], free.point_world[0], **POINT)
 
 
 def test_equal_queries_get_equal_answers(clip: Clip):
     tracks = make_tracker().track(clip, [POINTS[0], replace(POINTS[0], name="twin")])
-    np.testing.assert_allclose(tracks.uv_px[:, 0], tracks.uv_px[:, 1], atol=1e-3)
+    np.testing.assert_allclose(tracks.uv_px[:, 0], tracks.uv_px[:, 1], **PIXEL)
 
 
 def test_what_is_no_query_is_refused(clip: Clip):
@@ -338,7 +339,7 @@ def test_answers_are_in_source_pixels(size: tuple[int, int]):
     got = tracker.track(clip, [Query.point(0, *at[0].tolist())])
     expected = tracker.track(square, [Query.point(0, *there.tolist())])
     np.testing.assert_allclose(box.to_canvas(got.uv_px), expected.uv_px, atol=1e-2)
-    np.testing.assert_allclose(got.point_world, expected.point_world, atol=1e-3)
+    np.testing.assert_allclose(got.point_world, expected.point_world, **POINT_MOVED)
 
 
 def test_world_points_follow_the_world(clip: Clip):
@@ -349,8 +350,8 @@ def test_world_points_follow_the_world(clip: Clip):
     motion[:3, 3] = [3.0, -2.0, 0.5]
     tracker = make_tracker()
     here, there = tracker.track(clip, POINTS), tracker.track(moved_world(clip, motion), POINTS)
-    np.testing.assert_allclose(there.uv_px, here.uv_px, atol=1e-3)
-    np.testing.assert_allclose(there.point_world, here.point_world @ motion[:3, :3].T + motion[:3, 3], atol=1e-3)
+    np.testing.assert_allclose(there.uv_px, here.uv_px, **PIXEL_MOVED)
+    np.testing.assert_allclose(there.point_world, here.point_world @ motion[:3, :3].T + motion[:3, 3], **POINT_MOVED)
 
 
 def test_lifted_points_are_where_the_cameras_say(clip: Clip):

@@ -13,6 +13,7 @@ from quest.errors import ConfigError
 from quest.train.dataset import Dataset, licence_after, open_dataset
 from quest.train.settings import WindowConfig
 from tests.tiny import make_network
+from tests.tolerances import PIXEL
 from tests.train.prepared import CPU, make_store
 
 TRAIN, VALIDATION, TEST, UNLISTED = 3, 100003, 110003, 999999
@@ -103,4 +104,4 @@ def test_mirror_images_teach_beside_the_takes_or_instead(tmp_path: Path):
     mirrored = alone.training.views[0]
     view = next(v for v in both.training.views if v.name not in {m.name for m in alone.training.views})
     np.testing.assert_array_equal(mirrored.rgb[:, :, ::-1], view.rgb)
-    np.testing.assert_allclose(mirrored.uv_px[..., 0], 64 - view.uv_px[..., 0], atol=1e-4)
+    np.testing.assert_allclose(mirrored.uv_px[..., 0], 64 - view.uv_px[..., 0], **PIXEL)

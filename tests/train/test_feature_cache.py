@@ -16,6 +16,7 @@ from quest.errors import ConfigError
 from quest.train.feature_cache import FeatureCache, encode_images, owner_of
 from tests.synthetic import make_take
 from tests.tiny import DEFAULT, make_network
+from tests.tolerances import PIXEL
 from tests.train.prepared import CPU
 
 NAME = "panels-0"
@@ -50,7 +51,7 @@ def test_what_is_cached_is_what_the_take_holds(tmp_path: Path):
         np.testing.assert_array_equal(view.rgb, truth.clip.rgb)
         assert truth.clip.depth_m is not None
         np.testing.assert_allclose(view.depth * 1e-4, truth.clip.depth_m, atol=1e-6)
-        np.testing.assert_allclose(view.uv_px, truth.uv_px[:, :2], atol=1e-4)
+        np.testing.assert_allclose(view.uv_px, truth.uv_px[:, :2], **PIXEL)
         np.testing.assert_array_equal(view.visible, truth.visible[:, :2])
         assert view.label.tolist() == [0, 1]
         assert view.revolute.tolist() == [False, True]

@@ -23,6 +23,7 @@ from quest.train.stage import StageOne
 from quest.train.validation import WindowScores, validate
 from quest.train.windows import WindowSampler, WindowTruth
 from tests.tiny import DEFAULT, PAPER, make_network
+from tests.tolerances import TRAINED, approx
 from tests.train.prepared import make_sampler
 
 pytest.importorskip("lightning_fabric")
@@ -145,7 +146,7 @@ def test_micro_batches_add_up_to_the_batch(run: Run, config: NetworkConfig):
     """Windows of different numbers of entities, so that the mean of the parts' means would be another one."""
     whole, reports = run(network=config, out="whole")
     parts, same = run(replace(SHORT, accumulate=2), network=config, out="parts")
-    assert [r.loss for r in same] == pytest.approx([r.loss for r in reports], rel=1e-3)
+    assert [r.loss for r in same] == approx([r.loss for r in reports], TRAINED)
     for name, tensor in weights_of(whole).items():
         assert torch.allclose(parts.state_dict()[name], tensor, atol=2e-3), name
 

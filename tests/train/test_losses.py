@@ -13,6 +13,7 @@ from torch import Tensor
 from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
 from quest.train import losses
+from tests.tolerances import LOSS, approx
 
 B, T, K, C = 2, 4, 3, 8
 
@@ -73,7 +74,7 @@ def test_coordinate_loss():
         for i in [tuple(i[0].tolist())]
     ]
     loss = losses.coordinate_loss(uv, target, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, uv)
     assert uv.grad is not None
     assert (uv.grad[~mask] == 0).all()
@@ -100,7 +101,7 @@ def test_heatmap_loss():
                 total -= w * sum(p / sum(blob) * q for p, q in zip(blob, log_p, strict=True))
                 norm += w
     loss = losses.heatmap_loss(logits, uv, weight, cells=C)
-    assert float(loss.detach()) == pytest.approx(total / norm, rel=1e-4)
+    assert float(loss.detach()) == approx(total / norm, LOSS)
     lives(loss, logits)
 
 
@@ -120,7 +121,7 @@ def test_point_loss():
         if error.isfinite().all():
             expected.append(sum(huber(e, 0.05) for e in error.tolist()) / 0.05)
     loss = losses.point_loss(point, target, unit, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, point)
     assert losses.point_loss(target, target, unit, mask) == 0
 
@@ -141,9 +142,9 @@ def test_difference_loss(order: int):
                 d = error[1] - error[0] if order == 1 else error[2] - 2 * error[1] + error[0]
                 expected.append(sum(min(abs(x), 0.5) for x in d.tolist()))
     loss = losses.difference_loss(point, target, unit, mask, order=order)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     still = (target + torch.tensor([0.1, -0.2, 0.3])).nan_to_num()
-    assert losses.difference_loss(still, target, unit, mask, order=order) == pytest.approx(0, abs=1e-6)
+    assert losses.difference_loss(still, target, unit, mask, order=order) == approx(0, LOSS)
     small = (target.nan_to_num() + 0.01 * torch.randn_like(target)).requires_grad_()
     lives(losses.difference_loss(small, target, unit, torch.ones_like(mask), order=order), small)
 
@@ -161,10 +162,10 @@ def test_confidence_loss():
         for i in map(tuple, mask.nonzero().tolist())
     ]
     loss = losses.confidence_loss(logit, target, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, logit)
     sure = torch.where(target, 50.0, -50.0)
-    assert losses.confidence_loss(sure, target, mask) == pytest.approx(0, abs=1e-6)
+    assert losses.confidence_loss(sure, target, mask) == approx(0, LOSS)
 
 
 def test_label_loss():
@@ -172,7 +173,7 @@ def test_label_loss():
     mask = torch.tensor([[True, False, True], [False, True, True]])
     expected = [-float(logits[b, k].log_softmax(-1)[label[b, k]]) for b, k in mask.nonzero().tolist()]
     loss = losses.label_loss(logits, label, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, logits)
 
 
@@ -183,7 +184,7 @@ def test_bound_loss():
         sum(max(0.0, -x) + max(0.0, x - 1) for x in uv[b, t, k].tolist()) for b, t, k in mask.nonzero().tolist()
     ]
     loss = losses.bound_loss(uv, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, uv)
     assert losses.bound_loss(torch.rand(B, T, K, 2), mask) == 0
 
@@ -197,10 +198,10 @@ def test_feature_loss():
             x, y = embedding[b, t, k].detach(), embedding[b, t - 1, k].detach()
             expected.append(1 - float(x @ y / x.norm() / y.norm()))
     loss = losses.feature_loss(embedding, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-4)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, embedding)
     same = embedding.detach()[:, :1].expand(-1, T, -1, -1)
-    assert losses.feature_loss(same, mask) == pytest.approx(0, abs=1e-6)
+    assert losses.feature_loss(same, mask) == approx(0, LOSS)
 
 
 def screws() -> tuple[Tensor, Tensor, Tensor]:
@@ -258,7 +259,7 @@ def test_manifold_loss():
         expected.append(min(float(gap / unit[b]), 0.5))
     point.requires_grad_()
     loss = losses.manifold_loss(point, rest, axis, revolute, unit, mask)
-    assert float(loss.detach()) == pytest.approx(mean(expected), rel=1e-3)
+    assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, point)
 
 
@@ -296,7 +297,7 @@ def test_affordance_loss(purposes: int):
                 residuals[m].append(sum(abs(o - g) for o, g in zip(offset[b, i, m].tolist(), gap, strict=True)))
     found = AffordanceMap(logits[:, None], offset[:, None])
     loss = losses.affordance_loss(found, uv[:, None], label, intent, visible[:, None])
-    assert float(loss.detach()) == pytest.approx(total / positives + 0.5 * mean([mean(r) for r in residuals]), rel=1e-4)
+    assert float(loss.detach()) == approx(total / positives + 0.5 * mean([mean(r) for r in residuals]), LOSS)
     lives(loss, logits, offset)
 
 
@@ -308,7 +309,7 @@ def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
     for x, y in itertools.product((1, 2, 3), (4, 5, 6)):
         perfect.offset[0, 0, y * C + x, 1] = torch.tensor([2.4 - 0.5 - x, 5.6 - 0.5 - y])
     none, seen = torch.tensor([[[False]]]), torch.tensor([[[True]]])
-    assert losses.affordance_loss(quiet, uv, label, intent, none) == pytest.approx(0, abs=1e-6)
+    assert losses.affordance_loss(quiet, uv, label, intent, none) == approx(0, LOSS)
     assert losses.affordance_loss(perfect, uv, label, intent, seen) == pytest.approx(0, abs=1e-4)
     assert losses.affordance_loss(quiet, uv, label, intent, seen) > 1
 
@@ -335,7 +336,7 @@ def test_every_cell_of_a_rim_or_front_points_to_it():
         far.append(mean(own))
     plain = losses.affordance_loss(found, uv, label, intent, visible)
     more = losses.affordance_loss(found, uv, label, intent, visible, owner)
-    assert float(more - plain) == pytest.approx(0.5 * losses.FAR_WEIGHT * mean(far), rel=1e-4)
+    assert float(more - plain) == approx(0.5 * losses.FAR_WEIGHT * mean(far), LOSS)
     # Any cell of a handle may score like its middle; those of rims and fronts may not.
     owner[0, 0, 3 * C + 1] = 2
     found.logits[0, 0, 3 * C + 1, 0, 0] += 9
@@ -347,7 +348,7 @@ def test_every_cell_of_a_rim_or_front_points_to_it():
     visible[0, 0, 1] = False
     less = losses.affordance_loss(found, uv, label, intent, visible, owner)
     alone = losses.affordance_loss(found, uv, label, intent, visible)
-    assert float(less - alone) == pytest.approx(0.5 * losses.FAR_WEIGHT * far[0] / 2, rel=1e-4)
+    assert float(less - alone) == approx(0.5 * losses.FAR_WEIGHT * far[0] / 2, LOSS)
 
 
 def joints() -> tuple[JointBelief, Tensor, Tensor, Tensor, Tensor]:
@@ -380,7 +381,7 @@ def test_joint_loss_against_a_plain_loop():
             gap = float((belief.foot[b, t, k] - (foot - point[b, t, k])).norm())
             value += gap * math.exp(-float(spread[2])) + 3 * float(spread[2])
         expected.append(value)
-    assert float(losses.joint_loss(belief, point, axis, revolute, mask)) == pytest.approx(mean(expected), rel=1e-3)
+    assert float(losses.joint_loss(belief, point, axis, revolute, mask)) == approx(mean(expected), LOSS)
 
 
 def test_joint_loss_does_not_know_the_sign_of_an_axis():

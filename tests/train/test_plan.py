@@ -16,6 +16,7 @@ from quest.train.batches import stream_batches
 from quest.train.devices import divide
 from quest.train.windows import WindowSampler
 from tests.tiny import make_network
+from tests.tolerances import EXACT
 from tests.train.prepared import make_sampler
 
 
@@ -30,7 +31,7 @@ def assert_same(parts: list, whole: object) -> None:
             assert all(getattr(part, f.name) is None for part in parts)
             continue
         joined = torch.cat([getattr(part, f.name) for part in parts])
-        torch.testing.assert_close(joined, getattr(whole, f.name), rtol=0, atol=0, equal_nan=True)
+        torch.testing.assert_close(joined, getattr(whole, f.name), **EXACT, equal_nan=True)
 
 
 @pytest.mark.parametrize(("processes", "accumulate"), [(1, 1), (2, 1), (1, 3), (3, 2)])

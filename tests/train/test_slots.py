@@ -14,6 +14,7 @@ from quest.model.observation import FrameBatch
 from quest.train.slots import CONFIDENT_PX, SlotAnswers, answer_slots, slot_confidence_loss, slot_label_loss
 from quest.train.windows import WindowSampler, WindowTruth
 from tests.tiny import PAPER, make_network
+from tests.tolerances import LOSS, approx
 from tests.train.prepared import make_sampler
 
 Batch = tuple[QuestNetwork, FrameBatch, WindowTruth]
@@ -81,7 +82,7 @@ def test_confidence_of_all_slots_against_a_plain_loop(batch: Batch, near: bool):
         target[i, t, slot] = gap < CONFIDENT_PX
     assert target.any() or not near
     expected = F.binary_cross_entropy_with_logits(logit, target)
-    assert float(slot_confidence_loss(answers, truth, image_size=64)) == pytest.approx(float(expected), rel=1e-4)
+    assert float(slot_confidence_loss(answers, truth, image_size=64)) == approx(float(expected), LOSS)
 
 
 def test_unmatched_slots_learn_that_there_is_nothing(batch: Batch):
@@ -105,7 +106,7 @@ def test_an_entity_without_a_slot_says_nothing_of_slot_0(batch: Batch):
     logit = torch.full_like(answers.prediction.right_logit, -50.0)
     logit[:, :, 0] = 50.0
     sure = replace(answers, prediction=replace(answers.prediction, right_logit=logit))
-    assert slot_confidence_loss(sure, near, image_size=64) == pytest.approx(0, abs=1e-6)
+    assert slot_confidence_loss(sure, near, image_size=64) == approx(0, LOSS)
 
 
 def test_labels_of_matched_slots_against_a_plain_loop(batch: Batch):
@@ -114,4 +115,4 @@ def test_labels_of_matched_slots_against_a_plain_loop(batch: Batch):
         -float(answers.label_logits[b, t, answers.slot[b, k]].log_softmax(-1)[truth.label[b, k]])
         for b, t, k in (truth.visible & answers.matched[:, None]).nonzero().tolist()
     ]
-    assert float(slot_label_loss(answers, truth)) == pytest.approx(float(np.mean(expected)), rel=1e-4)
+    assert float(slot_label_loss(answers, truth)) == approx(float(np.mean(expected)), LOSS)

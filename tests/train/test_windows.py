@@ -17,6 +17,7 @@ from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler
 from quest.types import Camera
 from tests.tiny import DEFAULT, make_network
+from tests.tolerances import EXACT
 from tests.train.prepared import prepare
 
 WINDOW = DEFAULT.window
@@ -86,7 +87,7 @@ def test_the_same_seed_draws_the_same_windows(views: list[CachedView]):
     other = sampler(views).draw(np.random.default_rng(6))
     for a, b, c in zip(one, two, other, strict=True):
         for f in fields(a):
-            torch.testing.assert_close(getattr(a, f.name), getattr(b, f.name), equal_nan=True, rtol=0, atol=0)
+            torch.testing.assert_close(getattr(a, f.name), getattr(b, f.name), equal_nan=True, **EXACT)
         assert any(not torch.equal(getattr(a, f.name), getattr(c, f.name)) for f in fields(a))
 
 
