@@ -55,7 +55,8 @@ def test_commands():
     from quest.cli import main
 
     assert sorted(main.COMMANDS) == COMMANDS
-    assert all(inspect.getdoc(command) and callable(command.run) for command in main.COMMANDS.values())
+    entries = [e for c in main.COMMANDS.values() for e in ([c] if isinstance(c, main.Entry) else c.commands.values())]
+    assert all(entry.summary and inspect.getdoc(entry.load()) and callable(entry.load().run) for entry in entries)
 
 
 def test_errors_are_one_family():

@@ -51,12 +51,51 @@ def test_help_lists_the_commands(arguments, capsys):
     assert all(command in out for command in program.COMMANDS)
 
 
-@pytest.mark.parametrize("command", sorted(program.COMMANDS))
-def test_every_command_has_help(command, capsys):
+def test_help_begins_with_what_one_needs_first(capsys):
+    with pytest.raises(SystemExit):
+        program.main(["--help"])
+    out = capsys.readouterr().out
+    assert [line.split()[0] for line in out.splitlines() if line[:2] == "  " != line[1:3]][:2] == ["track", "monitor"]
+    assert "quest --version" in out
+
+
+def every_command() -> list[list[str]]:
+    words = [[name] for name in program.COMMANDS]
+    return words + [[n, w] for n, c in program.COMMANDS.items() if isinstance(c, program.Group) for w in c.commands]
+
+
+@pytest.mark.parametrize("words", every_command(), ids=" ".join)
+def test_every_command_has_help(words, capsys):
     with pytest.raises(SystemExit) as stop:
-        program.main([command, "--help"])
+        program.main([*words, "--help"])
     assert stop.value.code == 0
-    assert f"quest {command}" in capsys.readouterr().out
+    assert f"usage: quest {' '.join(words)}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (["trak", "sample"], "no command 'trak'; did you mean track"),
+        (["weights", "lst"], "quest weights: no command 'lst'; did you mean list?"),
+        (["xyzzy"], "expected one of track, monitor,"),
+    ],
+)
+def test_misspelt_commands(words, advice, capsys):
+    with pytest.raises(SystemExit) as stop:
+        program.main(words)
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert advice in error
+    assert error.count("\n") == 1
+
+
+def test_misspelt_options(capsys):
+    """Of the command that was called, not of all."""
+    with pytest.raises(SystemExit):
+        program.main(["track", "sample", "--ot", "x"])
+    error = capsys.readouterr().err
+    assert "--out" in error
+    assert "--protocol" not in error
 
 
 def test_help_imports_nothing_heavy():

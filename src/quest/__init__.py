@@ -8,7 +8,7 @@ from quest.errors import QuestError
 from quest.types import LABELS, Camera, Clip, Frame, Joints, Query, State, Tracks
 
 if TYPE_CHECKING:
-    from quest.data.read import read
+    from quest.data.recording import read_recording as read
     from quest.track import Stream, StreamState, Tracker, load
 
 __version__ = "0.1.0"
@@ -33,7 +33,7 @@ __all__ = [
 def __getattr__(name: str) -> object:
     """The tracker and the readers are imported when they are first asked for, because they bring torch and more."""
     if name == "read":
-        from quest.data.read import read
+        from quest.data.recording import read_recording as read
 
         return read
     if name in {"Stream", "StreamState", "Tracker", "load"}:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
+from quest.depth import check_units, clean_depth
 from quest.errors import InputError
 from quest.extras import require
 
@@ -203,8 +204,6 @@ class Clip:
             InputError: shapes or types are not as expected or contradict each other, times decrease, or there are no
                 frames; as RecordingError if the depth is in the wrong units (millimetres, say).
         """
-        from quest.data.frame_source import check_units, clean_depth
-
         what = f"clip {name!r}"
         colours = _colours(_array(rgb, f"{what}: colours"), what)
         t, h, w = colours.shape[:3]

@@ -194,18 +194,18 @@ def test_names_become_folders(clip: Clip, name: str, folder: str):
 
 @pytest.mark.parametrize("words", [["--depth", "d"], ["--camera", "c.json"], ["--depth-scale-m", "0.001"]])
 def test_a_take_has_depth_and_a_camera_of_its_own(words: list[str]):
-    with pytest.raises(RecordingError, match="of its own"):
+    with pytest.raises(RecordingError, match="and this is a take"):
         tyro.cli(Track, args=["takes/a.zarr", *words]).open()
 
 
 @pytest.mark.parametrize(
     ("source", "words", "named"),
     [
-        ("folder", ["--episode", "1"], "--episode 1 is for LeRobot datasets"),
-        ("folder", ["--topic-depth", "none"], "--topic-depth none is for bags"),
-        ("clip.mcap", ["--camera-key", "front"], "--camera-key front is for LeRobot datasets"),
-        ("lerobot", ["--sync-s", "0.1"], "--sync-s 0.1 is for bags"),
-        ("lerobot", ["--view", "1"], "--view is for takes"),
+        ("folder", ["--episode", "1"], "--episode 1 is for a LeRobot v3 dataset, and this is a folder or video"),
+        ("folder", ["--topic-depth", "none"], "--topic-depth none is for an MCAP file or a ROS bag"),
+        ("clip.mcap", ["--camera-key", "front"], "--camera-key front is for a LeRobot v3 dataset"),
+        ("lerobot", ["--sync-s", "0.1"], "--sync-s 0.1 is for an MCAP file or a ROS bag"),
+        ("lerobot", ["--view", "1"], "--view 1 is for a take"),
     ],
 )
 def test_options_of_other_kinds_are_refused(sources: dict[str, str], source: str, words: list[str], named: str):
@@ -214,7 +214,7 @@ def test_options_of_other_kinds_are_refused(sources: dict[str, str], source: str
 
 
 def test_a_take_has_neither_episodes_nor_topics():
-    with pytest.raises(RecordingError, match=r"take takes/a\.zarr/: --episode 2 is for LeRobot datasets"):
+    with pytest.raises(RecordingError, match=r"takes/a\.zarr/: --episode 2 is for a LeRobot v3 dataset"):
         tyro.cli(Track, args=["takes/a.zarr/", "--episode", "2"]).open()
 
 

@@ -18,7 +18,7 @@ def test_arguments_are_checked(tmp_path: Path):
     for scale in (0.0, -1.0, float("nan")):
         with pytest.raises(RecordingError, match=r"depth_scale_m is .*, expected a positive number"):
             open_recording(path, depth_scale_m=scale)
-    with pytest.raises(RecordingError, match="is for folders of images and videos, but a bag has its depth in a topic"):
+    with pytest.raises(RecordingError, match="is for a folder or video, and this is an MCAP file"):
         open_recording(path, depth=tmp_path)
     found = read_recording(path, depth_scale_m=2e-3)
     assert found.depth_m is not None
@@ -42,7 +42,7 @@ def test_torn_bags_of_ros1(compression: str | None, tmp_path: Path):
             refused += 1
     assert refused >= 3
     path.write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(RecordingError, match=r"the bag is torn.*`rosbag reindex`"):
+    with pytest.raises(RecordingError, match=r"the bag is corrupt.*`rosbag reindex`"):
         read_recording(path)
 
 

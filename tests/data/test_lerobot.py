@@ -284,7 +284,7 @@ def test_units_of_depth_in_the_rows(tmp_path: Path):
         open_recording(folder, camera=CAMERA, depth_scale_m=-1)
     with pytest.raises(RecordingError, match=r"with depth_scale_m = 1, .*depth_scale_m = 0\.001 would give"):
         read_recording(folder, camera=CAMERA, depth_scale_m=1)
-    with pytest.raises(RecordingError, match="but a LeRobot dataset has its depth in a feature of its own"):
+    with pytest.raises(RecordingError, match="is for a folder or video, and this is a LeRobot v3 dataset"):
         open_recording(folder, camera=CAMERA, depth=tmp_path)
 
 
@@ -360,7 +360,7 @@ BAD: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "torn rows": (lambda f: tear(f, "data/*/*.parquet"), {}, "file-000.parquet: cannot be read"),
     "torn episodes": (lambda f: tear(f, "meta/episodes/*/*.parquet"), {}, "file-000.parquet: cannot be read"),
     "torn video": (lambda f: tear(f, "videos/*/*/*.mp4"), {}, "cannot be decoded"),
-    "short video": (cut_video, {}, "has 6 of the 8 frames of episode 0; the file is torn"),
+    "short video": (cut_video, {}, "has 6 of the 8 frames of episode 0; the file is corrupt"),
     "no video": (lambda f: next(f.glob("videos/*/*/*.mp4")).unlink(), {}, "no such file"),
 }
 
@@ -374,9 +374,12 @@ def test_what_is_refused(how: str, tmp_path: Path):
         read_recording(folder, camera=CAMERA, parts=Parts(**parts))
 
 
-def test_intrinsics_are_asked_for(tmp_path: Path):
+def test_intrinsics_are_guessed_or_asked_for(tmp_path: Path):
     folder, _, _ = foreign(tmp_path / "set")
-    with pytest.raises(RecordingError, match=r"LeRobot keeps no intrinsics.*--camera FILE"):
-        open_recording(folder)
+    assert any("guessed a focal length of 64 px" in flag for flag in open_recording(folder).flags)
+    assert open_recording(folder, fov_deg=90).camera == Camera(32, 32, 32, 24, 64, 48)
     with pytest.raises(RecordingError, match=r"frames|colours"):
         read_recording(folder, camera=Camera(60, 60, 30, 30, 60, 60))
+    with_depth, _, _ = foreign(tmp_path / "images", keep="image")
+    with pytest.raises(RecordingError, match=r"depth but no camera.*--camera FILE.*--fov"):
+        open_recording(with_depth)

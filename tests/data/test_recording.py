@@ -14,10 +14,12 @@ import pytest
 
 from quest.data.camera_file import CameraFile, read_camera, write_camera
 from quest.data.distortion import Distortion, Rectifier
-from quest.data.frame_source import Notes
-from quest.data.recording import clean_depth, open_recording, read_recording, write_recording
+from quest.data.frame_source import Notes, Parts
+from quest.data.recording import open_recording, read_recording, readers, write_recording
+from quest.data.store import TakeStore
 from quest.data.video import write_video
-from quest.errors import InputError, RecordingError
+from quest.depth import clean_depth
+from quest.errors import InputError, RecordingError, TakeError
 from quest.types import Camera, Clip
 from tests.synthetic import make_take
 
@@ -154,8 +156,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "fewer depths": (lambda f: (f / "depth" / "000003.png").unlink(), "11 depth images for 12 colour frames"),
     "fewer colours": (lambda f: (f / "rgb" / "000003.png").unlink(), "stamp_s .* 12 frames, expected 11"),
     "no depths": (lambda f: empty(f / "depth"), "0 depth images for 12 colour frames"),
-    "torn colour": (lambda f: truncate(f / "rgb" / "000005.png"), "000005.png: cannot be decoded.*torn"),
-    "torn depth": (lambda f: truncate(f / "depth" / "000005.png"), "000005.png: cannot be decoded.*torn"),
+    "torn colour": (lambda f: truncate(f / "rgb" / "000005.png"), "000005.png: cannot be decoded.*corrupt"),
+    "torn depth": (lambda f: truncate(f / "depth" / "000005.png"), "000005.png: cannot be decoded.*corrupt"),
     "no image": (lambda f: (f / "rgb" / "000005.png").write_text("hello"), "000005.png: not an image"),
     "colour sizes differ": (
         lambda f: resize(f / "rgb" / "000005.png"),
@@ -175,7 +177,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: (write_depth(f, 0.05), edit_camera(f, depth_scale_m=0.001)),
         "median is 0.04 m with depth_scale_m = 0.001, expected 0.05 to 50 m; the units are wrong",
     ),
-    "no camera": (lambda f: (f / "camera.json").unlink(), "camera.json: no such file; write one such as"),
+    "no camera": (lambda f: (f / "camera.json").unlink(), "depth but no camera.*camera.json beside the frames.*--fov"),
     "torn camera": (lambda f: truncate(f / "camera.json", keep=0.2), "camera.json: cannot be read as JSON"),
     "camera is a list": (lambda f: (f / "camera.json").write_text("[]"), "expected an object .* got list"),
     "camera lacks a field": (lambda f: edit_camera(f, fx=None), "lacks fx"),
@@ -228,7 +230,7 @@ def test_torn_videos(tmp_path: Path, clip: Clip, keep: float):
     write_recording(clip, tmp_path / "recording")
     video = tmp_path / "recording" / "rgb.mp4"
     truncate(video, keep=keep)
-    with pytest.raises(RecordingError, match=r"rgb\.mp4.*torn"):
+    with pytest.raises(RecordingError, match=r"rgb\.mp4.*corrupt"):
         read_recording(tmp_path / "recording")
 
 
@@ -351,3 +353,57 @@ def test_notes_count_and_begin_anew():
     assert notes.words == ("colours only", "no depth: 2 frames, first 3")
     notes.restart()
     assert notes.words == ("colours only",)
+
+
+def test_colours_without_a_camera_are_read_with_a_guess(folder: Path, clip: Clip, tmp_path: Path):
+    write_video(tmp_path / "mine.mp4", clip.rgb, frames_per_s=10)
+    for source in (tmp_path / "mine.mp4", folder / "rgb"):
+        found = open_recording(source)
+        assert found.camera == Camera(64, 64, 32, 24, 64, 48)
+        assert any("guessed a focal length of 64 px, the longer side" in flag for flag in found.flags)
+        assert found.clip().depth_m is None
+        found = open_recording(source, fov_deg=90)
+        assert found.camera.fx == pytest.approx(32)
+        assert any("a focal length of 32 px from --fov 90" in flag for flag in found.flags)
+    np.testing.assert_allclose(read_recording(tmp_path / "mine.mp4").stamp_s, np.arange(FRAMES) / 10)
+
+
+def test_depth_needs_a_camera_or_a_field_of_view(folder: Path, clip: Clip):
+    with pytest.raises(RecordingError, match="--fov is for recordings without a camera"):
+        open_recording(folder, fov_deg=60)
+    (folder / "camera.json").unlink()
+    assert read_recording(folder, fov_deg=60, depth_scale_m=1e-4).depth_m is not None
+    with pytest.raises(RecordingError, match="expected a field of view of 1 to 178 degrees, got 0"):
+        open_recording(folder, fov_deg=0)
+
+
+def test_every_reader_says_how_its_recordings_look(tmp_path: Path):
+    known = readers()
+    assert len({reader.kind for reader in known}) == len(known) == 5
+    assert not any(reader.accepts(str(tmp_path)) for reader in known)
+    with pytest.raises(RecordingError, match="this is an empty folder; expected ") as caught:
+        open_recording(tmp_path)
+    (tmp_path / "notes.txt").touch()
+    with pytest.raises(RecordingError, match="with nothing of these in it; expected "):
+        open_recording(tmp_path)
+    assert all(f"{reader.kind} ({reader.form})" in str(caught.value) for reader in known)
+
+
+def test_takes_are_recordings_too(tmp_path: Path):
+    store, take = TakeStore(tmp_path / "takes"), make_take(frames=3, views=2, size=(64, 48), name="a")
+    store.write(take)
+    with pytest.raises(TakeError, match=r"a store of 1 take \(a\); name one, such as .*takes/a\.zarr"):
+        open_recording(store.root)
+    store.write(replace(take, info=replace(take.info, name="b")))
+    with pytest.raises(TakeError, match=r"a store of 2 takes \(a, b\)"):
+        open_recording(store.root)
+    found = read_recording(store.root / "b.zarr", parts=Parts(view=1))
+    np.testing.assert_array_equal(found.rgb, take.views[1].clip.rgb)
+    with pytest.raises(RecordingError, match=r"--camera .* is for a LeRobot v3 dataset or .* and this is a take"):
+        open_recording(store.root / "b.zarr", camera="c.json")
+
+
+def test_a_text_file_is_no_video(tmp_path: Path):
+    (tmp_path / "words.mp4").write_text("hello")
+    with pytest.raises(RecordingError, match=r"words\.mp4: cannot be decoded at all .*corrupt or not a video"):
+        open_recording(tmp_path / "words.mp4")

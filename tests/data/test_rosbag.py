@@ -216,14 +216,14 @@ def test_tf_that_ends_early_is_said(tmp_path: Path):
     sent += [colours(0, at_ns=BEGIN + 2 * SECOND), depths(0, at_ns=BEGIN + 2 * SECOND)]
     frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
     assert len(frames) == FRAMES + 1
-    assert flags == (f"tf has nothing within 0.5 s: the nearest pose is used: 1 frames, first {FRAMES}",)
+    assert flags == (f"tf has nothing within 0.5 s: the nearest pose is used: 1 frame, first {FRAMES}",)
 
 
 def test_late_colours_are_left_out(tmp_path: Path):
     sent = [info(), colours(1), (COLOUR, IMAGE, image(RGB[0], "rgb8", BEGIN), BEGIN + STEP + 1), colours(2)]
     frames, flags = frames_of(write_mcap(tmp_path / "bag.mcap", sent))
     assert len(frames) == 2
-    assert f"{LATE}: 1 frames, first 1" in flags
+    assert f"{LATE}: 1 frame, first 1" in flags
 
 
 def test_a_camera_that_changes_is_said(tmp_path: Path):
@@ -345,7 +345,7 @@ def test_empty_and_torn_folders(tmp_path: Path):
     path = write_bag(tmp_path / "torn", recording())
     (database,) = path.glob("*.db3")
     database.write_bytes(database.read_bytes()[:8000])
-    with pytest.raises(RecordingError, match=r"the bag is torn.*reindex"):
+    with pytest.raises(RecordingError, match=r"the bag is corrupt.*reindex"):
         read_recording(path)
     path = write_bag(tmp_path / "words", recording())
     (path / "metadata.yaml").write_text("rosbag2_bagfile_information: [")

@@ -78,7 +78,7 @@ def test_torn_videos_without_a_number_of_frames(suffix: str, tmp_path: Path):
     assert probe_video(path).frames == 0
     assert len(list(play_video(path))) == FRAMES
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(RecordingError, match=r"ends after 0\.\d\d of 1\.00 s; the file is torn"):
+    with pytest.raises(RecordingError, match=r"ends after 0\.\d\d of 1\.00 s; the file is corrupt"):
         list(play_video(path))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from quest.cli.evaluate_monitor import EvalMonitor
 from quest.cli.main import parse
-from quest.cli.weights import CalibrateWeights, Weights
+from quest.cli.weights import CalibrateWeights
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
 from quest.evaluation import calibrate, stream_record
@@ -179,5 +179,4 @@ def test_arguments():
     assert isinstance(command, EvalMonitor)
     assert (command.takes, command.alpha) == (("a", "b"), (0.05,))
     command = parse(["weights", "calibrate", "w.safetensors", "--takes", "a", "b", "--records", "r"])
-    assert isinstance(command, Weights)
-    assert command.command == CalibrateWeights(Path("w.safetensors"), ("a", "b"), Path("r"))
+    assert command == CalibrateWeights(Path("w.safetensors"), ("a", "b"), Path("r"))

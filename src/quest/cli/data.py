@@ -8,10 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from quest.cli.data_export import DataExport
-from quest.cli.data_stats import DataStats
-from quest.cli.data_verify import DataVerify
-
 if TYPE_CHECKING:
     import numpy as np
 
@@ -149,21 +145,3 @@ class DataLs:
         for problem in problems.values():
             Console(stderr=True, highlight=False, markup=False).print(problem, style="red", soft_wrap=True)
         return 1 if problems else 0
-
-
-@dataclass(frozen=True)
-class Data:
-    """Look at takes, verify them, and export them."""
-
-    command: (
-        Annotated[DataLs, tyro.conf.subcommand("ls")]
-        | Annotated[DataShow, tyro.conf.subcommand("show")]
-        | Annotated[DataStats, tyro.conf.subcommand("stats")]
-        | Annotated[DataVerify, tyro.conf.subcommand("verify")]
-        | Annotated[DataExport, tyro.conf.subcommand("export")]
-    )
-    """What to do."""
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
+import difflib
 import errno
+import importlib
 import io
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Protocol, runtime_checkable
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
 from rich.console import Console
 from rich.markup import escape
 
-from quest.cli.data import Data
-from quest.cli.doctor import Doctor
-from quest.cli.evaluate import Eval
-from quest.cli.evaluate_monitor import EvalMonitor
-from quest.cli.generate import Generate
-from quest.cli.monitor import Monitor
-from quest.cli.objects import Objects
-from quest.cli.track import Track
-from quest.cli.train import Train
-from quest.cli.weights import Weights
 from quest.errors import QuestError
 from quest.extras import explain_missing
 
@@ -34,21 +27,7 @@ _PLACES = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT),
     *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR),
 )
-"""What is wrong with a place for files, and not with the program."""
-
-COMMANDS: dict[str, type[Command]] = {
-    "generate": Generate,
-    "data": Data,
-    "objects": Objects,
-    "train": Train,
-    "track": Track,
-    "monitor": Monitor,
-    "eval": Eval,
-    "eval-monitor": EvalMonitor,
-    "weights": Weights,
-    "doctor": Doctor,
-}
-"""Command line name of every command."""
+"""Errors of a place for files, and not of the program."""
 
 DESCRIPTION = "Follow handles, knobs, rims and fronts of articulated objects in RGB-D video."
 
@@ -62,23 +41,116 @@ class Command(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Entry:
+    """A command in a list of commands; its module is imported when it is asked for."""
+
+    module: str
+    """Module below ``quest.cli``."""
+    name: str
+    """The command's dataclass in it."""
+    summary: str
+    """One line for the list."""
+
+    def load(self) -> type[Command]:
+        """The command's dataclass."""
+        return getattr(importlib.import_module(f"quest.cli.{self.module}"), self.name)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Commands that share their first word."""
+
+    summary: str
+    """One line for the list."""
+    commands: Mapping[str, Entry]
+    """By their second word."""
+
+
+COMMANDS: dict[str, Entry | Group] = {
+    "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
+    "monitor": Entry("monitor", "Monitor", "Watch a recording or a take live: states, joints and alarms."),
+    "doctor": Entry("doctor", "Doctor", "Print what this machine can do, and what to install for the rest."),
+    "weights": Group(
+        "List, show, share, tune and calibrate weights.",
+        {
+            "list": Entry("weights", "ListWeights", "List the weights that come with the package."),
+            "show": Entry("weights", "ShowWeights", "Print what a file of weights holds."),
+            "save": Entry("weights", "SaveWeights", "Write weights into a folder in the form of the hub."),
+            "push": Entry("weights", "PushWeights", "Push weights and a card to the Hugging Face hub."),
+            "merge": Entry("weights", "MergeWeights", "Put together what was trained apart."),
+            "import-encoder": Entry("weights", "ImportEncoder", "Make the encoder's initial weights."),
+            "pieces": Entry("weights", "PiecesWeights", "Teach discovery which pieces are handles and knobs."),
+            "tune": Entry("weights", "TuneWeights", "Choose the tracker's settings."),
+            "calibrate": Entry("weights", "CalibrateWeights", "Fit the monitor."),
+        },
+    ),
+    "data": Group(
+        "Look at takes, verify them, and export them.",
+        {
+            "ls": Entry("data", "DataLs", "List the takes of a store."),
+            "show": Entry("data", "DataShow", "Draw a take or a store, or write a Rerun recording."),
+            "stats": Entry("data_stats", "DataStats", "Count what is in a store."),
+            "verify": Entry("data_verify", "DataVerify", "Check the ground truth of takes."),
+            "export": Entry("data_export", "DataExport", "Write takes as TAPVid-3D, LeRobot or MCAP."),
+        },
+    ),
+    "objects": Group(
+        "Look at the objects of the simulator, or at your own.",
+        {
+            "list": Entry("objects", "ObjectsList", "List objects with their joints, entities and sizes."),
+            "show": Entry("objects", "ObjectsShow", "Draw objects with their entities."),
+        },
+    ),
+    "generate": Entry("generate", "Generate", "Render simulated takes with ground truth into a take store."),
+    "train": Entry("train", "Train", "Train a network on takes."),
+    "eval": Entry("evaluate", "Eval", "Score trackers."),
+    "eval-monitor": Entry("evaluate_monitor", "EvalMonitor", "Score the monitor beside plainer rules."),
+}
+"""Every command by its name on the command line, in the order of the help."""
+
+
 def parse(arguments: Sequence[str]) -> Command:
     """Parse arguments into a command.
 
     Args:
-        arguments: what follows ``quest`` on the command line.
+        arguments: the words after ``quest`` on the command line.
 
     Raises:
         SystemExit: on ``--help`` (code 0) and on bad arguments (code 2, after a message on stderr).
     """
-    commands: dict[str, Callable[..., Command]] = dict(COMMANDS)
-    return tyro.extras.subcommand_cli_from_dict(
-        commands,
-        prog="quest",
-        description=DESCRIPTION,
-        args=list(arguments),
-        config=(tyro.conf.OmitSubcommandPrefixes, tyro.conf.HelptextFromCommentsOff),
-    )
+    here: Group = Group(DESCRIPTION, {})
+    commands: Mapping[str, Entry | Group] = COMMANDS
+    words, rest = ["quest"], list(arguments)
+    while True:
+        if not rest or rest[0] in ("-h", "--help"):
+            print(_help(" ".join(words), here.summary, commands))
+            raise SystemExit(0)
+        chosen = commands.get(rest[0])
+        if chosen is None:
+            _unknown(" ".join(words), rest[0], commands)
+        words.append(rest.pop(0))
+        if isinstance(chosen, Entry):
+            config = (tyro.conf.HelptextFromCommentsOff,)
+            return tyro.cli(chosen.load(), prog=" ".join(words), args=rest, config=config)
+        here, commands = chosen, chosen.commands
+
+
+def _help(program: str, description: str, commands: Mapping[str, Entry | Group]) -> str:
+    """The list of commands."""
+    top = commands is COMMANDS
+    lines = [f"usage: {program} COMMAND ...", *(["       quest --version"] if top else []), "", description, ""]
+    lines += [f"  {name:<16}{command.summary}" for name, command in commands.items()]
+    lines += ["", f"{program} COMMAND --help explains a command."]
+    return "\n".join([*lines, "To begin: quest track sample"] if top else lines)
+
+
+def _unknown(program: str, word: str, commands: Mapping[str, Entry | Group]) -> NoReturn:
+    """Say which commands there are, the likeliest first."""
+    close = difflib.get_close_matches(word, commands, n=3, cutoff=0.5)
+    advice = f"did you mean {' or '.join(close)}?" if close else f"expected one of {', '.join(commands)}"
+    _fail(QuestError(f"{program}: no command {word!r}; {advice} ({program} --help lists them)"))
+    raise SystemExit(EXIT_ERROR)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -92,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         reads the output any more.
     """
     if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
-        sys.stdout.reconfigure(errors="backslashreplace")  # names may have letters that the terminal has not
+        sys.stdout.reconfigure(errors="backslashreplace")  # names may have letters that the terminal lacks
     try:
         code = _run(sys.argv[1:] if arguments is None else arguments)
         print(end="", flush=True)
@@ -113,7 +185,7 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"quest {__version__}")
         return 0
-    command = parse(arguments or ["--help"])
+    command = parse(arguments)
     try:
         return command.run()
     except QuestError as error:

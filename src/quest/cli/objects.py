@@ -131,18 +131,6 @@ class ObjectsShow:
         return [shelf.load(*found) for found in parse_object(name)]
 
 
-@dataclass(frozen=True)
-class Objects:
-    """Look at the objects that the simulator knows, or at your own."""
-
-    command: Annotated[ObjectsList, tyro.conf.subcommand("list")] | Annotated[ObjectsShow, tyro.conf.subcommand("show")]
-    """What to do."""
-
-    def run(self) -> int:
-        """Run the chosen command."""
-        return self.command.run()
-
-
 def _every_folder(root: Path | None) -> Iterator[SimObject | ObjectError]:
     from quest.sim.objects import find_objects, load_object
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 from rich.console import Console
@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
     from quest.track import Tracker
     from quest.types import Clip, Query
-
-SAMPLE = "sample"
 
 
 @dataclass(frozen=True)
@@ -34,16 +32,17 @@ class Source:
     label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """The most confident entity of a label: handle, knob, rim or front, such as rim:lift or rim:open to say what it is
     taken hold of for; give it again for more."""
-    view: int = 0
-    """Which camera of a take."""
     depth: Path | None = None
     """Folder of 16-bit depth images; default: depth beside the colours."""
     camera: Path | None = None
-    """Camera file; default: camera.json beside the colours, or what a bag says."""
+    """Camera file; default: the recording's own, such as camera.json beside the colours."""
     depth_scale_m: float | None = None
-    """Metres per unit of 16-bit depth; default: what the camera file says, in bags millimetres."""
+    """Metres per unit of 16-bit depth; default: that of the camera file, in bags millimetres."""
+    fov: Annotated[float | None, tyro.conf.arg(metavar="DEGREES")] = None
+    """Field of view across the longer side of the image, for colours without a camera file; default: a focal length as
+    long as that side, which is 53 degrees."""
     parts: tyro.conf.OmitArgPrefixes[Parts] = Parts()
-    """What to read of a LeRobot dataset or a bag."""
+    """Which parts of a take, a LeRobot dataset or a bag to read."""
     device: str = "auto"
     """cpu, cuda, mps or auto."""
     alpha: float = 0.05
@@ -56,27 +55,18 @@ class Source:
 
         Raises:
             RecordingError: there is no such recording, or it is not as expected.
-            TakeError: there is no such take, or it is torn.
+            TakeError: there is no such take, or it is corrupt.
             MissingExtraError: bags need the extra ``ros``.
         """
-        from quest.data.frame_source import source_of_clip
-        from quest.data.recording import open_recording, refuse_parts
-        from quest.data.sample import sample_folder
-        from quest.data.store import open_clip
-        from quest.errors import RecordingError
+        from quest.data.recording import open_recording
 
-        if self.clip.rstrip("/\\").endswith(".zarr"):
-            if (self.depth, self.camera, self.depth_scale_m) != (None, None, None):
-                raise RecordingError(
-                    f"take {self.clip}: it has depth and a camera of its own; leave those options away"
-                )
-            refuse_parts(f"take {self.clip}", self.parts, allowed=())
-            return source_of_clip(open_clip(self.clip, view=self.view))
-        if self.view != 0:
-            raise RecordingError(f"recording {self.clip}: --view is for takes (STORE/NAME.zarr); leave it out")
-        path = sample_folder() if self.clip == SAMPLE else Path(self.clip)
         return open_recording(
-            path, depth=self.depth, camera=self.camera, depth_scale_m=self.depth_scale_m, parts=self.parts
+            self.clip,
+            depth=self.depth,
+            camera=self.camera,
+            depth_scale_m=self.depth_scale_m,
+            fov_deg=self.fov,
+            parts=self.parts,
         )
 
     def read(self) -> Clip:

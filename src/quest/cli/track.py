@@ -63,7 +63,7 @@ class Track(Source):
     def _name(self, clip: Clip) -> str:
         """What to call the folder of a clip: views of a take, and episodes of a dataset, have folders of their own."""
         take = self.clip.rstrip("/\\")
-        name = f"{Path(take).stem}-view{self.view}" if take.endswith(".zarr") else clip.name
+        name = f"{Path(take).stem}-view{self.parts.view}" if take.endswith(".zarr") else clip.name
         return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
 
 

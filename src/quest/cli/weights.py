@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -302,27 +302,6 @@ class CalibrateWeights:
         )
         replace(load_network(self.weights), monitor=monitor).save(self.weights)
         return 0
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights: what ships, what a file holds, to and from the hub, and what training and tracking need beside."""
-
-    command: (
-        Annotated[ListWeights, tyro.conf.subcommand("list")]
-        | Annotated[ShowWeights, tyro.conf.subcommand("show")]
-        | Annotated[SaveWeights, tyro.conf.subcommand("save")]
-        | Annotated[PushWeights, tyro.conf.subcommand("push")]
-        | Annotated[MergeWeights, tyro.conf.subcommand("merge")]
-        | Annotated[ImportEncoder, tyro.conf.subcommand("import-encoder")]
-        | Annotated[PiecesWeights, tyro.conf.subcommand("pieces")]
-        | Annotated[TuneWeights, tyro.conf.subcommand("tune")]
-        | Annotated[CalibrateWeights, tyro.conf.subcommand("calibrate")]
-    )
-
-    def run(self) -> int:
-        """Run the subcommand."""
-        return self.command.run()
 
 
 def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedNetwork:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.data.distortion import Distortion
+from quest.data.frame_source import Notes, ReadOptions
 from quest.data.registration import Rig
 from quest.errors import InputError, RecordingError
 from quest.geometry.poses import is_rigid
@@ -35,7 +36,7 @@ _OPTIONAL = (
 
 @dataclass(frozen=True)
 class CameraFile:
-    """What ``camera.json`` says.
+    """The content of ``camera.json``.
 
     Attributes:
         camera: intrinsics, pixel centres at half-integers whatever the file's convention.
@@ -61,7 +62,7 @@ class CameraFile:
 
     @property
     def rig(self) -> Rig:
-        """What makes RGB-D frames of a pinhole camera from the pictures."""
+        """Makes RGB-D frames of a pinhole camera from the pictures."""
         return Rig(self.camera, self.distortion, self.depth_camera, self.depth_distortion, self.colour_from_depth)
 
     @property
@@ -117,6 +118,65 @@ def read_camera(path: Path) -> CameraFile:
         return _parse(fields)
     except (InputError, TypeError, ValueError, OverflowError) as error:
         raise RecordingError(f"camera file {path}: {error}; expected such as {EXAMPLE}") from error
+
+
+def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None = None) -> CameraFile:
+    """A camera file that is read, made of intrinsics, or taken as it is, with another depth scale if one is given.
+
+    Raises:
+        RecordingError: the file is missing or makes no sense.
+    """
+    if isinstance(camera, Path):
+        camera = read_camera(camera)
+    setup = CameraFile(camera) if isinstance(camera, Camera) else camera
+    return setup if depth_scale_m is None else replace(setup, depth_scale_m=depth_scale_m)
+
+
+def find_setup(
+    where: str,
+    options: ReadOptions,
+    known: Path | CameraFile | None,
+    *,
+    size: tuple[int, int],
+    depth: bool,
+    notes: Notes,
+) -> CameraFile:
+    """The camera of a recording: as the user gives it, else its own, else a guess, which is noted.
+
+    Args:
+        where: the recording, for messages.
+        options: with a camera, or a field of view, or neither.
+        known: the recording's own camera, if it has one.
+        size: width and height of the frames, pixels, for a guess.
+        depth: whether there is depth; without intrinsics it would be of no use.
+        notes: where a guess is noted.
+
+    Raises:
+        RecordingError: the camera file makes no sense, a field of view is given beside it or out of range, or there is
+            depth and no camera.
+    """
+    camera = known if options.camera is None else options.camera
+    if camera is not None:
+        if options.fov_deg is not None:
+            raise RecordingError(f"{where}: --fov is for recordings without a camera, and this has one; omit --fov")
+        return read_setup(camera, options.depth_scale_m)
+    if depth and options.fov_deg is None:
+        raise RecordingError(
+            f"recording {where}: it has depth but no camera, and depth needs intrinsics; give a camera file such as "
+            f"{EXAMPLE} (camera.json beside the frames, or --camera FILE), or the field of view with --fov DEGREES"
+        )
+    try:
+        camera = Camera.from_fov(*size, options.fov_deg)
+    except InputError as error:
+        raise RecordingError(f"recording {where}: --fov: {error}") from error
+    if options.fov_deg is None:
+        notes.say(
+            f"no camera file: guessed a focal length of {camera.fx:.0f} px, the longer side of the image (a field of "
+            "view of 53 degrees); if you know the field of view, state it with --fov DEGREES"
+        )
+    else:
+        notes.say(f"no camera file: a focal length of {camera.fx:.0f} px from --fov {options.fov_deg:g}")
+    return read_setup(camera, options.depth_scale_m)
 
 
 def write_camera(file: CameraFile, path: Path) -> None:
@@ -188,7 +248,7 @@ def _parse_lens(fields: dict[str, Any]) -> Distortion:
     if coefficients.ndim != 1:
         raise ValueError("distortion must be a list of coefficients, in the order of ROS and OpenCV")
     if "distortion_model" in fields and not len(coefficients):
-        raise ValueError("distortion_model is given without distortion; give its coefficients too, or leave it away")
+        raise ValueError("distortion_model is given without distortion; give its coefficients too, or omit it")
     return Distortion(str(fields.get("distortion_model", "plumb_bob")), tuple(coefficients.tolist()))
 
 

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
-from quest.data.camera_file import CameraFile, check_depth_scale, read_camera
-from quest.data.frame_source import FrameSource
+from quest.data.camera_file import CameraFile, find_setup
+from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.registration import Rig
 from quest.data.video import SUFFIXES, play_video, probe_video
 from quest.errors import RecordingError
-from quest.types import Camera, Frame
+from quest.types import Frame
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -28,7 +28,7 @@ class _Colours:
     Attributes:
         images: paths; empty for a video.
         video: its path; None for images.
-        number: of frames; for a video what its header says.
+        number: of frames; for a video by its header.
         size: width and height, upright.
         turned: whether the pixels of the video are not upright.
         paired: whether depth images of the same pixels go with them.
@@ -61,21 +61,25 @@ class _Colours:
             yield colours_of(image, f"image {path}"), t / 30.0
 
 
-def open_folder(
-    source: Path,
-    *,
-    depth: Path | None = None,
-    camera: Path | Camera | None = None,
-    depth_scale_m: float | int | None = None,
-) -> FrameSource:
-    """A recording folder, a folder of images or a video, as :func:`quest.data.recording.open_recording` describes it.
+def _accepts(where: str) -> bool:
+    path = Path(where)
+    if not path.is_dir():
+        return path.is_file()
+    return (path / "camera.json").is_file() or (path / "rgb").is_dir() or any(map(_is_colours, path.iterdir()))
 
-    Raises:
-        RecordingError: something is missing, empty or inconsistent.
-    """
+
+def _is_colours(path: Path) -> bool:
+    return path.suffix.lower() in (*IMAGE_SUFFIXES, *SUFFIXES) and not path.name.startswith(".")
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    source, notes = Path(where), Notes()
     root = source if source.is_dir() else source.parent
-    setup = read_setup(source, camera or root / "camera.json", depth_scale_m)
     colours = _find_colours(source)
+    folder = root / "depth" if options.depth is None else options.depth
+    paired = options.depth is not None or folder.exists()
+    own = root / "camera.json"
+    setup = find_setup(where, options, own if own.exists() else None, size=colours.size, depth=paired, notes=notes)
     if colours.size != (setup.camera.width, setup.camera.height):
         raise RecordingError(
             f"recording {source}: frames are {colours.size[0]} x {colours.size[1]} but the camera is for "
@@ -84,9 +88,8 @@ def open_folder(
     if colours.video is None:
         assert colours.number is not None
         _check_numbers(source, setup, colours.number)
-    folder = root / "depth" if depth is None else depth
     depths = None
-    if depth is not None or folder.exists():
+    if paired:
         depths = _list_depth(folder)
         if colours.video is None:
             _check_partners(folder, depths, colours.images)
@@ -100,37 +103,24 @@ def open_folder(
         lambda: _frames(source, setup, colours, depths, folder),
         length=colours.number,
         exact=colours.video is None,
+        notes=notes,
         units=(str(folder), setup.depth_scale_m),
     )
 
 
-def read_setup(source: Path, camera: Path | Camera, depth_scale_m: float | int | None) -> CameraFile:
-    """The camera of a recording, from its file or from intrinsics, and with another depth scale if one is given.
-
-    Raises:
-        RecordingError: the file is missing or makes no sense, or the scale is no positive number.
-    """
-    setup = CameraFile(camera) if isinstance(camera, Camera) else read_camera(Path(camera))
-    scale_m = read_scale(source, depth_scale_m)
-    return setup if scale_m is None else replace(setup, depth_scale_m=scale_m)
-
-
-def read_scale(source: Path, depth_scale_m: float | int | None) -> float | None:
-    """A depth scale that was given, if one was.
-
-    Raises:
-        RecordingError: it is no positive number.
-    """
-    try:
-        return None if depth_scale_m is None else check_depth_scale(depth_scale_m)
-    except ValueError as error:
-        raise RecordingError(f"recording {source}: {error}") from error
+READER = Reader(
+    "a folder or video",
+    "images, or rgb/ with images or a video such as rgb.mp4; .mp4 and the like",
+    _accepts,
+    _open,
+    options=("depth", "camera", "depth_scale_m", "fov_deg"),
+)
 
 
 def _find_colours(source: Path) -> _Colours:
     videos = [source] if source.is_file() else []
     if not videos and not (source / "rgb").is_dir():
-        videos = sorted(p for p in source.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith("."))
+        videos = sorted(p for p in source.iterdir() if _is_colours(p) and p.suffix.lower() in SUFFIXES)
         if len(videos) > 1:
             found = ", ".join(video.name for video in videos)
             raise RecordingError(f"recording {source}: expected one video, got {found}; name the video itself")
@@ -236,8 +226,8 @@ def _open_image(path: Path) -> Image.Image:
             image.load()
             return image
     except UnidentifiedImageError:
-        raise RecordingError(f"image {path}: not an image; the file is torn, copy or record it again") from None
+        raise RecordingError(f"image {path}: not an image; the file is corrupt, copy or record it again") from None
     except (OSError, SyntaxError, ValueError) as error:
         raise RecordingError(
-            f"image {path}: cannot be decoded ({error}); the file is torn, copy or record it again"
+            f"image {path}: cannot be decoded ({error}); the file is corrupt, copy or record it again"
         ) from error

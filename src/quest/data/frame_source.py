@@ -3,50 +3,79 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32, Shaped
 
+from quest.depth import check_units
 from quest.errors import RecordingError
 from quest.types import Camera, Clip, Frame
 
-PLAUSIBLE_DEPTH_M = (0.05, 50.0)
-"""A clip whose median depth lies outside is taken to be in other units."""
-
-_USUAL_SCALES_M = (1e-3, 1e-4, 2e-4, 1e-2, 1e-5, 1e-6, 0.1, 1.0)
-_USUAL_DEPTH_M = 1.5
 _ENOUGH_DEPTH = 0.05
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Which parts of a recording to read, where it has several or does not say.
+    """Which parts of a recording to read, where it has several or does not say."""
 
-    Attributes:
-        episode: Which episode of a LeRobot dataset.
-        camera_key: Which camera of a LeRobot dataset, such as observation.images.front or front; default: the first.
-        topic_rgb: Topic of the colours in a bag; default: found by its type and name.
-        topic_depth: Topic of the depth in a bag, or none to leave it out; default: found likewise.
-        topic_info: Topic of the colours' CameraInfo; default: beside the colours.
-        topic_depth_info: Topic of the depth's CameraInfo; default: beside the depth.
-        world_frame: tf frame that is the world; default: the root of the camera's tf tree.
-        sync_s: How far apart colour and depth of a bag may be, seconds.
-    """
-
+    view: int = 0
+    """Which camera of a take."""
     episode: int = 0
+    """Which episode of a LeRobot dataset."""
     camera_key: str | None = None
+    """Which camera of a LeRobot dataset, such as observation.images.front or front; default: the first."""
     topic_rgb: str | None = None
+    """Topic of the colours in a bag; default: found by its type and name."""
     topic_depth: str | None = None
+    """Topic of the depth in a bag, or none to omit it; default: found likewise."""
     topic_info: str | None = None
+    """Topic of the colours' CameraInfo; default: beside the colours."""
     topic_depth_info: str | None = None
+    """Topic of the depth's CameraInfo; default: beside the depth."""
     world_frame: str | None = None
+    """tf frame that is the world; default: the root of the camera's tf tree."""
     sync_s: float = 0.02
+    """How far apart colour and depth of a bag may be, seconds."""
+
+
+@dataclass(frozen=True)
+class ReadOptions(Parts):
+    """Everything that a reader may be asked for; each knows some of it (:attr:`Reader.options`)."""
+
+    depth: Path | None = None
+    """Folder of 16-bit depth images."""
+    camera: Path | Camera | None = None
+    """Camera file, or the intrinsics themselves."""
+    depth_scale_m: float | None = None
+    """Metres per unit of depth images."""
+    fov_deg: float | None = None
+    """Field of view across the longer side, for recordings without a camera."""
+
+    def given(self) -> dict[str, object]:
+        """The options that are not as usual."""
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: value for name, value in values.items() if value != getattr(ReadOptions, name)}
+
+
+@dataclass(frozen=True)
+class Reader:
+    """One kind of recording: how to recognise it, and how to read it."""
+
+    kind: str
+    """In messages, such as ``a ROS bag``."""
+    form: str
+    """How one looks, such as ``a folder with metadata.yaml``."""
+    accepts: Callable[[str], bool]
+    """Whether a path or URL is of this kind, by its name or by files in it."""
+    open: Callable[[str, ReadOptions], FrameSource]
+    """The frames, which are read when they are asked for."""
+    options: tuple[str, ...] = ()
+    """Fields of :class:`ReadOptions` that mean something here; others are refused."""
 
 
 class Notes:
-    """What is less than it could be in a recording, in words: said of the whole, or counted over its frames."""
+    """Degradations of a recording, in words: of the whole, or counted over its frames."""
 
     def __init__(self) -> None:
         self._said: list[str] = []
@@ -69,7 +98,10 @@ class Notes:
     @property
     def words(self) -> tuple[str, ...]:
         """All notes; those of frames with how many and which was the first."""
-        counted = (f"{words}: {number} frames, first {first}" for words, (number, first) in self._counted.items())
+        counted = (
+            f"{words}: {number} frame{'s' * (number > 1)}, first {first}"
+            for words, (number, first) in self._counted.items()
+        )
         return (*self._said, *counted)
 
 
@@ -83,7 +115,7 @@ class FrameSource:
         frames: begins to read.
         length: number of frames, or about that many where ``exact`` is False; None where only reading tells.
         exact: whether ``length`` is the number of frames that come.
-        notes: what is less than it could be; complete when the last frame has come.
+        notes: degradations; complete when the last frame has come.
         units: where the depth comes from and metres per unit of it, for the message about wrong units.
     """
 
@@ -104,7 +136,7 @@ class FrameSource:
         """Frames in order.
 
         Raises:
-            RecordingError: the recording is torn or inconsistent, has no frames, or its depth is in the wrong units.
+            RecordingError: the recording is corrupt or inconsistent, has no frames, or its depth is in the wrong units.
         """
         self.notes.restart()
         unchecked, before = True, -np.inf
@@ -146,6 +178,7 @@ class FrameSource:
             depth_m,
             np.array([frame.stamp_s for frame in frames], dtype=np.float64),
             np.stack([frame.cam_from_world for frame in frames]).astype(np.float64),
+            notes=self.flags,
         )
 
 
@@ -157,30 +190,4 @@ def source_of_clip(clip: Clip) -> FrameSource:
         lambda: (clip.frame(t) for t in range(len(clip))),
         length=len(clip),
         units=(clip.name, 1.0),
-    )
-
-
-def clean_depth(depth_m: Shaped[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
-    """Depth as float32 in which 0 stands for whatever was not finite or not positive."""
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
-
-
-def check_units(depth_m: Float32[np.ndarray, "T H W"], where: Path | str, scale_m: float) -> None:
-    """Raise RecordingError if the median depth is not one that a camera sees."""
-    step = max(1, len(depth_m) // 16)
-    sample = depth_m[::step, ::2, ::2] if depth_m[0].size > 64 else depth_m
-    valid = sample[sample > 0]
-    if valid.size == 0:
-        valid = depth_m[depth_m > 0]
-    if valid.size == 0:
-        raise RecordingError(f"depth of {where}: every pixel is missing; leave the depth out to use colours only")
-    median_m = float(np.median(valid))
-    low, high = PLAUSIBLE_DEPTH_M
-    if low <= median_m <= high:
-        return
-    likely = min(_USUAL_SCALES_M, key=lambda scale: abs(np.log(median_m / scale_m * scale / _USUAL_DEPTH_M)))
-    raise RecordingError(
-        f"depth of {where}: the median is {median_m:.3g} m with depth_scale_m = {scale_m:g}, expected {low:g} to "
-        f"{high:g} m; the units are wrong, depth_scale_m = {likely:g} would give {median_m / scale_m * likely:.2f} m"
     )

@@ -22,11 +22,11 @@ import pyarrow.parquet as pq
 from jaxtyping import Float32, UInt16
 from PIL import Image, UnidentifiedImageError
 
-from quest.data.camera_file import CameraFile
-from quest.data.folder import read_setup
-from quest.data.frame_source import FrameSource, Notes, clean_depth
+from quest.data.camera_file import CameraFile, find_setup
+from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.video import play_video, probe_video
+from quest.depth import clean_depth
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Frame
 
@@ -117,36 +117,23 @@ class _Episode:
         return self.root / self.info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
 
 
-def open_lerobot(
-    root: Path,
-    *,
-    episode: int = 0,
-    camera_key: str | None = None,
-    camera: Path | Camera | None = None,
-    depth_scale_m: float | None = None,
-) -> FrameSource:
-    """One camera of an episode.
+def _accepts(where: str) -> bool:
+    return (Path(where) / "meta" / "info.json").is_file()
 
-    Args:
-        root: folder of the dataset.
-        episode: index of the episode.
-        camera_key: feature of the colours, such as ``observation.images.front``; the first by default.
-        camera: camera file or intrinsics; by default those that this project wrote into the dataset.
-        depth_scale_m: metres per unit of depth images; by default what the camera file says, else millimetres, but
-            metres in floats and where the dataset says so.
 
-    Raises:
-        RecordingError: not a v3 dataset, no such episode or camera, no intrinsics, files are torn, or a depth scale is
-            given for a depth video.
-    """
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    """One camera of an episode; depth images are in millimetres, but floats in metres, unless it is said otherwise."""
+    root, episode = Path(where), options.episode
     notes = Notes()
     found = _read_episode(root, episode)
-    key = _colour_key(found, camera_key, notes)
+    key = _colour_key(found, options.camera_key, notes)
     depth_key = _depth_key(found, key)
     if depth_key is None:
         notes.say(f"no depth feature beside {key}: colours only")
-    setup = _setup(found, key, camera)
-    units_m = _units_m(found, depth_key, setup, depth_scale_m)
+    setup = find_setup(
+        where, options, _own_setup(found, key), size=_size(found, key), depth=depth_key is not None, notes=notes
+    )
+    units_m = _units_m(found, depth_key, setup, options.depth_scale_m)
     rows = _Rows(found, key)
     if not rows.posed and setup.cam_from_world is None:
         notes.say("the dataset has no camera poses: the world is the camera")
@@ -226,21 +213,26 @@ def _is_depth(feature: dict[str, Any]) -> bool:
     return bool(info.get("is_depth_map") or info.get("video.is_depth_map") or older.get("video.is_depth_map"))
 
 
-def _setup(episode: _Episode, key: str, camera: Path | Camera | None) -> CameraFile:
-    if camera is not None:
-        return read_setup(episode.root, camera, None)
+def _own_setup(episode: _Episode, key: str) -> CameraFile | None:
+    """The intrinsics that this project wrote into the dataset; LeRobot itself keeps none."""
     kept = episode.row.get(f"{CAMERA_COLUMN}/{key.rpartition('.')[2]}")
     if kept is None:
         kept = (episode.feature(key).get("info") or {}).get(CAMERA_KEY)
     if kept is None:
-        raise RecordingError(
-            f"dataset {episode.root}: LeRobot keeps no intrinsics; give those of {key} with --camera FILE "
-            "(docs/recordings.md describes the file)"
-        )
+        return None
     try:
         return CameraFile(Camera(**kept))
     except (TypeError, InputError) as error:
         raise RecordingError(f"dataset {episode.root}: {CAMERA_KEY} of {key} makes no sense ({error})") from error
+
+
+def _size(episode: _Episode, key: str) -> tuple[int, int]:
+    """Width and height of a feature's images; channels are first or last."""
+    shape = [int(n) for n in episode.feature(key).get("shape", ())]
+    if len(shape) != 3:
+        raise RecordingError(f"dataset {episode.root}: {key} has shape {shape}, expected height, width and channels")
+    height, width = shape[1:] if shape[0] in (1, 3) else shape[:2]
+    return width, height
 
 
 @dataclass(frozen=True)
@@ -256,7 +248,7 @@ def _units_m(episode: _Episode, key: str | None, setup: CameraFile, depth_scale_
     if depth_scale_m is not None:
         if feature.get("dtype") == "video":
             raise RecordingError(
-                f"dataset {episode.root}: {key} is a video, whose metres info.json gives; leave --depth-scale-m out"
+                f"dataset {episode.root}: {key} is a video, whose metres info.json gives; omit --depth-scale-m"
             )
         return _Units(depth_scale_m, depth_scale_m)
     in_metres = feature.get("dtype") == "video" or (feature.get("info") or {}).get("depth_unit") == "m"
@@ -279,7 +271,7 @@ class _Rows:
         if length != self.number:
             raise RecordingError(
                 f"dataset {episode.root}: {path.name} has {self.number} rows of episode {episode.index}, expected "
-                f"{length}; the file is torn, copy it again"
+                f"{length}; the file is corrupt, copy it again"
             )
         self.timestamp = table["timestamp"].to_numpy().astype(np.float64)
         self.stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else self.timestamp
@@ -335,7 +327,7 @@ def _pictures(
             return
     raise RecordingError(
         f"dataset {episode.root}: {path.name} of {key} has {number} of the {len(times)} frames of episode "
-        f"{episode.index}; the file is torn, copy it again"
+        f"{episode.index}; the file is corrupt, copy it again"
     )
 
 
@@ -386,3 +378,12 @@ def _read_table(path: Path, columns: list[str], *, filters: list[tuple[str, str,
 
 def _unreadable(path: Path, error: Exception) -> RecordingError:
     return RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again")
+
+
+READER = Reader(
+    "a LeRobot v3 dataset",
+    "a folder with meta/info.json",
+    _accepts,
+    _open,
+    options=("episode", "camera_key", "camera", "depth_scale_m", "fov_deg"),
+)

@@ -22,11 +22,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from quest.data.frame_source import clean_depth
 from quest.data.lerobot import CAMERA_COLUMN, CAMERA_KEY, POSE, STAMP, VERSION, DepthRange
 from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, depth_key, image_key
 from quest.data.lerobot_stats import feature_stats, image_stats, merge_stats
 from quest.data.video import write_depth_video, write_video
+from quest.depth import clean_depth
 from quest.errors import InputError
 from quest.types import Clip
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from quest.data.frame_source import clean_depth
+from quest.depth import clean_depth
 from quest.errors import InputError
 from quest.extras import require
 from quest.types import Camera, Clip, Tracks

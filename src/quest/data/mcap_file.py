@@ -12,6 +12,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from quest.data.frame_source import FrameSource, Reader, ReadOptions
+from quest.data.ros_frames import BAG_OPTIONS, open_messages
 from quest.data.ros_topics import Topic
 from quest.errors import RecordingError
 from quest.extras import require
@@ -24,7 +26,7 @@ class McapMessages:
         path: the file.
 
     Raises:
-        RecordingError: the file is torn, is not MCAP, or has no ROS 2 messages.
+        RecordingError: the file is corrupt, is not MCAP, or has no ROS 2 messages.
         MissingExtraError: the extra ``ros`` is not installed.
     """
 
@@ -41,7 +43,7 @@ class McapMessages:
         self._check_encodings()
 
     def _find_topics(self) -> dict[str, Topic]:
-        """What is in the file; one without a summary is read through for it."""
+        """The topics of the file; one without a summary is read through for them."""
         found: dict[str, Topic] = {}
         for schema, channel, number in self._channels:
             kind = "" if schema is None else schema.name.replace("/msg/", "/")
@@ -92,10 +94,10 @@ class McapMessages:
 
     @contextmanager
     def _reader(self) -> Iterator[Any]:
-        """A reader of the file at its beginning; what goes wrong with the file becomes an error that says so."""
+        """A reader of the file at its beginning; errors of the file become ours."""
         exceptions = require("mcap.exceptions")
-        chunk = (require("zstandard").ZstdError, RuntimeError)  # what zstd and lz4 raise
-        torn = (exceptions.McapError, *chunk, struct.error, EOFError, OSError, ValueError)
+        chunk = (require("zstandard").ZstdError, RuntimeError)  # of zstd and lz4
+        corrupt = (exceptions.McapError, *chunk, struct.error, EOFError, OSError, ValueError)
         try:
             with self.path.open("rb") as file:
                 decoder = require("mcap_ros2.decoder").DecoderFactory()
@@ -109,8 +111,19 @@ class McapMessages:
             ) from error
         except exceptions.DecoderNotFoundError as error:
             raise RecordingError(f"MCAP {self.path}: {error}; name topics of ROS 2 messages") from error
-        except torn as error:
+        except corrupt as error:
             raise RecordingError(
-                f"MCAP {self.path}: cannot be read ({type(error).__name__}: {error}); the file is torn, copy it again, "
-                "or repair it with `mcap recover`"
+                f"MCAP {self.path}: cannot be read ({type(error).__name__}: {error}); the file is corrupt, copy it "
+                "again, or repair it with `mcap recover`"
             ) from error
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    return open_messages(McapMessages(Path(where)), options)
+
+
+def _accepts(where: str) -> bool:
+    return where.lower().endswith(".mcap") and Path(where).is_file()
+
+
+READER = Reader("an MCAP file", ".mcap", _accepts, _open, BAG_OPTIONS)

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from quest.data.camera_file import CameraFile
+from quest.data.camera_file import CameraFile, read_setup
 from quest.data.distortion import Distortion
-from quest.data.frame_source import FrameSource, Notes, Parts
+from quest.data.frame_source import FrameSource, Notes, Parts, ReadOptions
 from quest.data.registration import Rig
 from quest.data.ros_images import depth_of, header_ns, rgb_of, unit_of
 from quest.data.ros_topics import Chosen, Messages, base_of, choose
@@ -28,6 +28,12 @@ _PATIENCE_NS = 500_000_000
 _SCAN_NS = 2_000_000_000
 _LATE_NS = 1_000_000_000
 _STALE_S = 0.5
+
+BAG_OPTIONS = (
+    *("topic_rgb", "topic_depth", "topic_info", "topic_depth_info", "world_frame", "sync_s"),
+    *("camera", "depth_scale_m"),
+)
+"""What readers of bags know of :class:`quest.data.frame_source.ReadOptions`."""
 
 NO_POSE = "no tf joins the camera to another frame: the world is the camera"
 NO_DEPTH = "no topic of depth: colours only"
@@ -67,29 +73,27 @@ class _Setting:
         return f"bag {self.messages.path}: message {number} of {topic}"
 
 
-def open_messages(
-    messages: Messages, parts: Parts, *, setup: CameraFile | None = None, depth_scale_m: float | None = None
-) -> FrameSource:
+def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
     """The RGB-D frames of a bag.
 
     Args:
         messages: the bag.
-        parts: which topics, frames and tolerance; what is not said is found.
-        setup: camera file that overrules what the bag says of the colour camera, and of depth that is registered to
-            it, and of the depth camera, if it has one.
-        depth_scale_m: metres per unit of depth; by default millimetres in 16 bits, metres in floats.
+        options: topics, frames and tolerance, where they are not to be found; a camera file, which overrules the bag's
+            colour camera, and that of depth that is registered to it, and the depth camera, if it has one; metres per
+            unit of depth, by default millimetres in 16 bits, metres in floats.
 
     Raises:
         RecordingError: no colours, no intrinsics, unknown lens, or depth of a camera whose place is unknown.
     """
-    chosen = choose(messages, parts)
+    setup = None if options.camera is None else read_setup(options.camera)
+    chosen = choose(messages, options)
     where = f"bag {messages.path}"
     notes = Notes()
     transforms, now_ns = _scan_transforms(messages, chosen)
     colour_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
     world = transforms.root(colour_frame)
-    if parts.world_frame is not None:
-        world = frame_name(parts.world_frame)
+    if options.world_frame is not None:
+        world = frame_name(options.world_frame)
         if transforms.lookup(colour_frame, world, now_ns) is None:
             raise RecordingError(
                 f"{where}: no tf joins the camera's frame {colour_frame!r} to {world!r} (--world-frame); it hangs on "
@@ -114,8 +118,8 @@ def open_messages(
     by_log = all(header_ns(message) == 0 for _, _, message in islice(messages.read([chosen.rgb]), 2))
     if by_log:
         notes.say(NO_STAMP)
-    unit_m = 1.0 if chosen.depth is None else depth_scale_m or unit_of(chosen.first[chosen.depth])
-    setting = _Setting(messages, chosen, rig, parts, colour_frame, world, depth_scale_m, pose, by_log)
+    unit_m = 1.0 if chosen.depth is None else options.depth_scale_m or unit_of(chosen.first[chosen.depth])
+    setting = _Setting(messages, chosen, rig, options, colour_frame, world, options.depth_scale_m, pose, by_log)
     return FrameSource(
         messages.path.stem if messages.path.is_file() else messages.path.resolve().name,
         rig.camera,

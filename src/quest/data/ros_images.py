@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from quest.data.frame_source import clean_depth
+from quest.depth import clean_depth
 from quest.errors import RecordingError
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")

@@ -9,6 +9,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from quest.data.frame_source import FrameSource, Reader, ReadOptions
+from quest.data.ros_frames import BAG_OPTIONS, open_messages
 from quest.data.ros_topics import Topic
 from quest.errors import RecordingError
 from quest.extras import require
@@ -21,7 +23,7 @@ class BagMessages:
         path: the folder or file.
 
     Raises:
-        RecordingError: the bag is torn, or holds no messages.
+        RecordingError: the bag is corrupt, or holds no messages.
         MissingExtraError: the extra ``ros`` is not installed.
     """
 
@@ -50,10 +52,10 @@ class BagMessages:
 
     @contextmanager
     def _reader(self) -> Iterator[Any]:
-        """An open reader; what goes wrong with the bag becomes an error that says so."""
+        """An open reader; errors of the bag become ours."""
         highlevel, typesys, serde = (require(f"rosbags.{name}") for name in ("highlevel", "typesys", "serde"))
         rosbag1, rosbag2 = require("rosbags.rosbag1"), require("rosbags.rosbag2")
-        torn = (
+        corrupt = (
             highlevel.AnyReaderError,
             serde.SerdeError,
             rosbag1.ReaderError,
@@ -73,11 +75,23 @@ class BagMessages:
                 yield reader
         except RecordingError:
             raise
-        except torn as error:
+        except corrupt as error:
             reindex = "rosbag reindex" if self.path.suffix.lower() == ".bag" else "ros2 bag reindex"
             raise RecordingError(
-                f"bag {self.path}: cannot be read ({type(error).__name__}: {error}); the bag is torn, copy it again, "
-                f"or rebuild it with `{reindex}`"
+                f"bag {self.path}: cannot be read ({type(error).__name__}: {error}); the bag is corrupt, copy it "
+                f"again, or rebuild it with `{reindex}`"
             ) from error
         except OSError as error:
             raise RecordingError(f"bag {self.path}: cannot be read ({error}); check the files in it") from error
+
+
+def _accepts(where: str) -> bool:
+    path = Path(where)
+    return (path.suffix.lower() in (".bag", ".db3") and path.is_file()) or (path / "metadata.yaml").is_file()
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    return open_messages(BagMessages(Path(where)), options)
+
+
+READER = Reader("a ROS bag", "a folder with metadata.yaml, .db3 or .bag", _accepts, _open, BAG_OPTIONS)

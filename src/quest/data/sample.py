@@ -5,7 +5,10 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
+from quest.data.frame_source import FrameSource, Reader, ReadOptions
 from quest.errors import RecordingError
+
+SAMPLE = "sample"
 
 
 def sample_folder() -> Path:
@@ -14,7 +17,16 @@ def sample_folder() -> Path:
     Raises:
         RecordingError: the installed package lacks it.
     """
-    folder = Path(str(resources.files("quest") / "assets" / "sample"))
+    folder = Path(str(resources.files("quest") / "assets" / SAMPLE))
     if not (folder / "camera.json").is_file():
         raise RecordingError(f"{folder}: the sample clip is missing from the installed package; install it again")
     return folder
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    from quest.data.folder import READER as FOLDER
+
+    return FOLDER.open(str(sample_folder()), options)
+
+
+READER = Reader("the packaged clip", SAMPLE, lambda where: where == SAMPLE and not Path(where).exists(), _open)

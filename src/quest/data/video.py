@@ -123,12 +123,12 @@ def _check_whole(path: Path, container: InputContainer, number: int, *, last_s: 
     declared = container.streams.video[0].frames
     if number < declared - 2:
         raise RecordingError(
-            f"video {path}: ends after {number} of {declared} frames; the file is torn, copy or record it again"
+            f"video {path}: ends after {number} of {declared} frames; the file is corrupt, copy or record it again"
         )
     declared_s = None if declared else _declared_s(container)
     if declared_s is not None and last_s + 3.5 * frame_s < declared_s:
         raise RecordingError(
-            f"video {path}: ends after {last_s + frame_s:.2f} of {declared_s:.2f} s; the file is torn, "
+            f"video {path}: ends after {last_s + frame_s:.2f} of {declared_s:.2f} s; the file is corrupt, "
             "copy or record it again"
         )
 
@@ -176,7 +176,7 @@ def _undecodable(path: Path, number: int, error: av.error.FFmpegError) -> Record
     where = f"after {number} frames" if number else "at all"
     return RecordingError(
         f"video {path}: cannot be decoded {where} ({error.strerror}); "
-        "the file is torn or not a video, copy or record it again"
+        "the file is corrupt or not a video, copy or record it again"
     )
 
 

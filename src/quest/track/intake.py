@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from quest.data.frame_source import PLAUSIBLE_DEPTH_M
+from quest.depth import PLAUSIBLE_DEPTH_M
 from quest.errors import InputError
 from quest.geometry.letterbox import Letterbox
 from quest.geometry.poses import is_rigid, nearest_rigid

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from quest.data.read import read
+from quest.data.recording import read_recording
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.grounding import Joint, JointKind
 from quest.model.discovery import Peaks, find_peaks
@@ -195,7 +195,7 @@ class Tracker:
             ConfigError: alpha is no probability, or there are no frames.
         """
         if isinstance(clip, str | Path):
-            clip = read(clip)
+            clip = read_recording(clip)
         elif not isinstance(clip, Clip):
             clip = Clip.from_arrays(clip)
         stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
