@@ -10,6 +10,7 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.progress import counting
 from quest.data.frame_source import Parts
 
 if TYPE_CHECKING:
@@ -20,18 +21,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Source:
-    """What to follow, where, and with which weights."""
+    """The recording, the queries, and the weights."""
 
     clip: tyro.conf.Positional[str]
-    """A recording folder, a video, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take (STORE/NAME.zarr), or the word
-    sample for the clip that ships."""
+    """A video, a folder of images, a recording folder, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take
+    (STORE/NAME.zarr), or the word sample for the clip that ships."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
     point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An entity by pixel, as FRAME,X,Y or FRAME,X,Y,NAME; give it again for each entity."""
     label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
-    """The most confident entity of a label: handle, knob, rim or front, such as rim:lift or rim:open to say what it is
-    taken hold of for; give it again for more."""
+    """The most confident entity of a label: handle, knob, rim or front; for one intent only, such as rim:lift or
+    rim:open; give it again for more."""
     depth: Path | None = None
     """Folder of 16-bit depth images; default: depth beside the colours."""
     camera: Path | None = None
@@ -69,28 +70,33 @@ class Source:
             parts=self.parts,
         )
 
-    def read(self) -> Clip:
-        """All frames in memory; what is less than it could be in them is said on standard error.
+    def read(self, console: Console) -> Clip:
+        """All frames in memory; degradations are said on standard error.
+
+        Args:
+            console: where to say how far it is.
 
         Raises:
-            RecordingError: as in :meth:`open`.
-            TakeError: likewise.
+            RecordingError: as in :meth:`open`, or the frames do not fit into memory.
+            TakeError: as in :meth:`open`.
         """
         source = self.open()
-        clip = source.clip()
+        _check_memory(source)
+        with counting(console, "reading", source.length) as report:
+            clip = source.clip(report=report)
         self.say_flags(source, Console(stderr=True, highlight=False, soft_wrap=True))
         return clip
 
     def say_flags(self, source: FrameSource, console: Console) -> None:
-        """Print what is less than it could be in a recording."""
+        """Print the degradations of a recording."""
         for flag in source.flags:
             console.print(f"[yellow]note:[/] {escape(source.name)}: {escape(flag)}")
 
     def queries(self, clip: Clip | FrameSource) -> list[Query] | None:
-        """What was asked; None where nothing was, and everything is to be discovered.
+        """The queries; None where there are none, and entities are to be discovered.
 
         Args:
-            clip: in which it was asked; frames beyond its end are refused where its length is known.
+            clip: the frames that they are about; frames beyond its end are refused where its length is known.
 
         Raises:
             InputError: a point or label is not written as expected, or its frame is not in the clip.
@@ -139,8 +145,8 @@ class Source:
         from quest.monitor import Budget
 
         budget = Budget(self.alpha, self.alpha_frames)
-        if tracker.calibration is not None and (told := tracker.calibration.shortfall(budget, frames=frames)):
-            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {told}; `quest weights calibrate`")
+        if tracker.calibration is not None and (why := tracker.calibration.shortfall(budget, frames=frames)):
+            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {why}; `quest weights calibrate`")
 
     def tracker(self) -> Tracker:
         """The tracker of the weights.
@@ -152,3 +158,29 @@ class Source:
         from quest.track import load
 
         return load(self.weights, device=self.device)
+
+
+def _check_memory(source: FrameSource) -> None:
+    """Raise RecordingError if all frames at once would need more memory than there is."""
+    from quest.errors import RecordingError
+
+    free_bytes = _free_bytes()
+    if free_bytes is None or source.length is None:
+        return
+    camera = source.camera
+    need_bytes = 2 * 3 * source.length * camera.width * camera.height  # each picture alone, and then all together
+    if need_bytes > free_bytes:
+        raise RecordingError(
+            f"recording {source.name}: {source.length} frames of {camera.width} x {camera.height} need "
+            f"{need_bytes / 1e9:.1f} GB of memory, {free_bytes / 1e9:.1f} GB are free; make it shorter or smaller "
+            f"(ffmpeg -i IN -vf scale=640:-2 OUT.mp4), or use `quest monitor`, which keeps no frames"
+        )
+
+
+def _free_bytes() -> int | None:
+    """Memory that is free; None where the system does not say."""
+    try:
+        lines = Path("/proc/meminfo").read_text().splitlines()
+    except OSError:
+        return None
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)

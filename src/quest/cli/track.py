@@ -12,7 +12,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quest.cli.progress import counting
 from quest.cli.source import Source
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.types import Clip, Tracks
@@ -23,31 +25,35 @@ class Track(Source):
     """Track a recording or a take; without queries the entities are discovered."""
 
     out: Path | None = None
-    """Folder for tracks.parquet and overlay.mp4; default: outputs/NAME, with the view of a take behind."""
+    """Folder for tracks.parquet and overlay.mp4; default: outputs/NAME, for a take with the view."""
     overlay: bool = True
     """Write the video."""
+    rrd: Path | None = None
+    """Also save a Rerun recording: frames, depth as points, tracks in the image and in space, joints."""
+    rerun: bool = False
+    """Open Rerun's viewer on the tracks."""
 
     def run(self) -> int:
         """Track, write, summarise."""
-        from quest.data.tracks_file import write_tracks
-        from quest.errors import InputError
-        from quest.viz.overlay import write_overlay
-
         self.check_alpha()
-        console = Console(highlight=False)
-        clip = self.read()
+        console = Console(highlight=False, soft_wrap=True)
+        console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
+        from quest.data.tracks_file import write_tracks
+        from quest.viz.overlay import write_overlay
+        from quest.viz.rerun_tracks import check_viewer, open_tracks, save_tracks
+
+        if self.rrd is not None or self.rerun:
+            check_viewer(on_screen=self.rerun)
+        clip = self.read(console)
         queries = self.queries(clip)
+        console.print(f"loading weights {escape(self.weights)}")
         tracker = self.tracker()
-        out = self.out or Path("outputs") / self._name(clip)
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=out).close()  # told before the work
-        except OSError as error:
-            raise InputError(
-                f"--out {out}: cannot be made a folder, or not be written to ({error.strerror}); name another"
-            ) from error
-        with console.status(f"tracking {len(clip)} frames on {tracker.device}"):
-            tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
+        out = self._make_folder(clip)
+        depth = "" if clip.depth_m is None else " with depth"
+        size = f"{clip.camera.width} x {clip.camera.height}"
+        console.print(f"tracking {counted(len(clip), 'frame')} of {size}{depth} on {tracker.device}")
+        with counting(console, "tracking", len(clip)) as report:
+            tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report)
         write_tracks(tracks, out / "tracks.parquet")
         console.print(_summary(clip, tracks))
         self.say_shortfall(tracker, console, frames=len(clip))
@@ -58,10 +64,29 @@ class Track(Source):
             with console.status("drawing"):
                 write_overlay(clip, tracks, out / "overlay.mp4")
             console.print(f"video:  {escape(str(out / 'overlay.mp4'))}")
+        if self.rrd is not None:
+            save_tracks(clip, tracks, self.rrd)
+            console.print(f"rerun:  {escape(str(self.rrd))}; open it with: rerun {escape(str(self.rrd))}")
+        if self.rerun:
+            open_tracks(clip, tracks)
         return 0
 
+    def _make_folder(self, clip: Clip) -> Path:
+        """The folder to write to, which is tried before the work."""
+        from quest.errors import InputError
+
+        out = self.out or Path("outputs") / self._name(clip)
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=out).close()
+        except OSError as error:
+            raise InputError(
+                f"--out {out}: cannot be made a folder, or not be written to ({error.strerror}); name another"
+            ) from error
+        return out
+
     def _name(self, clip: Clip) -> str:
-        """What to call the folder of a clip: views of a take, and episodes of a dataset, have folders of their own."""
+        """Name of the folder of a clip: views of a take, and episodes of a dataset, have folders of their own."""
         take = self.clip.rstrip("/\\")
         name = f"{Path(take).stem}-view{self.parts.view}" if take.endswith(".zarr") else clip.name
         return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
@@ -70,7 +95,11 @@ class Track(Source):
 def _summary(clip: Clip, tracks: Tracks) -> Table:
     import numpy as np
 
-    table = Table(title=escape(f"{clip.name}: {len(tracks)} frames, {len(tracks.names)} entities"))
+    table = Table(
+        title=escape(
+            f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
+        )
+    )
     for column in ("entity", "label", "seen", "moved", "confidence", "state at the end"):
         table.add_column(column, justify="left" if column in ("entity", "label") else "right")
     for k, (name, label) in enumerate(zip(tracks.names, tracks.labels, strict=True)):

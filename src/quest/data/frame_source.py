@@ -159,13 +159,20 @@ class FrameSource:
         if before == -np.inf:
             raise RecordingError(f"recording {self.name}: expected at least one frame, got none; record it again")
 
-    def clip(self) -> Clip:
+    def clip(self, *, report: Callable[[int], object] | None = None) -> Clip:
         """All frames in memory; depth is zero in frames that have none.
+
+        Args:
+            report: called after every frame with the number of frames that are read.
 
         Raises:
             RecordingError: as in reading frame by frame, or every pixel of the depth is missing.
         """
-        frames = list(self)
+        frames: list[Frame] = []
+        for frame in self:
+            frames.append(frame)
+            if report is not None:
+                report(len(frames))
         depth_m = None
         if any(frame.depth_m is not None for frame in frames):
             none = np.zeros((self.camera.height, self.camera.width), np.float32)

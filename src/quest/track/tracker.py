@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -178,6 +178,7 @@ class Tracker:
         *,
         alpha: float | None = DEFAULT_ALPHA,
         alpha_frames: int | None = None,
+        report: Callable[[int], object] | None = None,
     ) -> Tracks:
         """Track a whole clip: the stream's step in a loop.
 
@@ -187,6 +188,7 @@ class Tracker:
             queries: what to follow; None discovers entities in the first frame.
             alpha: as in :meth:`stream`.
             alpha_frames: as in :meth:`stream`; ``len(clip)`` shares alpha among all parts of the clip alike.
+            report: called after every frame with the number of frames that are done.
 
         Raises:
             InputError: a point query lies outside the clip, or two queries have one name; or the frames are not as
@@ -208,6 +210,8 @@ class Tracker:
         for t in range(len(clip)):
             frame = clip.frame(t)
             states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
+            if report is not None:
+                report(t + 1)
         tracks = collect(states, queries)
         tracks = replace(tracks, frame_flags=(*clip.notes, *tracks.frame_flags))
         return tracks if stream.budget is not None else replace(tracks, lost_p=None, alarm=None)

@@ -42,7 +42,7 @@ def save_rrd(take: Take, path: str | Path, *, every: int = 1) -> None:
     Raises:
         MissingExtraError: the extra ``viz`` is not installed.
     """
-    recording = _new_recording(take)
+    recording = new_recording(APPLICATION, take.info.name)
     with whole_file(Path(path)) as partial:
         recording.save(partial, default_blueprint=take_blueprint(take))
         log_take(take, recording, every=every)
@@ -61,12 +61,8 @@ def open_viewer(take: Take, *, every: int = 1) -> None:
         ConfigError: there is no screen.
         MissingExtraError: the extra ``viz`` is not installed.
     """
-    recording = _new_recording(take)
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise ConfigError(
-            "Rerun: there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); save a recording with --rrd "
-            "FILE and open it elsewhere"
-        )
+    recording = new_recording(APPLICATION, take.info.name)
+    check_screen()
     recording.spawn(default_blueprint=take_blueprint(take))
     log_take(take, recording, every=every)
     recording.flush()
@@ -116,9 +112,23 @@ def take_blueprint(take: Take) -> rrb.Blueprint:
     )
 
 
-def _new_recording(take: Take) -> rr.RecordingStream:
-    recording = require("rerun").RecordingStream(APPLICATION)
-    recording.send_recording_name(take.info.name)
+def check_screen() -> None:
+    """Raise ConfigError if there is no screen for Rerun's viewer."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError(
+            "Rerun: there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); save a recording with --rrd "
+            "FILE and open it elsewhere"
+        )
+
+
+def new_recording(application: str, name: str) -> rr.RecordingStream:
+    """A recording that knows no other times than those that are logged.
+
+    Raises:
+        MissingExtraError: the extra ``viz`` is not installed.
+    """
+    recording = require("rerun").RecordingStream(application)
+    recording.send_recording_name(name)
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     return recording
