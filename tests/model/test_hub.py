@@ -173,6 +173,13 @@ def test_a_hub_that_cannot_be_reached(hub: FakeHub, monkeypatch: pytest.MonkeyPa
         download(HubId("owner/name"), local_files_only=True)
 
 
+def test_a_hub_that_does_not_answer_is_asked_once(hub: FakeHub, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("time.sleep", lambda seconds: pytest.fail("waited for another try"))
+    listen(monkeypatch, "http://127.0.0.1:9")
+    with pytest.raises(WeightsError, match=r"127\.0\.0\.1:9 cannot be reached, and the cache .* has no copy"):
+        load_network("owner/name")
+
+
 def test_push_and_load(hub: FakeHub, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     assert main(["weights", "push", str(file), "owner/mine"]) == 2
     assert "hf auth login" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""Weights on the Hugging Face hub: one file of a model repository, and what can go wrong on the way."""
+"""Weights on the Hugging Face hub: one file of a model repository, and the errors on the way."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from huggingface_hub import constants, hf_hub_download
+from huggingface_hub import constants, get_hf_file_metadata, hf_hub_download, hf_hub_url
 from huggingface_hub.errors import (
     GatedRepoError,
     HfHubHTTPError,
@@ -70,11 +70,11 @@ def download(
     cache_dir: str | Path | None = None,
     local_files_only: bool = False,
 ) -> Path:
-    """The weights of a repository as a file of the hub's cache; what the cache has needs no network.
+    """The weights of a repository as a file of the hub's cache; a file that is there needs no network.
 
     Args:
         hub_id: the repository.
-        force_download: whether to download what the cache has.
+        force_download: whether to download files that the cache has.
         token: of the hub; the one that ``hf auth login`` stored by default.
         cache_dir: of the hub's files.
         local_files_only: whether only the cache is looked at.
@@ -92,9 +92,21 @@ def download(
             force_download=force_download,
             token=token,
             cache_dir=cache_dir,
-            local_files_only=local_files_only,
+            local_files_only=local_files_only or not _answers(hub_id, token),
         )
     return Path(path)
+
+
+def _answers(hub_id: HubId, token: str | bool | None) -> bool:
+    """Whether the hub can be reached, asked once: the library would ask six times and complain each time."""
+    url = hf_hub_url(hub_id.repo, FILE, revision=hub_id.revision)
+    try:
+        get_hf_file_metadata(url, timeout=constants.HF_HUB_ETAG_TIMEOUT, token=token)
+    except HfHubHTTPError:
+        return True  # with a refusal, which the download explains
+    except (OSError, TransportError):
+        return False
+    return True
 
 
 @contextmanager
