@@ -153,7 +153,7 @@ def test_tracking_needs_no_extra():
     """The base install tracks a recorded clip: nothing on the way may import what an extra brings."""
     code = (
         f"import sys; sys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\n"
-        "import quest.track, quest.data.recording, quest.data.tracks_file, quest.viz.overlay, quest.evaluation\n"
+        "import quest.track, quest.data.recording, quest.tracks, quest.viz.overlay, quest.evaluation\n"
         "import quest.baselines, quest.cli.main"
     )
     done = python("-c", code)

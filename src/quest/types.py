@@ -7,20 +7,17 @@ radians, times seconds. Depth is along +z; 0 means missing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from enum import StrEnum
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 from quest.depth import check_units, clean_depth
 from quest.errors import InputError
-from quest.extras import require
-
-if TYPE_CHECKING:
-    import pandas as pd
+from quest.tracks import Joints as Joints
+from quest.tracks import State as State
+from quest.tracks import Tracks as Tracks
 
 LABELS = ("handle", "knob", "rim", "front")
 """Labels of the entities that a tracker follows, in the order of the network's outputs."""
@@ -28,15 +25,6 @@ INTENTS = ("open", "lift")
 """What one takes hold of an entity for: to move its joint, or to lift the whole thing by its base."""
 GUESSED_CAMERA = "camera guessed: a focal length as long as the longer side (53 degrees); give the camera or fov_deg"
 _FRAMES_PER_S = 30.0
-_SHOWN = 12
-
-
-class State(StrEnum):
-    """What a query is doing at a frame."""
-
-    TRACKING = "tracking"
-    HELD = "held"
-    LOST = "lost"
 
 
 @dataclass(frozen=True)
@@ -342,196 +330,6 @@ class Query:
     def point(cls, frame: int, x: float, y: float, *, name: str = "", label: str | None = None) -> Query:
         """Follow the entity at pixel ``(x, y)`` of frame ``frame``."""
         return cls("point", name, label, frame, (x, y))
-
-
-@dataclass(frozen=True)
-class Joints:
-    """The joints that explain K tracks, as known at the end, in the world.
-
-    The coordinate ``q`` of a joint is 0 about where its entity was seen first and grows the way it then went: radians
-    about the axis (right-handed, within half a turn either way), or metres along it.
-
-    Attributes:
-        kind: ``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen.
-        axis: unit direction of sliding, or of the axis of turning; NaN where there is none.
-        origin: metres: the point of the axis of turning that is nearest to the path, a point of the path of sliding, or
-            the place of what is static; NaN where unknown.
-        q_min_seen: smallest coordinate that was seen; NaN without a joint that moves.
-        q_max_seen: largest one; NaN likewise.
-        q: coordinate per frame; NaN likewise, and where the tracker knew no world point. Of a query that was asked for
-            by a pixel, it is that of the network's own point beside it, which the same joint moves.
-        covariance: of small errors of ``axis`` (3, radians) and ``origin`` (3, metres) together, in world axes. Only
-            what is across the axis counts: its length is 1, and a shift along the axis of turning, or along the path of
-            sliding, changes nothing, so that a moving joint's matrix has rank 4. Of a static one the part of the axis
-            is NaN; all is NaN where the kind is unknown. It is the inverse of the normal equations at the end of the
-            fit, scaled by the noise of a point that the tracker assumes, or by the residuals where these are larger.
-            A wrong kind, or a point that is not of the entity, is not in it.
-    """
-
-    kind: tuple[str, ...]
-    axis: Float32[np.ndarray, "K 3"]
-    origin: Float32[np.ndarray, "K 3"]
-    q_min_seen: Float32[np.ndarray, " K"]
-    q_max_seen: Float32[np.ndarray, " K"]
-    q: Float32[np.ndarray, "T K"]
-    covariance: Float32[np.ndarray, "K 6 6"]
-
-    @classmethod
-    def unknown(cls, frames: int, queries: int) -> Joints:
-        """Joints of which nothing is known."""
-        return cls(
-            kind=("unknown",) * queries,
-            axis=np.full((queries, 3), np.nan, np.float32),
-            origin=np.full((queries, 3), np.nan, np.float32),
-            q_min_seen=np.full(queries, np.nan, np.float32),
-            q_max_seen=np.full(queries, np.nan, np.float32),
-            q=np.full((frames, queries), np.nan, np.float32),
-            covariance=np.full((queries, 6, 6), np.nan, np.float32),
-        )
-
-    def __len__(self) -> int:
-        return len(self.kind)
-
-    def __repr__(self) -> str:
-        return f"Joints({', '.join(self.describe(k) for k in range(len(self)))})"
-
-    def describe(self, k: int, t: int | None = None) -> str:
-        """A joint in a few words: see :func:`joint_words`.
-
-        Args:
-            k: the query.
-            t: a frame, to say where on the joint the entity is in it.
-        """
-        q = None if t is None else float(self.q[t, k])
-        return joint_words(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
-
-    def select(self, queries: np.ndarray) -> Joints:
-        """The joints of some queries only."""
-        return Joints(
-            kind=tuple(self.kind[i] for i in queries),
-            axis=self.axis[queries],
-            origin=self.origin[queries],
-            q_min_seen=self.q_min_seen[queries],
-            q_max_seen=self.q_max_seen[queries],
-            q=self.q[:, queries],
-            covariance=self.covariance[queries],
-        )
-
-
-def joint_words(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
-    """Kind of a joint and the range that was seen, in degrees or metres: ``revolute 0 to 34 deg``.
-
-    Args:
-        kind: as in :class:`Joints`.
-        q_min_seen: radians or metres.
-        q_max_seen: radians or metres.
-        q: where on it something is, which then comes first, with the range in brackets; NaN is ``?``.
-    """
-    if kind not in ("prismatic", "revolute"):
-        return kind
-    factor, digits, unit = (180 / np.pi, 0, "deg") if kind == "revolute" else (1.0, 2, "m")
-    seen = f"{factor * q_min_seen:z.{digits}f} to {factor * q_max_seen:z.{digits}f}"
-    if q is None:
-        return f"{kind} {seen} {unit}"
-    now = f"{factor * q:z.{digits}f}" if np.isfinite(q) else "?"
-    return f"{kind} {now} {unit} ({seen})"
-
-
-@dataclass(frozen=True)
-class Tracks:
-    """Answers to K queries over T frames.
-
-    Attributes:
-        names: name per query.
-        labels: label per query, or None.
-        uv_px: pixel in the source image; NaN before a query is bound.
-        point_world: world point in metres; NaN before binding and where it cannot be lifted.
-        confidence: probability that the identity is still right, 0 before binding.
-        visible: whether the entity is seen.
-        state: :class:`State` value per frame and query.
-        stamp_s: times in seconds.
-        frame_flags: degradations of whole frames or of the whole clip, in words.
-        lost_p: calibrated probability that the identity is lost, NaN where unknown; None without a monitor.
-        alarm: whether an alarm is open; None likewise.
-        joints: what explains the tracks at the end; None without grounding.
-    """
-
-    names: tuple[str, ...]
-    labels: tuple[str | None, ...]
-    uv_px: Float32[np.ndarray, "T K 2"]
-    point_world: Float32[np.ndarray, "T K 3"]
-    confidence: Float32[np.ndarray, "T K"]
-    visible: Bool[np.ndarray, "T K"]
-    state: np.ndarray
-    stamp_s: Float[np.ndarray, " T"]
-    frame_flags: tuple[str, ...] = ()
-    lost_p: Float32[np.ndarray, "T K"] | None = None
-    alarm: Bool[np.ndarray, "T K"] | None = None
-    joints: Joints | None = None
-
-    def __len__(self) -> int:
-        return len(self.uv_px)
-
-    def __repr__(self) -> str:
-        k = len(self.names)
-        lines = [f"Tracks({len(self)} frames, {k} {'query' if k == 1 else 'queries'})"]
-        lines += [f"  {self.describe(i)}" for i in range(min(k, _SHOWN))]
-        return "\n".join(lines if k <= _SHOWN else [*lines, f"  and {k - _SHOWN} more"])
-
-    def describe(self, k: int) -> str:
-        """A track in one line: its name, how often it was seen, its joint and its state at the end.
-
-        Args:
-            k: the query.
-        """
-        found = np.isfinite(self.uv_px[:, k]).all(axis=-1)
-        if not found.any():
-            return f"{self.names[k]}: not found"
-        joint = "" if self.joints is None else f", {self.joints.describe(k)}"
-        seen = f"seen in {self.visible[found, k].mean():.0%} of {found.sum()} frames"
-        return f"{self.names[k]}: {seen}{joint}, {self.state[-1, k]} at the end"
-
-    def save(self, path: str | Path) -> None:
-        """Write the tracks; what is there already is replaced.
-
-        Args:
-            path: a folder, which gets ``tracks.parquet`` and, with joints, ``joints.json``; or a file that ends in
-                ``.parquet``, which gets all in one table.
-
-        Raises:
-            InputError: the path names a file of another kind.
-        """
-        from quest.data.tracks_file import save_tracks
-
-        save_tracks(self, path)
-
-    def to_pandas(self) -> pd.DataFrame:
-        """One row per frame and query, with the columns of ``tracks.parquet``; NaN or None where nothing is known.
-
-        Raises:
-            MissingExtraError: the extra ``pandas`` is not installed.
-        """
-        from quest.data.tracks_file import tracks_table
-
-        require("pandas")
-        return tracks_table(self).to_pandas()
-
-    def select(self, queries: list[int] | np.ndarray) -> Tracks:
-        """The same tracks of some queries only."""
-        index = np.asarray(queries, dtype=int)
-        return replace(
-            self,
-            names=tuple(self.names[i] for i in index),
-            labels=tuple(self.labels[i] for i in index),
-            uv_px=self.uv_px[:, index],
-            point_world=self.point_world[:, index],
-            confidence=self.confidence[:, index],
-            visible=self.visible[:, index],
-            state=self.state[:, index],
-            lost_p=None if self.lost_p is None else self.lost_p[:, index],
-            alarm=None if self.alarm is None else self.alarm[:, index],
-            joints=None if self.joints is None else self.joints.select(index),
-        )
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from quest.data.lerobot_export import Episode, export_lerobot
 from quest.data.mcap_export import export_mcap
 from quest.data.recording import write_recording
 from quest.data.store import TakeStore
-from quest.data.tracks_file import read_tracks
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
 from quest.model.weights import save_network
 from quest.track import Stream, TrackerConfig
+from quest.tracks import read_tracks
 from quest.types import Clip
 from tests.synthetic import make_take
 from tests.tiny import make_network

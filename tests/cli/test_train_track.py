@@ -11,10 +11,10 @@ from safetensors.torch import save_file
 
 from quest.cli.main import main
 from quest.data.store import TakeStore
-from quest.data.tracks_file import read_tracks
 from quest.model.config import PRESETS
 from quest.model.weights import load_network, save_network
 from quest.track import TrackerConfig
+from quest.tracks import read_tracks
 from tests.synthetic import make_take
 from tests.tiny import DEFAULT, make_network
 

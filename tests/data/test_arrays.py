@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -89,14 +90,15 @@ def test_cameras_of_arrays(clip: Clip):
     assert (upright.fx, upright.fy, upright.cx, upright.cy) == pytest.approx((32, 32, 24, 32))
     matrix = Clip.from_arrays(clip.rgb, camera=[[50, 0, 31.5], [0, 51, 23.5], [0, 0, 1]])
     assert matrix.camera == Camera(50, 51, 32, 24, 64, 48)
-    for wrong in ({"fov_deg": 180}, {"fov_deg": 60, "camera": clip.camera}, {"camera": np.eye(4)}):
+    wrong: list[dict[str, Any]] = [{"fov_deg": 180}, {"fov_deg": 60, "camera": clip.camera}, {"camera": np.eye(4)}]
+    for how in wrong:
         with pytest.raises(InputError, match=r"field of view|3 x 3"):
-            Clip.from_arrays(clip.rgb, **wrong)
+            Clip.from_arrays(clip.rgb, **how)
 
 
 def test_shapes_that_contradict_each_other(clip: Clip):
     assert clip.depth_m is not None
-    for wrong, what in (
+    wrong: list[tuple[dict[str, Any], str]] = [
         ({"depth_m": clip.depth_m[:5]}, "depth of shape"),
         ({"depth_m": clip.depth_m[..., None]}, "depth of shape"),
         ({"camera": Camera.from_fov(48, 64)}, "64 x 48 but the camera is for 48 x 64"),
@@ -104,9 +106,10 @@ def test_shapes_that_contradict_each_other(clip: Clip):
         ({"cam_from_world": np.eye(3)}, "12 time stamps and poses"),
         ({"stamp_s": np.arange(12.0), "fps": 10}, "not from both"),
         ({"fps": 0}, "fps > 0"),
-    ):
+    ]
+    for how, what in wrong:
         with pytest.raises((InputError, TypeCheckError), match=what):
-            Clip.from_arrays(clip.rgb, **wrong)
+            Clip.from_arrays(clip.rgb, **how)
 
 
 def test_intrinsics_of_numpy_are_numbers(clip: Clip, tmp_path: Path):

@@ -344,10 +344,10 @@ def test_what_is_found_again_ends_the_alarm(clip: Clip):
     assert after[-1].state != (State.LOST,)
 
 
-def test_without_depth_alarms_end_too(clip: Clip):
+def test_alarms_end_too_when_depth_has_gone(clip: Clip):
     blind = replace(clip, depth_m=None)
-    stream = watched(alarming=True).stream(clip.camera, POINTS[:1], alpha=0.1)
-    feed(stream, blind, range(3))
+    stream = watched(alarming=True).stream(clip.camera, POINTS[1:], alpha=0.1)
+    feed(stream, clip, range(3))
     assert stream._monitor is not None
     stream._monitor.calibration = make_calibration(alarming=False)
     after = feed(stream, blind, range(3, 8))

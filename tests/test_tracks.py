@@ -12,8 +12,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from quest.data.tracks_file import SCHEMA, read_tracks, write_joints, write_tracks
 from quest.errors import InputError, MissingExtraError
+from quest.tracks import COLUMNS, read_tracks, write_joints, write_tracks
 from quest.types import Joints, State, Tracks
 
 
@@ -77,7 +77,7 @@ def test_tracks_of_trackers_that_do_not_watch_themselves(tracks: Tracks, tmp_pat
 def test_columns_that_other_programs_read(tracks: Tracks, tmp_path: Path):
     write_tracks(tracks, tmp_path / "tracks.parquet")
     table = pq.read_table(tmp_path / "tracks.parquet")
-    assert table.schema.names == SCHEMA.names
+    assert table.schema.names == list(COLUMNS)
     rows = table.to_pylist()
     assert len(rows) == 15
     assert (rows[4]["frame"], rows[4]["query"], rows[4]["name"], rows[4]["label"]) == (1, 1, "slot-1", None)
@@ -122,7 +122,7 @@ def test_tables_of_pandas(tracks: Tracks, monkeypatch: pytest.MonkeyPatch):
             tracks.to_pandas()
     pytest.importorskip("pandas")
     table = tracks.to_pandas()
-    assert list(table.columns) == SCHEMA.names
+    assert list(table.columns) == list(COLUMNS)
     assert len(table) == 15
     last = table[(table["name"] == "link_0/handle") & (table["frame"] == 4)]
     assert tracks.joints is not None

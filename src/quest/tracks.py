@@ -1,0 +1,424 @@
+"""Tracks, the answers of a tracker, with the joints that explain them; and the files that they are kept in.
+
+A file of tracks is Parquet, one row per frame and query, readable by any table tool, with the joints in it; joints are
+also written as JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from quest.errors import InputError
+from quest.extras import require
+from quest.whole_file import whole_file
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+VERSION = 3
+JOINTS_VERSION = 1
+_SHOWN = 12
+_METADATA_KEY = b"quest-tracks"
+
+COLUMNS = {
+    "frame": "int32",
+    "stamp_s": "double",
+    "query": "int32",
+    "name": "string",
+    "label": "string",
+    "x_px": "float",
+    "y_px": "float",
+    "x_m": "float",
+    "y_m": "float",
+    "z_m": "float",
+    "confidence": "float",
+    "visible": "bool",
+    "state": "string",
+    "lost_p": "float",
+    "alarm": "bool",
+    "q": "float",
+}
+"""Columns and their types in Arrow: pixels of the source image, metres in the world, ``q`` on the joint in radians or
+metres; null where there is none, and where a tracker does not say how probably it is lost or whether it alarms."""
+
+
+class State(StrEnum):
+    """What a query is doing at a frame."""
+
+    TRACKING = "tracking"
+    HELD = "held"
+    LOST = "lost"
+
+
+@dataclass(frozen=True)
+class Joints:
+    """The joints that explain K tracks, as known at the end, in the world.
+
+    The coordinate ``q`` of a joint is 0 about where its entity was seen first and grows the way it then went: radians
+    about the axis (right-handed, within half a turn either way), or metres along it.
+
+    Attributes:
+        kind: ``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen.
+        axis: unit direction of sliding, or of the axis of turning; NaN where there is none.
+        origin: metres: the point of the axis of turning that is nearest to the path, a point of the path of sliding, or
+            the place of what is static; NaN where unknown.
+        q_min_seen: smallest coordinate that was seen; NaN without a joint that moves.
+        q_max_seen: largest one; NaN likewise.
+        q: coordinate per frame; NaN likewise, and where the tracker knew no world point. Of a query that was asked for
+            by a pixel, it is that of the network's own point beside it, which the same joint moves.
+        covariance: of small errors of ``axis`` (3, radians) and ``origin`` (3, metres) together, in world axes. Only
+            what is across the axis counts: its length is 1, and a shift along the axis of turning, or along the path of
+            sliding, changes nothing, so that a moving joint's matrix has rank 4. Of a static one the part of the axis
+            is NaN; all is NaN where the kind is unknown. It is the inverse of the normal equations at the end of the
+            fit, scaled by the noise of a point that the tracker assumes, or by the residuals where these are larger.
+            A wrong kind, or a point that is not of the entity, is not in it.
+    """
+
+    kind: tuple[str, ...]
+    axis: Float32[np.ndarray, "K 3"]
+    origin: Float32[np.ndarray, "K 3"]
+    q_min_seen: Float32[np.ndarray, " K"]
+    q_max_seen: Float32[np.ndarray, " K"]
+    q: Float32[np.ndarray, "T K"]
+    covariance: Float32[np.ndarray, "K 6 6"]
+
+    @classmethod
+    def unknown(cls, frames: int, queries: int) -> Joints:
+        """Joints of which nothing is known."""
+        return cls(
+            kind=("unknown",) * queries,
+            axis=np.full((queries, 3), np.nan, np.float32),
+            origin=np.full((queries, 3), np.nan, np.float32),
+            q_min_seen=np.full(queries, np.nan, np.float32),
+            q_max_seen=np.full(queries, np.nan, np.float32),
+            q=np.full((frames, queries), np.nan, np.float32),
+            covariance=np.full((queries, 6, 6), np.nan, np.float32),
+        )
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+    def __repr__(self) -> str:
+        return f"Joints({', '.join(self.describe(k) for k in range(len(self)))})"
+
+    def describe(self, k: int, t: int | None = None) -> str:
+        """A joint in a few words: see :func:`joint_words`.
+
+        Args:
+            k: the query.
+            t: a frame, to say where on the joint the entity is in it.
+        """
+        q = None if t is None else float(self.q[t, k])
+        return joint_words(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
+
+    def select(self, queries: np.ndarray) -> Joints:
+        """The joints of some queries only."""
+        return Joints(
+            kind=tuple(self.kind[i] for i in queries),
+            axis=self.axis[queries],
+            origin=self.origin[queries],
+            q_min_seen=self.q_min_seen[queries],
+            q_max_seen=self.q_max_seen[queries],
+            q=self.q[:, queries],
+            covariance=self.covariance[queries],
+        )
+
+
+def joint_words(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
+    """Kind of a joint and the range that was seen, in degrees or metres: ``revolute 0 to 34 deg``.
+
+    Args:
+        kind: as in :class:`Joints`.
+        q_min_seen: radians or metres.
+        q_max_seen: radians or metres.
+        q: where on it something is, which then comes first, with the range in brackets; NaN is ``?``.
+    """
+    if kind not in ("prismatic", "revolute"):
+        return kind
+    factor, digits, unit = (180 / np.pi, 0, "deg") if kind == "revolute" else (1.0, 2, "m")
+    seen = f"{factor * q_min_seen:z.{digits}f} to {factor * q_max_seen:z.{digits}f}"
+    if q is None:
+        return f"{kind} {seen} {unit}"
+    now = f"{factor * q:z.{digits}f}" if np.isfinite(q) else "?"
+    return f"{kind} {now} {unit} ({seen})"
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Answers to K queries over T frames.
+
+    Attributes:
+        names: name per query.
+        labels: label per query, or None.
+        uv_px: pixel in the source image; NaN before a query is bound.
+        point_world: world point in metres; NaN before binding and where it cannot be lifted.
+        confidence: probability that the identity is still right, 0 before binding.
+        visible: whether the entity is seen.
+        state: :class:`State` value per frame and query.
+        stamp_s: times in seconds.
+        frame_flags: degradations of whole frames or of the whole clip, in words.
+        lost_p: calibrated probability that the identity is lost, NaN where unknown; None without a monitor.
+        alarm: whether an alarm is open; None likewise.
+        joints: what explains the tracks at the end; None without grounding.
+    """
+
+    names: tuple[str, ...]
+    labels: tuple[str | None, ...]
+    uv_px: Float32[np.ndarray, "T K 2"]
+    point_world: Float32[np.ndarray, "T K 3"]
+    confidence: Float32[np.ndarray, "T K"]
+    visible: Bool[np.ndarray, "T K"]
+    state: np.ndarray
+    stamp_s: Float[np.ndarray, " T"]
+    frame_flags: tuple[str, ...] = ()
+    lost_p: Float32[np.ndarray, "T K"] | None = None
+    alarm: Bool[np.ndarray, "T K"] | None = None
+    joints: Joints | None = None
+
+    def __len__(self) -> int:
+        return len(self.uv_px)
+
+    def __repr__(self) -> str:
+        k = len(self.names)
+        lines = [f"Tracks({len(self)} frames, {k} {'query' if k == 1 else 'queries'})"]
+        lines += [f"  {self.describe(i)}" for i in range(min(k, _SHOWN))]
+        return "\n".join(lines if k <= _SHOWN else [*lines, f"  and {k - _SHOWN} more"])
+
+    def describe(self, k: int) -> str:
+        """A track in one line: its name, how often it was seen, its joint and its state at the end.
+
+        Args:
+            k: the query.
+        """
+        found = np.isfinite(self.uv_px[:, k]).all(axis=-1)
+        if not found.any():
+            return f"{self.names[k]}: not found"
+        joint = "" if self.joints is None else f", {self.joints.describe(k)}"
+        seen = f"seen in {self.visible[found, k].mean():.0%} of {found.sum()} frames"
+        return f"{self.names[k]}: {seen}{joint}, {self.state[-1, k]} at the end"
+
+    def save(self, path: str | Path) -> None:
+        """Write the tracks; what is there already is replaced.
+
+        Args:
+            path: a folder, which gets ``tracks.parquet`` and, with joints, ``joints.json``; or a file that ends in
+                ``.parquet``, which gets all in one table.
+
+        Raises:
+            InputError: the path names a file of another kind.
+        """
+        path = Path(path)
+        if path.suffix == ".parquet":
+            write_tracks(self, path)
+            return
+        if path.is_file() or (path.suffix and not path.is_dir()):
+            raise InputError(f"tracks {path}: expected a folder, or a file that ends in .parquet; name one of these")
+        write_tracks(self, path / "tracks.parquet")
+        if self.joints is not None:
+            write_joints(self, path / "joints.json")
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row per frame and query, with the columns of ``tracks.parquet``; NaN or None where nothing is known.
+
+        Raises:
+            MissingExtraError: the extra ``pandas`` is not installed.
+        """
+        require("pandas")
+        return tracks_table(self).to_pandas()
+
+    def select(self, queries: list[int] | np.ndarray) -> Tracks:
+        """The same tracks of some queries only."""
+        index = np.asarray(queries, dtype=int)
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in index),
+            labels=tuple(self.labels[i] for i in index),
+            uv_px=self.uv_px[:, index],
+            point_world=self.point_world[:, index],
+            confidence=self.confidence[:, index],
+            visible=self.visible[:, index],
+            state=self.state[:, index],
+            lost_p=None if self.lost_p is None else self.lost_p[:, index],
+            alarm=None if self.alarm is None else self.alarm[:, index],
+            joints=None if self.joints is None else self.joints.select(index),
+        )
+
+
+def write_joints(tracks: Tracks, path: str | Path) -> None:
+    """Write the joints of tracks as JSON (``docs/tracker.md`` lists its fields), all or nothing.
+
+    Raises:
+        InputError: the tracks have no joints.
+    """
+    joints = tracks.joints
+    if joints is None:
+        raise InputError(f"joints {path}: these tracks have none; a tracker that is grounded in joints gives them")
+    rows = [
+        {"query": k, "name": tracks.names[k], "label": tracks.labels[k], **row, "q": _plain(joints.q[:, k], digits=6)}
+        for k, row in enumerate(_joints_to_json(joints, digits=6))
+    ]
+    whole = {"version": JOINTS_VERSION, "stamp_s": [float(stamp) for stamp in tracks.stamp_s], "joints": rows}
+    with whole_file(Path(path)) as partial:
+        partial.write_text(json.dumps(whole, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def write_tracks(tracks: Tracks, path: str | Path) -> None:
+    """Write tracks as Parquet, all or nothing; an existing file is replaced.
+
+    Rows are ordered by frame, then query. Names, labels, time stamps, frame flags and joints are in the metadata, so
+    that tracks without queries come back whole.
+    """
+    import pyarrow.parquet as pq
+
+    with whole_file(Path(path)) as partial, partial.open("wb") as file:  # not by its path, which may be no UTF-8
+        pq.write_table(tracks_table(tracks), file, compression="zstd")
+
+
+def tracks_table(tracks: Tracks) -> pa.Table:
+    """Tracks as a table with the columns of :data:`COLUMNS`, one row per frame and query."""
+    import pyarrow as pa
+
+    frames, queries = tracks.uv_px.shape[:2]
+    frame, query = (index.ravel() for index in np.indices((frames, queries), dtype=np.int32))
+    uv_px, point = tracks.uv_px.reshape(-1, 2), tracks.point_world.reshape(-1, 3)
+    columns = {
+        "frame": frame,
+        "stamp_s": np.asarray(tracks.stamp_s, dtype=np.float64)[frame],
+        "query": query,
+        "name": [tracks.names[k] for k in query],
+        "label": [tracks.labels[k] for k in query],
+        "x_px": uv_px[:, 0],
+        "y_px": uv_px[:, 1],
+        "x_m": point[:, 0],
+        "y_m": point[:, 1],
+        "z_m": point[:, 2],
+        "confidence": tracks.confidence.ravel(),
+        "visible": tracks.visible.ravel(),
+        "state": [str(state) for state in tracks.state.ravel()],
+        "lost_p": [None] * len(frame) if tracks.lost_p is None else tracks.lost_p.ravel(),
+        "alarm": [None] * len(frame) if tracks.alarm is None else tracks.alarm.ravel(),
+        "q": [None] * len(frame) if tracks.joints is None else tracks.joints.q.ravel(),
+    }
+    schema = pa.schema(list(COLUMNS.items()))
+    arrays = [pa.array(columns[field.name], type=field.type, from_pandas=True) for field in schema]
+    metadata = {
+        "version": VERSION,
+        "names": tracks.names,
+        "labels": tracks.labels,
+        "stamp_s": [float(stamp) for stamp in tracks.stamp_s],
+        "frame_flags": tracks.frame_flags,
+        "watched": tracks.lost_p is not None,
+        "joints": None if tracks.joints is None else _joints_to_json(tracks.joints),
+    }
+    return pa.Table.from_arrays(arrays, schema=schema.with_metadata({_METADATA_KEY: json.dumps(metadata).encode()}))
+
+
+def read_tracks(path: str | Path) -> Tracks:
+    """Read tracks written by :func:`write_tracks`.
+
+    Raises:
+        InputError: the file is missing, torn, not a table of tracks, or of another format version.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        with Path(path).open("rb") as file:
+            table = pq.read_table(file)
+    except FileNotFoundError:
+        raise InputError(f"tracks {path}: no such file; check the path, or run quest track") from None
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"tracks {path}: cannot be read as Parquet ({reason}); the file is torn, track again"
+        ) from error
+    raw = (table.schema.metadata or {}).get(_METADATA_KEY)
+    if raw is None or table.schema.names != list(COLUMNS):
+        raise InputError(
+            f"tracks {path}: a Parquet file, but not of tracks (columns {', '.join(table.schema.names)}); "
+            "give a file that quest track wrote"
+        )
+    metadata = json.loads(raw)
+    if metadata.get("version") != VERSION:
+        raise InputError(
+            f"tracks {path}: format version {metadata.get('version')}, expected {VERSION}; track again, or use the "
+            "version of quest that wrote it"
+        )
+    frames, queries = len(metadata["stamp_s"]), len(metadata["names"])
+    if table.num_rows != frames * queries:
+        raise InputError(f"tracks {path}: {table.num_rows} rows for {frames} frames of {queries} queries; track again")
+
+    def column(name: str) -> np.ndarray:
+        return table[name].to_numpy().reshape(frames, queries)
+
+    def stacked(*names: str) -> np.ndarray:
+        return np.stack([column(name) for name in names], axis=-1).astype(np.float32)
+
+    return Tracks(
+        names=tuple(metadata["names"]),
+        labels=tuple(metadata["labels"]),
+        uv_px=stacked("x_px", "y_px"),
+        point_world=stacked("x_m", "y_m", "z_m"),
+        confidence=column("confidence").astype(np.float32),
+        visible=column("visible").astype(bool),
+        state=np.array([State(state).value for state in table["state"].to_pylist()], dtype="<U8").reshape(
+            frames, queries
+        ),
+        stamp_s=np.array(metadata["stamp_s"], dtype=np.float64),
+        frame_flags=tuple(metadata["frame_flags"]),
+        lost_p=column("lost_p").astype(np.float32) if metadata["watched"] else None,
+        alarm=column("alarm").astype(bool) if metadata["watched"] else None,
+        joints=None if metadata["joints"] is None else _joints_from_json(metadata["joints"], column("q")),
+    )
+
+
+def _joints_to_json(joints: Joints, *, digits: int | None = None) -> list[dict[str, Any]]:
+    """One entry per query, without its coordinates."""
+    return [
+        {
+            "kind": kind,
+            "axis": _plain(joints.axis[k], digits),
+            "origin_m": _plain(joints.origin[k], digits),
+            "q_min_seen": _plain(joints.q_min_seen[k], digits),
+            "q_max_seen": _plain(joints.q_max_seen[k], digits),
+            "covariance": _plain(joints.covariance[k], digits),
+        }
+        for k, kind in enumerate(joints.kind)
+    ]
+
+
+def _plain(values: np.ndarray, digits: int | None = None) -> Any:
+    """Nested lists of numbers, null where they are NaN, as JSON has none; one null where all of several are.
+
+    Args:
+        values: of any shape.
+        digits: significant ones; all by default.
+    """
+    if values.ndim == 0:
+        number = float(values) if digits is None else float(f"{values:.{digits}g}")
+        return number if np.isfinite(number) else None
+    return [_plain(value, digits) for value in values] if np.isfinite(values).any() or not values.size else None
+
+
+def _joints_from_json(rows: list[dict[str, Any]], q: np.ndarray) -> Joints:
+    joints = Joints.unknown(*q.shape)
+    for k, row in enumerate(rows):
+        joints.axis[k] = _numbers(row["axis"])
+        joints.origin[k] = _numbers(row["origin_m"])
+        joints.q_min_seen[k] = _numbers(row["q_min_seen"])
+        joints.q_max_seen[k] = _numbers(row["q_max_seen"])
+        if row["covariance"] is not None:
+            joints.covariance[k] = [[np.nan] * 6 if line is None else _numbers(line) for line in row["covariance"]]
+    return replace(joints, kind=tuple(row["kind"] for row in rows), q=q.astype(np.float32))
+
+
+def _numbers(values: float | list[float | None] | None) -> np.ndarray:
+    return np.array(values, np.float32)  # null becomes NaN
