@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import subprocess
 import sys
@@ -161,8 +162,6 @@ def test_tracking_needs_no_extra():
 
 
 def test_require(monkeypatch):
-    import json
-
     assert require("json") is json
     monkeypatch.setitem(EXTRA_OF, "quest_not_there", "sim")
     with pytest.raises(MissingExtraError, match=r"quest_not_there.*pip install .*\[sim\]"):
@@ -202,6 +201,17 @@ def test_doctor(capsys):
     out = capsys.readouterr().out
     assert all(part in out for part in ("torch", "video", "weights", "renderer", "[sim]", "disk"))
     assert code == 0, out
+
+
+def test_doctor_and_weights_in_json(capsys):
+    assert program.main(["doctor", "--json"]) == 0
+    parts = {finding["part"]: finding for finding in json.loads(capsys.readouterr().out)}
+    assert parts["torch"]["status"] == "ok"
+    assert set(parts["disk"]) == {"part", "status", "found", "remedy"}
+    assert program.main(["weights", "list", "--json"]) == 0
+    listed = json.loads(capsys.readouterr().out)
+    assert {weights["name"] for weights in listed} >= {"quest-s16"}
+    assert all(Path(weights["file"]).stat().st_size == weights["bytes"] for weights in listed)
 
 
 def test_doctor_fails_without_weights(monkeypatch, capsys):

@@ -1,11 +1,12 @@
 import json
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
 from quest.errors import RendererError
-from quest.render_device import find_vulkan_icd, prepare_renderer
+from quest.render_device import find_vulkan_icd, prepare_renderer, without_known_warnings
 
 pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems bring their own driver")
 
@@ -91,3 +92,12 @@ def test_prepare_sets_the_environment(tmp_path, monkeypatch):
     import os
 
     assert os.environ["VK_ICD_FILENAMES"] == str(icd)
+
+
+def test_known_warnings_of_the_driver_are_kept_back(capfd: pytest.CaptureFixture):
+    """Native code writes past ``sys.stderr``."""
+    known = b"../third_party/swiftshader/src/Vulkan/libVulkan.cpp:3965 WARNING: UNSUPPORTED: pNext sType = 1000212000\n"
+    with without_known_warnings():
+        os.write(2, known + b"device lost\n" + known)
+    os.write(2, b"after\n")
+    assert capfd.readouterr().err == "device lost\nafter\n"

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import sys
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -55,6 +58,8 @@ REMEDY = (
     "elsewhere: Chromium that is no snap, or Google Chrome), or install the NVIDIA driver with its graphics "
     "libraries, or name a driver yourself with VK_ICD_FILENAMES=/path/to/icd.json"
 )
+
+_KNOWN_WARNING = re.compile(rb"swiftshader/src/\S+ WARNING: UNSUPPORTED: ")
 
 DriverKind = Literal["chosen", "nvidia", "swiftshader", "lavapipe", "system"]
 
@@ -119,6 +124,31 @@ def prepare_renderer() -> VulkanDriver:
         # The older name of the variable is understood by every loader, SAPIEN's own included.
         os.environ["VK_ICD_FILENAMES"] = driver.icd
     return driver
+
+
+@contextmanager
+def without_known_warnings() -> Iterator[None]:
+    """Keep SwiftShader's remarks on what it does not support off standard error; all else comes when it ends.
+
+    They are written by native code, which knows no ``sys.stderr``, when a renderer first looks at its devices.
+    """
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as kept:
+        try:
+            original = os.dup(2)
+        except OSError:  # standard error is closed
+            yield
+            return
+        os.dup2(kept.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(original, 2)
+            os.close(original)
+            kept.seek(0)
+            for line in kept:
+                if not _KNOWN_WARNING.search(line):
+                    os.write(2, line)
 
 
 def _chosen_by_user(environ: Mapping[str, str]) -> VulkanDriver | None:

@@ -179,7 +179,7 @@ def test_export(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str])
 def test_export_names_what_is_torn(broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert quest("export", broken, "--out", tmp_path / "out") == 1
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["whole-v0.npz", "wrong-v0.npz"]
-    assert "left out: take 'torn'" in capsys.readouterr().err
+    assert "omitted: take 'torn'" in capsys.readouterr().err
     rotten = next(path for path in (broken / "whole.zarr" / "view_0" / "rgb" / "c").rglob("*") if path.is_file())
     rotten.write_bytes(rotten.read_bytes()[:40] + b"x" + rotten.read_bytes()[41:])
     assert quest("export", broken, "--out", tmp_path / "again") == 1
@@ -226,3 +226,10 @@ def test_mistakes(
     (whole.parent / "empty").mkdir(exist_ok=True)
     assert quest(*arguments) == 2
     assert said in capsys.readouterr().err
+
+
+def test_a_take_where_a_store_is_expected(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    take = next(whole.glob("*.zarr"))
+    assert program.main(["data", "stats", str(take)]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert f"expected a store, and this is one take, {take.stem}; name its store, {whole}" in error

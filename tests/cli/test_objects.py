@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from quest.cli.main import main
+from quest.sim.objects import SimObject, load_object
 from tests.sim.small_objects import CARCASS, DRAWER, write_cabinet, write_object
 
 
@@ -25,6 +26,22 @@ def test_list_names_objects_entities_and_what_is_broken(tmp_path: Path, capsys: 
     captured = capsys.readouterr()
     assert "cabinet" in captured.out
     assert "not a readable URDF" in captured.err
+
+
+def test_list_prints_each_object_as_it_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_cabinet(tmp_path / "a-cabinet")
+    write_cabinet(tmp_path / "b-cabinet")
+    seen: list[str] = []
+
+    def watched(folder: Path) -> SimObject:
+        seen.append(capsys.readouterr().out)
+        return load_object(folder)
+
+    monkeypatch.setattr("quest.sim.objects.load_object", watched)
+    assert main(["objects", "list", "--objects-root", str(tmp_path)]) == 0
+    assert "a-cabinet" in seen[1]
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import io
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tyro
+from rich.console import Console
 
 from quest.cli.main import main
+from quest.cli.progress import counting
 from quest.cli.source import Source
 from quest.cli.track import Track
 from quest.data.camera_file import CameraFile, write_camera
@@ -221,3 +226,82 @@ def test_a_take_has_neither_episodes_nor_topics():
 def test_no_such_recording():
     with pytest.raises(RecordingError, match="no such file or folder"):
         Source("nowhere.mcap").open()
+
+
+def test_a_store_where_a_take_is_expected(tmp_path: Path, weights: str, capsys):
+    TakeStore(tmp_path / "takes").write(make_take(frames=2, views=1, size=(32, 24), name="only"))
+    assert main(["track", str(tmp_path / "takes"), "--weights", weights]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "a store of 1 take (only); name one, such as" in error
+
+
+def test_any_video_is_tracked(clip: Clip, weights: str, tmp_path: Path, capsys):
+    """Without a camera file: colours only, and the guess is said."""
+    write_video(tmp_path / "mine.mp4", clip.rgb, frames_per_s=30)
+    track(str(tmp_path / "mine.mp4"), weights, tmp_path / "out")
+    captured = capsys.readouterr()
+    assert captured.out.startswith("reading ")
+    assert "guessed a focal length of 64 px, the longer side of the image" in captured.err
+    track(str(tmp_path / "mine.mp4"), weights, tmp_path / "out", "--fov", "60")
+    assert "a focal length of 55 px from --fov 60" in capsys.readouterr().err
+
+
+def test_the_first_line_comes_before_anything_heavy_is_imported(tmp_path: Path):
+    code = (
+        "import sys, builtins\n"
+        "from quest.cli.main import main\n"
+        "heavy = ('torch', 'av', 'cv2', 'zarr', 'pyarrow', 'scipy')\n"
+        "class Out:\n"
+        "    encoding, errors = 'utf-8', 'strict'\n"
+        "    def isatty(self): return False\n"
+        "    def flush(self): pass\n"
+        "    def write(self, text):\n"
+        "        sys.__stdout__.write(text.strip() + str([m for m in heavy if m in sys.modules]))\n"
+        "        sys.__stdout__.flush()\n"
+        "        import os; os._exit(0)\n"
+        "sys.stdout = Out()\n"
+        "main(['track', 'sample'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=60)
+    assert done.stdout == "reading sample[]", done.stderr
+
+
+def test_frames_that_do_not_fit_into_memory(sources: dict[str, str], monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.setattr("quest.cli.source._free_bytes", lambda: 1000)
+    assert main(["track", sources["folder"]]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "6 frames of 64 x 48 need" in error
+    assert "quest monitor" in error
+
+
+def test_frames_are_counted_in_lines_where_output_is_piped(monkeypatch: pytest.MonkeyPatch):
+    now_s = iter(range(0, 100, 6))
+    monkeypatch.setattr("quest.cli.progress.time.monotonic", lambda: next(now_s))
+    out = io.StringIO()
+    with counting(Console(file=out, width=80), "tracking", 6) as report:
+        for done in range(1, 7):
+            report(done)
+    assert out.getvalue().splitlines() == [
+        "tracking: 2 of 6 frames, 24 s left",
+        "tracking: 4 of 6 frames, 12 s left",
+    ]
+
+
+def test_frames_are_counted_in_a_bar_in_a_terminal():
+    out = io.StringIO()
+    with counting(Console(file=out, width=80, force_terminal=True), "tracking", 6) as report:
+        report(3)
+    assert "3/6" in out.getvalue()
+
+
+def test_tracks_in_rerun(sources: dict[str, str], weights: str, tmp_path: Path, capsys):
+    pytest.importorskip("rerun")
+    track(sources["folder"], weights, tmp_path / "out", "--rrd", str(tmp_path / "tracks.rrd"))
+    assert (tmp_path / "tracks.rrd").stat().st_size > 1000
+    assert "open it with: rerun" in capsys.readouterr().out
+
+
+def test_rerun_without_the_extra_is_told_before_the_work(sources: dict[str, str], monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["track", sources["folder"], "--rrd", "x.rrd"]) == 2
+    assert "[viz]" in capsys.readouterr().err

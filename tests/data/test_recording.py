@@ -219,6 +219,8 @@ def test_bad_recordings(folder: Path, how: str):
 def test_missing_paths(tmp_path: Path, folder: Path):
     with pytest.raises(RecordingError, match="no such file or folder"):
         read_recording(tmp_path / "nowhere")
+    with pytest.raises(RecordingError, match=r"did you mean .*recording\?"):
+        read_recording(tmp_path / "recordign")
     with pytest.raises(RecordingError, match="no such folder; expected one 16-bit PNG"):
         read_recording(folder, depth=tmp_path / "nowhere")
     with pytest.raises(RecordingError, match="positive number"):

@@ -229,7 +229,7 @@ def test_a_run_skips_what_is_there_and_what_is_impossible(
     assert TakeStore(tmp_path / "takes").names() == ["cabinet-L1-s000000", "cabinet-L1-s000001"]
     assert store.data_hash("cabinet-L1-s000000") == before
     assert program.main([*common, "--objects", "partnet:broken"]) == program.EXIT_ERROR
-    assert "none of the 1 planned takes" in " ".join(capsys.readouterr().err.split())
+    assert "no planned take can be made (1 skipped)" in " ".join(capsys.readouterr().err.split())
 
 
 @pytest.mark.render

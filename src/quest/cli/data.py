@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
+from quest.wording import counted
+
 if TYPE_CHECKING:
     import numpy as np
 
@@ -97,7 +99,7 @@ class DataShow:
         where = str(store.root.resolve()) if store.is_folder else self.takes
         name = where.rstrip("/\\").replace("\\", "/").rpartition("/")[2] or "takes"
         sheet = takes_sheet(takes, title=title, columns=self.columns)
-        self._write(sheet, self.out or Path(f"{name}.png"), f"{len(takes)} takes")
+        self._write(sheet, self.out or Path(f"{name}.png"), counted(len(takes), "take"))
         return 0
 
     @staticmethod
@@ -110,13 +112,13 @@ class DataShow:
 
 @dataclass(frozen=True)
 class DataLs:
-    """List the takes of a store, and what is wrong with those that cannot be read."""
+    """List the takes of a store, and the faults of those that cannot be read."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or URL of takes."""
 
     def run(self) -> int:
-        """Print a table; returns 1 if a take is torn."""
+        """Print a table; returns 1 if a take is corrupt."""
         from rich.console import Console
         from rich.table import Table
 
@@ -141,7 +143,7 @@ class DataLs:
         console = wide_console()
         console.print(table)
         frames = sum(header.frames * len(header.cameras) for header in headers.values())
-        console.print(f"{len(headers)} takes, {frames} frames", style="dim")
+        console.print(f"{counted(len(headers), 'take')}, {counted(frames, 'frame')}", style="dim")
         for problem in problems.values():
             Console(stderr=True, highlight=False, markup=False).print(problem, style="red", soft_wrap=True)
         return 1 if problems else 0

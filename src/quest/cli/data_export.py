@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
+from quest.wording import counted
+
 if TYPE_CHECKING:
     from quest.data.store import TakeStore
     from quest.types import Take
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 class DataExport:
     """Write takes as TAPVid-3D examples, a LeRobot dataset, or MCAP recordings.
 
-    Exit code 1 if takes of the store cannot be read and were left out.
+    Exit code 1 if takes of the store cannot be read and were omitted.
     """
 
     takes: Annotated[str, tyro.conf.Positional]
@@ -27,21 +29,21 @@ class DataExport:
     """Folder to write into: one .npz per view (tapvid3d), one dataset (lerobot), one .mcap per view (mcap)."""
 
     format: Literal["tapvid3d", "lerobot", "mcap"] = "tapvid3d"
-    """What to write."""
+    """Format of the files."""
 
     def run(self) -> int:
-        """Write and say what was written."""
-        from quest.cli.takes import open_takes, say_left_out, say_torn
+        """Write, and print the files."""
+        from quest.cli.takes import open_takes, say_corrupt, say_omitted
         from quest.errors import TakeError
 
         store, names = open_takes(self.takes)
         chosen = store.names() if names is None else names
         if not chosen:
             raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
-        torn = 0 if names is not None else say_torn([store])
+        corrupt = 0 if names is not None else say_corrupt([store])
         if self.format == "lerobot":
             self._write_dataset(store, chosen)
-            return 1 if torn else 0
+            return 1 if corrupt else 0
         write = _write_tapvid3d if self.format == "tapvid3d" else _write_mcap
         for name in chosen:
             try:
@@ -49,11 +51,11 @@ class DataExport:
             except TakeError as error:
                 if names is not None:
                     raise
-                torn += say_left_out(str(error))
+                corrupt += say_omitted(str(error))
                 continue
             for path in write(take, self.out):
                 print(path)
-        return 1 if torn else 0
+        return 1 if corrupt else 0
 
     def _write_dataset(self, store: TakeStore, names: list[str]) -> None:
         """One episode per take, with as many places for joints and entities as the take with the most has."""
@@ -67,7 +69,7 @@ class DataExport:
             joints=max(len(info.joints) for info in infos),
             entities=max(sum(entity.label in LABELS for entity in info.entities) for info in infos),
         )
-        print(f"{self.out}: {episodes} episodes")
+        print(f"{self.out}: {counted(episodes, 'episode')}")
 
 
 def _write_tapvid3d(take: Take, folder: Path) -> list[Path]:

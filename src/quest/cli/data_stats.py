@@ -1,4 +1,4 @@
-"""``quest data stats``: what is in a store."""
+"""``quest data stats``: the content of a store, in numbers."""
 
 from __future__ import annotations
 
@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import tyro
 
+from quest.cli.progress import counting
+from quest.wording import counted
+
 if TYPE_CHECKING:
     from quest.data.stats import Spread, StoreStats
 
 
 @dataclass(frozen=True)
 class DataStats:
-    """Count what is in a store, how much of it is seen, how far things move, what depth is missing."""
+    """Count the takes of a store, the share that is visible, the motion, and the missing depth."""
 
     store: Annotated[str, tyro.conf.Positional]
     """Folder or URL of takes."""
@@ -27,21 +30,15 @@ class DataStats:
     def run(self) -> int:
         """Print a table; returns 0."""
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
         from rich.table import Table
 
-        from quest.cli.takes import open_takes, wide_console
+        from quest.cli.takes import open_store, wide_console
         from quest.data.stats import store_stats
-        from quest.errors import TakeError
         from quest.evaluation.report import write_report
 
-        store, names = open_takes(self.store)
-        if names is not None:
-            raise TakeError(f"stats: expected a store, and {self.store} is one take; give the folder that it is in")
-        columns = (TextColumn("reading"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-            task = progress.add_task("")
-            found = store_stats(store, report=lambda done, of: progress.update(task, completed=done, total=of))
+        store = open_store(self.store)
+        with counting(Console(stderr=True), "reading", None, "takes") as report:
+            found = store_stats(store, report=report)
         if self.json is not None:
             write_report(finite(asdict(found)), self.json)
         table = Table(box=None, show_header=False)
@@ -55,8 +52,11 @@ class DataStats:
 
 def _rows(found: StoreStats) -> Iterator[tuple[str, str]]:
     unreadable = f"; {found.unreadable} cannot be read" if found.unreadable else ""
-    yield "takes", f"{found.takes} of {found.objects} objects{unreadable}"
-    yield "frames", f"{found.frames} in {found.views} views, {found.hours:.2f} hours, pixels: {_counts(found.image_px)}"
+    yield "takes", f"{found.takes} of {counted(found.objects, 'object')}{unreadable}"
+    yield (
+        "frames",
+        f"{found.frames} in {counted(found.views, 'view')}, {found.hours:.2f} hours, pixels: {_counts(found.image_px)}",
+    )
     yield "on disk", f"{found.stored_bytes / 1e9:.3f} GB"
     for name in ("sources", "categories", "levels", "suites"):
         yield name, _counts(getattr(found, name))

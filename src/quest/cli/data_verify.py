@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from quest.cli.data_stats import finite
+from quest.cli.progress import counting
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.data.store import TakeStore
@@ -29,7 +32,6 @@ class DataVerify:
     def run(self) -> int:
         """Print a table of the worst of each check; returns 1 if a take fails."""
         from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
         from quest.cli.takes import open_takes
         from quest.data.verify import TakeReport, verify_store
@@ -40,16 +42,15 @@ class DataVerify:
         if not chosen:
             raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
         errors = Console(stderr=True, highlight=False, markup=False)
-        columns = (TextColumn("verifying"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=errors, transient=True) as progress:
-            task = progress.add_task("", total=len(chosen))
+        with counting(errors, "verifying", len(chosen), "takes") as report:
+            done = itertools.count(1)
 
-            def told(report: TakeReport) -> None:
-                if not report.passed:
-                    progress.console.print(report.message(), style="red", soft_wrap=True)
-                progress.advance(task)
+            def checked(take: TakeReport) -> None:
+                if not take.passed:
+                    errors.print(take.message(), style="red", soft_wrap=True)
+                report(next(done))
 
-            found = verify_store(store, chosen, report=told)
+            found = verify_store(store, chosen, report=checked)
         if self.json is not None:
             _write(found, store, self.json)
         _print(found)
@@ -78,7 +79,8 @@ def _print(found: StoreReport) -> None:
         console.print(table)
     frames = sum(report.frames * report.views for report in found.takes)
     console.print(
-        f"{len(found.takes) - len(found.failed)} of {len(found.takes)} takes pass, {frames} frames",
+        f"{len(found.takes) - len(found.failed)} of {counted(len(found.takes), 'take')} pass, "
+        f"{counted(frames, 'frame')}",
         style="green" if found.passed else "bold red",
     )
 

@@ -1,15 +1,16 @@
-"""``quest doctor``: what this machine can do, and what to install for the rest."""
+"""``quest doctor``: the abilities of this machine, and the packages to install for the rest."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import platform
 import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -19,6 +20,7 @@ from rich.table import Table
 
 from quest.errors import QuestError
 from quest.extras import EXTRA_OF, explain_missing, install_command, is_installed
+from quest.wording import counted
 
 Status = Literal["ok", "optional", "broken"]
 
@@ -29,27 +31,26 @@ MIN_FREE_GB = 1.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the table.
-
-    Attributes:
-        part: what was looked at.
-        status: ``broken`` only if the base install cannot track without it.
-        found: what there is.
-        remedy: what to do about it, if anything.
-    """
+    """One line of the table."""
 
     part: str
+    """The part of the machine or of the installation."""
     status: Status
+    """``broken`` only if the base install cannot track without it."""
     found: str
+    """What there is, in words."""
     remedy: str = ""
+    """What to do about it, if anything."""
 
 
 @dataclass(frozen=True)
 class Doctor:
-    """Print what this machine can do: renderer, torch and devices, weights, optional parts."""
+    """Print what this machine can do: torch and devices, video, weights, renderer, optional parts."""
 
     render: bool = False
     """Render a few frames as well (takes up to half a minute without a GPU)."""
+    json: bool = False
+    """Print JSON instead: a list of parts, each with status, finding and remedy."""
 
     def run(self) -> int:
         """Print the table; 0 if a recorded clip can be tracked here, else 1."""
@@ -66,6 +67,10 @@ class Doctor:
             _disk,
         ]
         findings = [finding for check in checks for finding in check()]
+        broken = [finding.part for finding in findings if finding.status == "broken"]
+        if self.json:
+            print(json.dumps([asdict(finding) for finding in findings], indent=1))
+            return 1 if broken else 0
         table = Table(
             "", "part", "found", title="What this machine can do", title_justify="left", box=None, pad_edge=False
         )
@@ -79,7 +84,6 @@ class Doctor:
                     f"\n{SIGNS[finding.status]} {escape(finding.part)}: {escape(finding.remedy)}", soft_wrap=True
                 )
         console.print()
-        broken = [finding.part for finding in findings if finding.status == "broken"]
         if broken:
             console.print(f"[bold red]cannot track recordings here[/]: {', '.join(broken)}")
             return 1
@@ -193,7 +197,9 @@ def _test_render() -> Iterator[Finding]:
         return
     seconds = time.monotonic() - start_s
     contrast = int(take.views[0].clip.rgb.std())
-    yield Finding("render test", "ok", f"{len(take)} frames in {seconds:.0f} s with shaders, contrast {contrast}")
+    yield Finding(
+        "render test", "ok", f"{counted(len(take), 'frame')} in {seconds:.0f} s with shaders, contrast {contrast}"
+    )
 
 
 def _objects() -> Iterator[Finding]:
@@ -203,7 +209,7 @@ def _objects() -> Iterator[Finding]:
         return
     count = sum(1 for _ in Path(named).glob("*/mobility.urdf"))
     if count:
-        yield Finding("objects", "ok", f"{count} object folders in {named}")
+        yield Finding("objects", "ok", f"{counted(count, 'object folder')} in {named}")
     else:
         yield Finding("objects", "optional", f"no object folder in {named}", "correct QUEST_OBJECTS, or unset it")
 

@@ -1,4 +1,4 @@
-"""``quest eval-monitor``: how well the monitor tells lost identities, beside plainer rules."""
+"""``quest eval-monitor``: how well the monitor detects lost identities, beside plainer rules."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,12 +65,11 @@ class EvalMonitor:
         Raises:
             ConfigError: weights without a calibration, objects that they were calibrated on, or bad settings.
             InputError: the calibration streams are missing, of other weights, or not those of the calibration.
-            TakeError: a take cannot be read; those whose description is torn already are named and left out.
+            TakeError: a take cannot be read; those whose description is corrupt are named and omitted.
         """
         from rich.console import Console
 
-        from quest.cli.takes import say_torn
-        from quest.data.store import TakeStore
+        from quest.cli.takes import open_store, say_corrupt
         from quest.errors import ConfigError
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
         from quest.evaluation.selection import Shard, select_takes
@@ -90,8 +91,8 @@ class EvalMonitor:
                 f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
                 f"{self.alpha_frames}"
             )
-        stores = [TakeStore(path) for path in self.takes]
-        say_torn(stores)
+        stores = [open_store(path) for path in self.takes]
+        say_corrupt(stores)
         takes = [(s, select_takes(s.infos(), split=self.split, levels=self.level)) for s in stores]
         recorded = record_streams(
             tracker,
@@ -101,7 +102,7 @@ class EvalMonitor:
             progress=lambda name, done, total: console.print(f"{done + 1}/{total} {name}"),
         )
         if recorded.missing:
-            console.print(f"{recorded.missing} streams are left to other shards; nothing is judged yet")
+            console.print(f"left to other shards: {counted(recorded.missing, 'stream')}; nothing is judged yet")
             return 0
         known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
         unit = tracker.calibration.unit

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CAMERA_MOTIONS, MIXED
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.sim.settings import TakeSettings
@@ -48,11 +49,11 @@ class Generate:
     mix: Literal["usual", "broad"] = "usual"
     """Kinds of procedural objects, and materials of all: the usual furniture and appliances, or everything there is."""
     suite: Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "long"] | None = None
-    """Takes that are hard in one way: a named preset of what follows. docs/simulator.md describes each."""
+    """Takes that are hard in one way: a named preset of the options below. docs/simulator.md describes each."""
     variant: tuple[str, ...] = ()
     """Kinds of a suite, such as blur and bump of shift; default: all of them."""
     hidden: int | None = None
-    """Frames for which a suite's entities are hidden, 10 to 120; default: drawn, and 30 before lockers."""
+    """Frames for which a suite's entities are occluded, 10 to 120; default: drawn, and 30 before lockers."""
     look_alike: bool = False
     """Suite occlusion: entities of the same label stay in view; without it, none is ever in view."""
     level: tuple[int, ...] = ()
@@ -86,7 +87,7 @@ class Generate:
     physics: bool = False
     """Drive the joints through a physics engine: friction, damping, inertia."""
     gripper: bool = False
-    """A gripper comes and pulls what moves."""
+    """A gripper comes and pulls the parts that move."""
     randomize_materials: bool = True
     """Give objects random materials: procedural ones always, others now and then."""
     stretch: float = 1.0
@@ -125,7 +126,8 @@ class Generate:
         console = Console(stderr=True, highlight=False)
         missing = missing_takes(takes, store)
         console.print(
-            f"{len(takes)} takes planned, {len(takes) - len(missing)} there already; store {escape(str(self.out))}"
+            f"{counted(len(takes), 'take')} planned, {len(takes) - len(missing)} there already; "
+            f"store {escape(str(self.out))}"
         )
         if not missing:
             return 0
@@ -138,7 +140,7 @@ class Generate:
                 produce_on_cluster(missing, store, studio, cluster, report=progress)
         skipped = progress.skipped
         if skipped == len(takes):
-            raise ObjectError(f"generate: none of the {skipped} planned takes can be made, for the reasons above")
+            raise ObjectError(f"generate: no planned take can be made ({skipped} skipped), for the reasons above")
         return 0
 
     def command_line(self) -> str:
@@ -155,7 +157,7 @@ class Generate:
         return shlex.join(words)
 
     def _suites(self) -> tuple[Suite, ...]:
-        """The suites that the arguments name, with what the arguments change about them; none for ordinary takes."""
+        """The suites that the arguments name, with the changes of the arguments; none for ordinary takes."""
         from quest.sim.suites import find_suites
 
         if self.suite is None:
@@ -164,11 +166,11 @@ class Generate:
             return ()
         suites = [s.hidden_for(self.hidden, look_alike=self.look_alike) for s in find_suites(self.suite, self.variant)]
         if suites[0].hiding is not None and self.frames_per_joint is not None:
-            raise ConfigError(f"generate: suite {self.suite} has a script of its own; leave --frames-per-joint away")
+            raise ConfigError(f"generate: suite {self.suite} has a script of its own; omit --frames-per-joint")
         return tuple(dataclasses.replace(suite, settings=self._settings(suite.settings)) for suite in suites)
 
     def _settings(self, preset: TakeSettings) -> TakeSettings:
-        """A preset with what the arguments say."""
+        """A preset with the changes of the arguments."""
         from quest.sim.sensor import SENSORS
 
         given = {
@@ -224,11 +226,13 @@ class Generate:
                 if not low <= first <= last <= high:
                     raise ConfigError(
                         f"generate: --seeds {self.seeds} are not {self.split} seeds, which are {low}..{high}; name "
-                        "such, or leave --split away"
+                        "such, or omit --split"
                     )
             count = self.procedural or last - first + 1
             if count > last - first + 1:
-                raise ConfigError(f"generate: {count} procedural objects do not fit into seeds {first}..{last}")
+                raise ConfigError(
+                    f"generate: {counted(count, 'procedural object')} do not fit into seeds {first}..{last}"
+                )
             chosen += procedural_objects(count, first, category, mix=self.mix)
         if not chosen:
             raise ConfigError("generate: no objects; pass --objects, --split or --procedural")

@@ -1,4 +1,4 @@
-"""The bar that ``quest generate`` shows, and what it says beside it."""
+"""The bar of ``quest generate``, and the lines beside it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from quest.wording import counted
+
 if TYPE_CHECKING:
     from types import TracebackType
 
@@ -16,7 +18,7 @@ if TYPE_CHECKING:
 
 
 _LEAST_S = 5.0
-"""Less tells nothing of the speed: takes are written while the next ones are rendered, so two may end together."""
+"""Less says nothing of the speed: takes are written while the next ones are rendered, so two may end together."""
 
 
 class GenerateProgress:
@@ -50,13 +52,12 @@ class GenerateProgress:
         self._bar.stop()
         if self.made or self.skipped:
             speed = f" at {self._speed()}" if self._speed() else ""
+            made = f"{counted(self.made, 'take')} written{speed}, {self.skipped} skipped"
             # To the log as one line, whatever the width of the terminal.
-            self._console.print(
-                f"{self.made} takes written{speed}, {self.skipped} skipped; store {escape(self._store)}", soft_wrap=True
-            )
+            self._console.print(f"{made}; store {escape(self._store)}", soft_wrap=True)
 
     def __call__(self, event: Event) -> None:
-        """Take in what happened."""
+        """Show an event."""
         from quest.sim.production import Notice, TakeMade
 
         if isinstance(event, Notice):

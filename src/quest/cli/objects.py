@@ -1,4 +1,4 @@
-"""``quest objects``: which objects there are, and what they look like with their entities."""
+"""``quest objects``: which objects there are, and how they look with their entities."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ from typing import TYPE_CHECKING, Annotated
 import tyro
 
 from quest.errors import ConfigError, ObjectError
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.sim.objects import SimObject
     from quest.sim.plan import ObjectShelf
 
 
+_LINE = "{:<22} {:<18} {:>6}  {:<20}  {}"
+
+
 @dataclass(frozen=True)
 class ObjectsList:
-    """List objects with their joints, entities and sizes, and what is wrong with those that cannot be used."""
+    """List objects with their joints, entities and sizes, and the faults of those that cannot be used."""
 
     objects_root: Path | None = None
     """Folder of object folders; QUEST_OBJECTS by default."""
@@ -28,33 +32,24 @@ class ObjectsList:
     """List the procedural categories instead, by one object of each."""
 
     def run(self) -> int:
-        """Print a table; returns 1 if an object cannot be used."""
+        """Print a line for each object as it is read; returns 1 if an object cannot be used."""
         from rich.console import Console
-        from rich.table import Table
 
-        from quest.cli.takes import wide_console
         from quest.viz.object_sheet import entity_words, size_words
 
-        table = Table(box=None)
-        for title in ("object", "category", "joints", "size, m"):
-            table.add_column(title, no_wrap=True, justify="right" if title == "joints" else "left")
-        table.add_column("entities", overflow="fold")
-        problems: list[str] = []
-        warnings: list[str] = []
-        found = _every_category() if self.procedural else _every_folder(self.objects_root)
-        for thing in found:
+        out, errors = (Console(stderr=e, highlight=False, markup=False, soft_wrap=True) for e in (False, True))
+        out.print(_LINE.format("object", "category", "joints", "size, m", "entities"), style="bold")
+        problems = 0
+        for thing in _every_category() if self.procedural else _every_folder(self.objects_root):
             if isinstance(thing, ObjectError):
-                problems.append(str(thing))
+                problems += 1
+                errors.print(str(thing), style="red")
                 continue
-            joints = str(len(thing.articulation.joints))
-            table.add_row(thing.object_id, thing.category, joints, size_words(thing), entity_words(thing))
-            warnings += [f"{thing.object_id}: {warning}" for warning in thing.warnings]
-        wide_console().print(table)
-        print("size: width x depth x height, closed")
-        for warning in warnings:
-            Console(highlight=False, markup=False).print(warning, style="yellow", soft_wrap=True)
-        for problem in problems:
-            Console(stderr=True, highlight=False, markup=False).print(problem, style="red", soft_wrap=True)
+            joints = len(thing.articulation.joints)
+            out.print(_LINE.format(thing.object_id, thing.category, joints, size_words(thing), entity_words(thing)))
+            for warning in thing.warnings:
+                out.print(f"{thing.object_id}: {warning}", style="yellow")
+        out.print("size: width x depth x height, closed")
         return 1 if problems else 0
 
 
@@ -109,7 +104,7 @@ class ObjectsShow:
         columns = self.columns or max(1, round((len(cards) / (2 * self.sides) * 1.6) ** 0.5))
         sheet = object_sheet(cards, columns=columns)
         write_picture(sheet, self.out)
-        print(f"{self.out}: {sheet.shape[1]} x {sheet.shape[0]} px, {len(cards)} objects")
+        print(f"{self.out}: {sheet.shape[1]} x {sheet.shape[0]} px, {counted(len(cards), 'object')}")
         return 0
 
     def _named(self, name: str, shelf: ObjectShelf) -> list[SimObject]:

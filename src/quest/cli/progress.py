@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -12,33 +13,37 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 _LINE_EVERY_S = 10.0
 
 
+class Report(Protocol):
+    """To be called with the number that is done, and with that of all where it was not known before."""
+
+    def __call__(self, done: int, total: int | None = None, /) -> None:
+        """Show it."""
+
+
 @contextmanager
-def counting(console: Console, doing: str, total: int | None, noun: str = "frames") -> Iterator[Callable[[int], None]]:
+def counting(console: Console, doing: str, total: int | None, noun: str = "frames") -> Iterator[Report]:
     """Shows how many of something are done, and the time left.
 
     Args:
         console: where to show it.
-        doing: what is done, such as ``tracking``.
-        total: how many there are; None if only the end tells.
-        noun: what they are.
-
-    Yields:
-        To be called with the number that is done.
+        doing: the work, such as ``tracking``.
+        total: how many there are; None if that is not known yet.
+        noun: the things that are counted.
     """
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(f"{noun},"))
         with Progress(*columns, TimeRemainingColumn(), TextColumn("left"), console=console, transient=True) as progress:
             task = progress.add_task(doing, total=total)
-            yield lambda done: progress.update(task, completed=done)
+            yield lambda done, of=None, /: progress.update(task, completed=done, total=of or total)
         return
     begun_s = said_s = time.monotonic()
 
-    def line(done: int) -> None:
+    def line(done: int, of: int | None = None, /) -> None:
         nonlocal said_s
-        now_s = time.monotonic()
-        if now_s - said_s >= _LINE_EVERY_S and done != total:
+        now_s, of = time.monotonic(), of or total
+        if now_s - said_s >= _LINE_EVERY_S and done != of:
             said_s = now_s
-            left = "" if total is None else f", {(now_s - begun_s) / done * (total - done):.0f} s left"
-            console.print(f"{doing}: {done} {'' if total is None else f'of {total} '}{noun}{left}", soft_wrap=True)
+            left = "" if of is None else f", {(now_s - begun_s) / done * (of - done):.0f} s left"
+            console.print(f"{doing}: {done} {'' if of is None else f'of {of} '}{noun}{left}", soft_wrap=True)
 
     yield line

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 class Source:
     """The recording, the queries, and the weights."""
 
-    clip: tyro.conf.Positional[str]
+    clip: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """A video, a folder of images, a recording folder, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take
     (STORE/NAME.zarr), or the word sample for the clip that ships."""
     weights: str = "quest-s16"

@@ -1,4 +1,4 @@
-"""What commands that look at takes and objects share: a store or one of its takes, tables, pictures."""
+"""Shared by commands that look at takes and objects: a store or one of its takes, tables, pictures."""
 
 from __future__ import annotations
 
@@ -55,16 +55,16 @@ def write_picture(sheet: np.ndarray, out: Path) -> None:
         raise ConfigError(f"{out}: {size} are too many for {out.suffix} ({error}); use .png, or draw less") from error
 
 
-def say_torn(stores: Iterable[TakeStore]) -> int:
-    """Print on standard error what is wrong with takes that cannot be read and are left out; tells how many."""
-    return sum(say_left_out(problem) for store in stores for problem in store.problems().values())
+def say_corrupt(stores: Iterable[TakeStore]) -> int:
+    """Print on standard error why takes cannot be read and are omitted; returns how many."""
+    return sum(say_omitted(problem) for store in stores for problem in store.problems().values())
 
 
-def say_left_out(problem: str) -> int:
-    """Print on standard error what is wrong with one take; tells that it is one."""
+def say_omitted(problem: str) -> int:
+    """Print on standard error why one take is omitted; returns 1, the number of takes."""
     from rich.console import Console
 
-    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"left out: {problem}")
+    Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"omitted: {problem}")
     return 1
 
 
@@ -77,22 +77,43 @@ def open_takes(where: str) -> tuple[TakeStore, list[str] | None]:
     Raises:
         TakeError: there is no such store.
     """
+    from quest.data.store import locate_take
+
+    if not _is_take(where):
+        return open_store(where), None
+    store, name = locate_take(where)
+    return store, [name]
+
+
+def open_store(where: str) -> TakeStore:
+    """A store of takes.
+
+    Args:
+        where: its folder or URL.
+
+    Raises:
+        TakeError: there is no such store, or a take is named.
+    """
     from quest.data.store import TakeStore, locate_take
     from quest.errors import TakeError
 
-    if where.rstrip("/\\").endswith(".zarr"):
+    if _is_take(where):
         store, name = locate_take(where)
-        return store, [name]
+        raise TakeError(f"store {where}: expected a store, and this is one take, {name}; name its store, {store.url}")
     store = TakeStore(where)
     if not store.exists():
-        raise TakeError(f"store {where}: no such folder; check the path, or generate takes into it")
-    return store, None
+        raise TakeError(f"store {where}: no such folder; check the path, or make takes with `quest generate`")
+    return store
+
+
+def _is_take(where: str) -> bool:
+    return where.rstrip("/\\").endswith(".zarr")
 
 
 def wide_console() -> Console:
     """For tables: as wide as the terminal; where there is none, wide enough that lines are not broken.
 
-    What stands in brackets is shown as it is: it may be in the name of a take or an object.
+    Brackets are no markup: they may be in the name of a take or an object.
     """
     from rich.console import Console
 

@@ -1,4 +1,4 @@
-"""``quest weights``: list, show, push, merge, make the encoder's first weights, rank pieces, tune, calibrate."""
+"""``quest weights``: list, show, save, push, merge, import the encoder, learn pieces, tune, calibrate."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quest.wording import counted
+
 if TYPE_CHECKING:
     from quest.data.store import TakeStore
     from quest.evaluation.selection import SplitPart
@@ -22,27 +24,36 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ListWeights:
-    """List the weights that come with the package."""
+    """List the weights that come with the package: name, size, licence, file."""
+
+    json: bool = False
+    """Print JSON instead: a list of weights."""
 
     def run(self) -> int:
-        """Print name, size, licence and file of each."""
+        """Print a line of each."""
         from quest.model.tensor_file import read_tensors
         from quest.model.weights import shipped_weights
 
-        console = Console(highlight=False)
+        found = []
         for name, path in shipped_weights().items():
-            if name != path.stem:
-                console.print(f"{name}  stands for {path.stem}")
-                continue
-            metadata, _ = read_tensors(path, ())
-            size, licence = f"{path.stat().st_size / 1e6:.1f} MB", metadata.get("licence", "not said")
-            console.print(f"{name}  {size}  {escape(licence)}  {escape(str(path))}", soft_wrap=True)
+            licence = read_tensors(path, ())[0].get("licence")
+            found.append({"name": name, "stands_for": None if name == path.stem else path.stem})
+            found[-1] |= {"bytes": path.stat().st_size, "licence": licence, "file": str(path)}
+        if self.json:
+            print(json.dumps(found, indent=1))
+            return 0
+        console = Console(highlight=False, soft_wrap=True)
+        for weights in found:
+            licence = weights["licence"] or "licence not stated"
+            line = f"{weights['bytes'] / 1e6:.1f} MB  {licence}  {weights['file']}"
+            known_as = weights["stands_for"]
+            console.print(escape(f"{weights['name']}  " + (line if known_as is None else f"stands for {known_as}")))
         return 0
 
 
 @dataclass(frozen=True)
 class ShowWeights:
-    """Print what a file of weights holds: network, training, tracker settings, monitor, licence, hash."""
+    """Print the content of a file of weights: network, training, tracker settings, monitor, licence, hash."""
 
     weights: tyro.conf.Positional[str]
     """Shipped name, file, folder, or owner/name on the Hugging Face hub (fetched if the cache has no copy)."""
@@ -67,9 +78,9 @@ class SaveWeights:
     out: tyro.conf.Positional[Path]
     """Folder to write; a README.md that is there stays."""
     licence: str | None = None
-    """Licence to write into the file, such as Apache-2.0; default: what the file says."""
+    """Licence to write into the file, such as Apache-2.0; default: that of the file."""
     version: str | None = None
-    """Version to write into the file; default: what the file says."""
+    """Version to write into the file; default: that of the file."""
 
     def run(self) -> int:
         """Write the folder."""
@@ -91,9 +102,9 @@ class PushWeights:
     branch: str | None = None
     """Branch to push to; default: main."""
     licence: str | None = None
-    """Licence to write into the file, such as Apache-2.0; default: what the file says."""
+    """Licence to write into the file, such as Apache-2.0; default: that of the file."""
     version: str | None = None
-    """Version to write into the file; default: what the file says."""
+    """Version to write into the file; default: that of the file."""
 
     def run(self) -> int:
         """Push, and say how to load."""
@@ -108,10 +119,10 @@ class PushWeights:
 
 @dataclass(frozen=True)
 class MergeWeights:
-    """Put together what was trained apart: what follows entities, the affordance map, the flow head."""
+    """Merge parts that were trained apart: tracking, the affordance map, the flow head."""
 
     weights: tyro.conf.Positional[str]
-    """Shipped name, file or folder: what follows entities, with its settings and monitor."""
+    """Shipped name, file or folder: the part that tracks, with its settings and monitor."""
     out: tyro.conf.Positional[Path]
     """File to write."""
     map: tuple[str, ...] = ()
@@ -123,7 +134,7 @@ class MergeWeights:
         """Write the file.
 
         Raises:
-            WeightsError: weights cannot be loaded, or differ in what a map or flow head rests on.
+            WeightsError: weights cannot be loaded, or differ below the map or flow head.
         """
         from quest.model.merge import merge
         from quest.model.weights import load_network
@@ -173,7 +184,7 @@ class TuneWeights:
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
-        from quest.data.store import TakeStore
+        from quest.cli.takes import open_store
         from quest.evaluation.stream_record import tracker_id
         from quest.evaluation.tuning import tune
         from quest.model.weights import load_network
@@ -181,7 +192,7 @@ class TuneWeights:
 
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
-        stores = [TakeStore(url) for url in self.takes]
+        stores = [open_store(url) for url in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level, objects=self.objects)) for store in stores]
         tracker = load(self.weights, monitor=False)
         tuned = tune(
@@ -216,9 +227,8 @@ class PiecesWeights:
     """Seed of the first weights."""
 
     def run(self) -> int:
-        """Learn, print what from, rewrite the file."""
-        from quest.cli.takes import say_torn
-        from quest.data.store import TakeStore
+        """Learn, print from how much, rewrite the file."""
+        from quest.cli.takes import open_store, say_corrupt
         from quest.evaluation.piece_learning import learn_pieces
         from quest.evaluation.selection import select_takes
         from quest.model.weights import load_network
@@ -226,8 +236,8 @@ class PiecesWeights:
 
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
-        stores = [TakeStore(url) for url in self.takes]
-        say_torn(stores)
+        stores = [open_store(url) for url in self.takes]
+        say_corrupt(stores)
         takes = [(store, select_takes(store.infos(), split=("train", "unlisted"))) for store in stores]
         learned = learn_pieces(
             load(self.weights, monitor=False),
@@ -236,8 +246,8 @@ class PiecesWeights:
             progress=lambda name, done, total: console.print(f"{done + 1}/{total} {escape(name)}"),
         )
         console.print(
-            f"learned from {learned.pieces} pieces, {learned.right} of them handles or knobs, "
-            f"and {learned.peaks} peaks of the map; loss {learned.loss:.3f}"
+            f"learned from {counted(learned.pieces, 'piece')}, {learned.right} of them handles or knobs, "
+            f"and {counted(learned.peaks, 'peak')} of the map; loss {learned.loss:.3f}"
         )
         replace(load_network(self.weights), network=learned.network).save(self.weights)
         return 0
@@ -265,11 +275,11 @@ class CalibrateWeights:
     block_frames: int | None = None
     """Length of the streams that thresholds rest on; that of the shortest by default."""
     unit: Literal["object", "take"] = "object"
-    """What the promise is about: other objects, or other takes of these objects (where there are few objects)."""
+    """Subject of the promise: other objects, or other takes of these objects (where there are few objects)."""
 
     def run(self) -> int:
         """Record, fit, rewrite the file."""
-        from quest.data.store import TakeStore
+        from quest.cli.takes import open_store
         from quest.errors import ConfigError
         from quest.evaluation.calibrate import fit_calibration
         from quest.evaluation.selection import Shard
@@ -281,7 +291,7 @@ class CalibrateWeights:
         if self.block_frames is not None and self.block_frames < 1:
             raise ConfigError(f"calibrate: expected block_frames of at least 1, got {self.block_frames}")
         console = Console(highlight=False)
-        stores = [TakeStore(path) for path in self.takes]
+        stores = [open_store(url) for url in self.takes]
         takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
         recorded = record_streams(
             load(self.weights, monitor=False),
@@ -291,7 +301,7 @@ class CalibrateWeights:
             progress=lambda name, done, total: console.print(f"{done + 1}/{total} {escape(name)}"),
         )
         if recorded.missing:
-            console.print(f"{recorded.missing} streams are left to other shards; nothing is fitted yet")
+            console.print(f"left to other shards: {counted(recorded.missing, 'stream')}; nothing is fitted yet")
             return 0
         fitted = fit_calibration(recorded.records, block_frames=self.block_frames, unit=self.unit)
         monitor = fitted.calibration.to_json()
@@ -308,12 +318,12 @@ def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedN
     """A network with another licence or version, where they are given."""
     from quest.model.weights import load_network
 
-    told = {"licence": licence, "version": version}
-    return replace(load_network(weights), **{key: value for key, value in told.items() if value is not None})
+    given = {"licence": licence, "version": version}
+    return replace(load_network(weights), **{key: value for key, value in given.items() if value is not None})
 
 
 def _facts(loaded: LoadedNetwork) -> dict[str, str]:
-    """What a file of weights holds, by name, for people."""
+    """The content of a file of weights by name, for people."""
     config = asdict(loaded.network.config)
     encoder, preset = config.pop("encoder"), config.pop("preset")
     count = sum(p.numel() for p in loaded.network.parameters())
@@ -322,8 +332,8 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
         "name": loaded.name,
         "file": f"{loaded.path} ({loaded.path.stat().st_size / 1e6:.1f} MB)",
         "sha256": loaded.sha256,
-        "version": loaded.version or "not said",
-        "licence": loaded.licence or "not said (see the model card)",
+        "version": loaded.version or "not stated",
+        "licence": loaded.licence or "not stated (see the model card)",
         "about": loaded.about,
         "parameters": f"{count / 1e6:.1f} million, {trained / 1e6:.1f} of them outside the encoder",
         "network": f"preset {preset}: {_pairs(config)}",
@@ -334,7 +344,7 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
 
 
 def _must_be_a_file(weights: Path) -> None:
-    """Told before the work: what is found is written into the file itself."""
+    """Raise ConfigError, and that before the work, unless the result can be written into the file itself."""
     from quest.errors import ConfigError
 
     if not weights.is_file():
@@ -356,7 +366,7 @@ def _monitor(calibration: str | None) -> str:
     try:
         monitor = Calibration.from_json(calibration)
     except WeightsError as error:
-        return str(error)  # everything else that the file holds is of use still
+        return str(error)  # the rest of the file is of use still
     if monitor.revision != REVISION:
         return (
             f"of no use: calibrated on a tracker of revision {monitor.revision}, this is {REVISION}; "
@@ -371,9 +381,9 @@ def _pairs(values: Mapping[str, Any]) -> str:
 
 def _to_choose_by(store: TakeStore, *, levels: tuple[int, ...], objects: tuple[str, ...] = ()) -> dict[str, SplitPart]:
     """Takes of validation objects, and of objects in no part of the split, which count as such here."""
-    from quest.cli.takes import say_torn
+    from quest.cli.takes import say_corrupt
     from quest.evaluation.selection import select_takes
 
-    say_torn([store])
+    say_corrupt([store])
     chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
     return dict.fromkeys(chosen, "validation")

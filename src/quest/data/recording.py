@@ -6,6 +6,7 @@ PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The other forms 
 
 from __future__ import annotations
 
+import difflib
 import os
 import shutil
 import uuid
@@ -91,7 +92,7 @@ def open_recording(
     reader = next((reader for reader in known if reader.accepts(where)), None)
     if reader is None:
         if not Path(where).exists():
-            raise RecordingError(f"recording {where}: no such file or folder; check the path")
+            raise RecordingError(f"recording {where}: no such file or folder; {_near(Path(where))}")
         kinds = "; ".join(f"{reader.kind} ({reader.form})" for reader in known)
         what = "an empty folder" if not any(Path(where).iterdir()) else "a folder with nothing of these in it"
         raise RecordingError(f"recording {where}: this is {what}; expected {kinds}")
@@ -116,6 +117,13 @@ def read_recording(
     return open_recording(
         path, depth=depth, camera=camera, depth_scale_m=depth_scale_m, fov_deg=fov_deg, parts=parts
     ).clip()
+
+
+def _near(path: Path) -> str:
+    """Advice for a path that leads nowhere."""
+    there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
+    close = difflib.get_close_matches(path.name, there, n=1)
+    return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
 def _checked_scale(where: str, depth_scale_m: float | int | None) -> float | None:

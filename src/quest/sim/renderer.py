@@ -10,6 +10,7 @@ about twenty seconds in software.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +19,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from quest.errors import RendererError
 from quest.extras import require
-from quest.render_device import REMEDY, prepare_renderer
+from quest.render_device import REMEDY, prepare_renderer, without_known_warnings
 from quest.sim.articulation import Part
 from quest.sim.cameras import PosedCamera
 from quest.sim.objects import SimObject
@@ -77,7 +78,8 @@ class Renderer:
                 :meth:`Stage.dress`, which is enough for depth and labels.
         """
         try:
-            self._latest = Stage(self._sapien, sim_object, cameras)
+            with nullcontext() if self._latest is not None else without_known_warnings():
+                self._latest = Stage(self._sapien, sim_object, cameras)
             if dress is not None:
                 self._latest.dress(dress)
             return self._latest
