@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quest.data.object_store import ObjectPrefix
 from quest.data.store import TakeStore, locate_take, open_clip
-from quest.data.store_location import StoreError
+from quest.data.store_location import ObjectPrefix, StoreError
 from quest.errors import ConfigError, TakeError
 from quest.types import Take
 from tests.data.test_store import assert_equal

@@ -14,8 +14,7 @@ from huggingface_hub import ModelCard, constants
 import quest
 from quest.cli.main import main
 from quest.errors import WeightsError
-from quest.model.hub import FILE, HubId, download
-from quest.model.model_card import model_card
+from quest.model.hub import FILE, HubId, download, model_card
 from quest.model.weights import LoadedNetwork, load_network, save_network
 from tests.model.hub_server import COMMIT, FakeHub
 from tests.monitor.calibrations import watching

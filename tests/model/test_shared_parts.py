@@ -13,7 +13,7 @@ from safetensors.torch import load_file, save_file
 from quest.errors import WeightsError
 from quest.model import weights
 from quest.model.network import QuestNetwork
-from quest.model.shared_parts import SHARED
+from quest.model.tensor_file import SHARED
 from quest.model.weights import load_network, save_network
 from tests.tiny import make_network
 

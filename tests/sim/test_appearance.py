@@ -5,9 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quest.sim.appearance import CAMERA_AZIMUTH_DEG, Region, sample_appearance
-from quest.sim.dressing import apply_appearance, choose_surface, distractor_place
-from quest.sim.textures import TEXTURE_KINDS, Texture, paint
+from quest.sim.appearance import (
+    CAMERA_AZIMUTH_DEG,
+    Region,
+    apply_appearance,
+    choose_surface,
+    distractor_place,
+    sample_appearance,
+)
+from quest.sim.surfaces import TEXTURE_KINDS, Texture, paint
 
 seeds = st.integers(0, 2**31 - 1)
 

@@ -7,8 +7,20 @@ from hypothesis import strategies as st
 
 from quest.errors import ConfigError, InputError
 from quest.sim.annotate import project_points
-from quest.sim.camera_paths import displaced, fixations, hand_shake, jolt, look, there_and_back
-from quest.sim.cameras import CAMERA_MOTIONS, CameraPath, CameraStyle, bump, sample_camera_paths, sample_cameras
+from quest.sim.cameras import (
+    CAMERA_MOTIONS,
+    CameraPath,
+    CameraStyle,
+    bump,
+    displaced,
+    fixations,
+    hand_shake,
+    jolt,
+    look,
+    sample_camera_paths,
+    sample_cameras,
+    there_and_back,
+)
 from quest.sim.motion import FRAMES_PER_S
 from quest.types import Camera
 from tests.sim.test_cameras import cloud

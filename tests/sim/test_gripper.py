@@ -9,9 +9,18 @@ import pytest
 from quest.errors import ConfigError, ObjectError
 from quest.sim.articulation import apply
 from quest.sim.cameras import sample_cameras
-from quest.sim.grasp import ObjectSamples, find_grasp, gripper_scale
-from quest.sim.gripper import Gripper, plan_gripper
-from quest.sim.gripper_shape import GRIPPER_PARTS, LENGTH_M, OPENING_M, Boxes, sample_gripper_surfaces
+from quest.sim.gripper import (
+    GRIPPER_PARTS,
+    LENGTH_M,
+    OPENING_M,
+    Boxes,
+    Gripper,
+    ObjectSamples,
+    find_grasp,
+    gripper_scale,
+    plan_gripper,
+    sample_gripper_surfaces,
+)
 from quest.sim.motion import HOLD_FRAMES, MotionStyle, motion_script
 from quest.sim.objects import SimObject, load_object
 from quest.sim.props import Prop

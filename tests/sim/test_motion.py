@@ -11,14 +11,17 @@ from quest.errors import ConfigError
 from quest.sim.articulation import MAX_TURN_RAD
 from quest.sim.motion import (
     HOLD_FRAMES,
+    PROFILES,
     MotionStyle,
+    ProfileKind,
+    draw_profile,
     joint_profile,
     long_script,
     minimum_jerk,
     motion_script,
     share_plan,
+    trapezoid,
 )
-from quest.sim.profiles import PROFILES, ProfileKind, draw_profile, trapezoid
 from tests.sim.small_objects import articulation
 
 seeds = st.integers(0, 2**31 - 1)

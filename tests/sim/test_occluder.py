@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from quest.sim.articulation import apply
 from quest.sim.cameras import PosedCamera
-from quest.sim.occluder import fit_shape, slide_in
+from quest.sim.props import fit_shape, slide_in
 from quest.types import Camera
 
 POSED = PosedCamera(

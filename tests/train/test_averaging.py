@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from quest.train.averaging import RunningMean
+from quest.train.optimizer import RunningMean
 
 
 def learner(decay: float) -> tuple[nn.Parameter, RunningMean]:

@@ -3,32 +3,271 @@
 Each episode has its own data file and one video per view, which the format allows. Every episode of a dataset has the
 same features, so joints and entities have numbered places: an episode with fewer leaves the last ones empty, and which
 is which stands in the columns ``quest/joints`` and ``quest/entities`` of ``meta/episodes``, intrinsics of each view in
-``quest/camera/VIEW``.
+``quest/camera/VIEW``. Statistics of features, by which policies normalise, are those that LeRobot keeps.
 
-Reference: lerobot 0.6.2, ``lerobot/datasets`` (``utils.py``, ``dataset_metadata.py``, ``compute_stats.py``).
+References: lerobot 0.6.2, ``lerobot/datasets`` (``utils.py``, ``feature_utils.py``, ``dataset_metadata.py``,
+``compute_stats.py``); Chan, Golub and LeVeque 1979 for merging variances.
 """
 
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import uuid
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+from jaxtyping import Float32, Shaped
 
 from quest.data.lerobot import CAMERA_COLUMN, CAMERA_KEY, POSE, STAMP, VERSION, DepthRange
-from quest.data.lerobot_layout import STATE, TRACKS, Episode, Layout, depth_key, image_key
-from quest.data.lerobot_stats import feature_stats, image_stats, merge_stats
-from quest.data.video import write_depth_video, write_video
+from quest.data.video import frame_rate, write_depth_video, write_video
 from quest.depth import clean_depth
 from quest.errors import InputError
-from quest.types import Clip
+from quest.types import Clip, State, Take, Tracks
+
+QUANTILES = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
+
+_FRAMES = 100
+_SIDE = 100
+
+Stats = dict[str, np.ndarray]
+
+
+def feature_stats(values: Shaped[np.ndarray, "T *n"]) -> Stats:
+    """Of a number or a vector per frame; what is not finite is left out, and a place without a value has zeros."""
+    rows = values.reshape(len(values), -1).astype(np.float64)
+    return _stats(rows) | {"count": np.array([len(rows)])}
+
+
+def image_stats(pictures: Shaped[np.ndarray, "T H W *C"], scale: float) -> Stats:
+    """Of up to a hundred pictures, thinned to about a hundred pixels a side, per channel and divided by ``scale``.
+
+    All but the count have the shape (channels, 1, 1).
+    """
+    index = np.unique(np.linspace(0, len(pictures) - 1, min(len(pictures), _FRAMES)).round().astype(int))
+    step = max(1, max(pictures.shape[1:3]) // _SIDE)
+    sample = pictures[index][:, ::step, ::step]
+    channels = sample.shape[3] if sample.ndim == 4 else 1
+    found = _stats(sample.reshape(-1, channels).astype(np.float64) / scale)
+    return {name: value.reshape(channels, 1, 1) for name, value in found.items()} | {"count": np.array([len(index)])}
+
+
+def merge_stats(first: Stats | None, second: Stats) -> Stats:
+    """Of two parts together. Quantiles cannot be merged: the outer of both is kept, which bounds them."""
+    if first is None:
+        return second
+    counts = np.array([first["count"][0], second["count"][0]], dtype=np.float64)
+    share = counts / counts.sum()
+    mean = share[0] * first["mean"] + share[1] * second["mean"]
+    variance = sum(
+        weight * (part["std"] ** 2 + (part["mean"] - mean) ** 2)
+        for weight, part in zip(share, (first, second), strict=True)
+    )
+    merged = {
+        "min": np.minimum(first["min"], second["min"]),
+        "max": np.maximum(first["max"], second["max"]),
+        "mean": mean,
+        "std": np.sqrt(variance),
+        "count": first["count"] + second["count"],
+    }
+    for name, q in QUANTILES.items():
+        merged[name] = (np.minimum if q <= 0.5 else np.maximum)(first[name], second[name])
+    return merged
+
+
+def _stats(rows: np.ndarray) -> Stats:
+    found = {name: np.zeros(rows.shape[1]) for name in ("min", "max", "mean", "std", *QUANTILES)}
+    for column, values in enumerate(rows.T):
+        finite = values[np.isfinite(values)]
+        if finite.size == 0:
+            continue
+        found["min"][column], found["max"][column] = finite.min(), finite.max()
+        found["mean"][column], found["std"][column] = finite.mean(), finite.std()
+        for name, value in zip(QUANTILES, np.quantile(finite, list(QUANTILES.values())), strict=True):
+            found[name][column] = value
+    return found
+
+
+STATE, TRACKS = "observation.state", "observation.tracks"
+
+_VIEW_NAME = re.compile(r"[A-Za-z0-9_]+")
+_COUNTERS = {"frame_index": "int64", "episode_index": "int64", "index": "int64", "task_index": "int64"}
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One episode to write.
+
+    Attributes:
+        views: clips of the same moments, by the name of their camera: letters, digits and underscores.
+        task: what is done, in words.
+        joint_position: radians or metres per frame; None without a state.
+        joint_names: of its columns.
+        tracks: answers or truth per view, all of the same entities; empty without.
+    """
+
+    views: dict[str, Clip]
+    task: str
+    joint_position: Float32[np.ndarray, "T J"] | None = None
+    joint_names: tuple[str, ...] = ()
+    tracks: dict[str, Tracks] = field(default_factory=dict)
+
+    @classmethod
+    def of_take(cls, take: Take, *, task: str | None = None) -> Episode:
+        """A simulated take with its truth: joint positions, and the tracks of its entities but the hinges."""
+        kept = take.tracked
+        names = tuple(take.info.entities[i].name for i in kept)
+        labels = tuple(take.info.entities[i].label for i in kept)
+        tracks = {}
+        for v, view in enumerate(take.views):
+            visible = view.visible[:, kept]
+            tracks[f"view_{v}"] = Tracks(
+                names,
+                labels,
+                view.uv_px[:, kept].astype(np.float32),
+                take.point_world[:, kept].astype(np.float32),
+                np.ones(visible.shape, np.float32),
+                visible,
+                np.full(visible.shape, State.TRACKING.value),
+                take.stamp_s,
+            )
+        return cls(
+            {f"view_{v}": view.clip for v, view in enumerate(take.views)},
+            task or f"open {take.info.category}",
+            take.joint_position.astype(np.float32),
+            tuple(joint.name for joint in take.info.joints),
+            tracks,
+        )
+
+
+@dataclass(frozen=True)
+class Layout:
+    """What all episodes of a dataset share."""
+
+    fps: int
+    sizes: dict[str, tuple[int, int]]
+    cameras: dict[str, dict[str, Any]]
+    deep: frozenset[str]
+    joints: int
+    tracked: frozenset[str]
+    entities: int
+    depth_range: DepthRange
+
+    @classmethod
+    def of(
+        cls, episode: Episode, fps: int | None, joints: int | None, entities: int | None, depth_range: DepthRange
+    ) -> Layout:
+        """The layout that an episode and what was asked for determine.
+
+        Raises:
+            InputError: no views, or a view whose name cannot be one of a feature.
+        """
+        bad = [name for name in episode.views if not _VIEW_NAME.fullmatch(name)]
+        if bad or not episode.views:
+            raise InputError(
+                f"dataset: expected views named by letters, digits and underscores, got {bad or 'no view'}"
+            )
+        first = next(iter(episode.views.values()))
+        own_joints = 0 if episode.joint_position is None else episode.joint_position.shape[1]
+        own_entities = max((len(tracks.names) for tracks in episode.tracks.values()), default=0)
+        return cls(
+            fps=max(1, round(frame_rate(first.stamp_s))) if fps is None else fps,
+            sizes={name: clip.rgb.shape[1:3] for name, clip in episode.views.items()},
+            cameras={name: asdict(clip.camera) for name, clip in episode.views.items()},
+            deep=frozenset(name for name, clip in episode.views.items() if clip.depth_m is not None),
+            joints=own_joints if joints is None else joints,
+            tracked=frozenset(episode.tracks),
+            entities=own_entities if entities is None else entities,
+            depth_range=depth_range,
+        )
+
+    def check(self, episode: Episode, index: int) -> int:
+        """Number of frames of an episode; InputError if it does not fit."""
+        where = f"dataset: episode {index}"
+        lengths = {len(clip) for clip in episode.views.values()} | {len(tracks) for tracks in episode.tracks.values()}
+        lengths |= set() if episode.joint_position is None else {len(episode.joint_position)}
+        if len(lengths) != 1:
+            raise InputError(f"{where}: views, joints and tracks are of {sorted(lengths)} frames, expected one number")
+        sizes = {name: clip.rgb.shape[1:3] for name, clip in episode.views.items()}
+        deep = {name for name, clip in episode.views.items() if clip.depth_m is not None}
+        if sizes != self.sizes or deep != self.deep or set(episode.tracks) != self.tracked:
+            raise InputError(
+                f"{where}: views {sizes}, depth of {sorted(deep)}, tracks of {sorted(episode.tracks)}; expected those "
+                f"of the first episode: {self.sizes}, {sorted(self.deep)}, {sorted(self.tracked)}"
+            )
+        own = 0 if episode.joint_position is None else episode.joint_position.shape[1]
+        seen = max((len(tracks.names) for tracks in episode.tracks.values()), default=0)
+        if own > self.joints or seen > self.entities or (self.joints and episode.joint_position is None):
+            raise InputError(
+                f"{where}: {own} joints and {seen} entities do not fit {self.joints} and {self.entities} places; say "
+                "how many places the dataset needs"
+            )
+        return lengths.pop()
+
+    def features(self) -> dict[str, Any]:
+        """Features of ``meta/info.json``."""
+        found: dict[str, Any] = {}
+        for view, (height, width) in self.sizes.items():
+            names = ["height", "width", "channels"]
+            info = _video_info("h264", height, width, self.fps, 3) | {"is_depth_map": False}
+            info[CAMERA_KEY] = self.cameras[view]
+            found[image_key(view)] = {"dtype": "video", "shape": [height, width, 3], "names": names, "info": info}
+            if view in self.deep:
+                info = _video_info("hevc", height, width, self.fps, 1) | {"is_depth_map": True, "depth_unit": "m"}
+                info |= {f"video.{name}": value for name, value in asdict(self.depth_range).items()}
+                found[depth_key(view)] = {"dtype": "video", "shape": [height, width, 1], "names": names, "info": info}
+        for key, (dtype, names) in self.columns().items():
+            found[key] = {"dtype": dtype, "shape": [max(1, len(names or ()))], "names": names}
+        return found
+
+    def columns(self) -> dict[str, tuple[str, list[str] | None]]:
+        """Element type and names of everything in the data files; None for single numbers."""
+        found: dict[str, tuple[str, list[str] | None]] = {}
+        if self.joints:
+            found[STATE] = ("float32", [f"joint_{j}" for j in range(self.joints)])
+        for view in self.sizes:
+            if view in self.tracked and self.entities:
+                places = [f"entity_{e}" for e in range(self.entities)]
+                for what, axes in (("uv_px", "xy"), ("point_world", "xyz")):
+                    names = [f"{place}.{axis}" for place in places for axis in axes]
+                    found[f"{TRACKS}.{view}.{what}"] = ("float32", names)
+                found[f"{TRACKS}.{view}.visible"] = ("bool", places)
+                found[f"{TRACKS}.{view}.confidence"] = ("float32", places)
+            found[f"{POSE}.{view}"] = ("float64", [f"m{row}{column}" for row in range(4) for column in range(4)])
+        found[STAMP] = ("float64", None)
+        found["timestamp"] = ("float32", None)
+        return found | {name: (dtype, None) for name, dtype in _COUNTERS.items()}
+
+
+def image_key(view: str) -> str:
+    """Feature of a view's colours."""
+    return f"observation.images.{view}"
+
+
+def depth_key(view: str) -> str:
+    """Feature of a view's depth."""
+    return f"observation.images.{view}_depth"
+
+
+def _video_info(codec: str, height: int, width: int, fps: int, channels: int) -> dict[str, Any]:
+    odd = height % 2 or width % 2
+    colour_format = "yuv444p" if odd else "yuv420p"
+    return {
+        "video.height": height,
+        "video.width": width,
+        "video.codec": codec,
+        "video.pix_fmt": colour_format if channels == 3 else "gray12le",
+        "video.fps": fps,
+        "video.channels": channels,
+        "has_audio": False,
+    }
+
 
 __all__ = ["Episode", "export_lerobot"]
 

@@ -6,7 +6,6 @@ files. Writing is atomic: a take is there as a whole or not at all (:mod:`quest.
 
 from __future__ import annotations
 
-import re
 import zlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,12 +13,10 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
-from urllib.request import url2pathname
 
 import numpy as np
 
-from quest.data.store_location import SUFFIX, Draft, LocalFolder, Location, StoreError
+from quest.data.store_location import SUFFIX, Draft, LocalFolder, Location, StoreError, open_location
 from quest.data.take_format import (
     HEADER_FILE,
     TAKE_ARRAYS,
@@ -33,7 +30,7 @@ from quest.data.take_format import (
     parse_header,
     take_arrays,
 )
-from quest.errors import ConfigError, QuestError, TakeError
+from quest.errors import QuestError, TakeError
 from quest.types import Clip, Take, TakeInfo, View
 
 if TYPE_CHECKING:
@@ -289,26 +286,6 @@ def locate_take(path: str | Path) -> tuple[TakeStore, str]:
     if isinstance(path, Path) or "://" not in parent:
         return TakeStore(Path(path).parent), last.removesuffix(SUFFIX)
     return TakeStore(parent), last.removesuffix(SUFFIX)
-
-
-def open_location(root: str | Path) -> Location:
-    """The place that a path or URL names.
-
-    Raises:
-        ConfigError: it is a URL that cannot be used.
-        MissingExtraError: it is in an object store and obstore is not installed.
-    """
-    text = str(root)
-    if re.match(r"[a-z][a-z0-9]+:/([^/]|$)", text):  # not a drive letter
-        raise ConfigError(f"store {text}: a URL needs two slashes, such as s3://bucket/takes; a Path loses one of them")
-    if "://" not in text:
-        return LocalFolder(Path(root))
-    parts = urlsplit(text)
-    if parts.scheme == "file":
-        return LocalFolder(Path(url2pathname(parts.path)))
-    from quest.data.object_store import ObjectPrefix
-
-    return ObjectPrefix(text)
 
 
 def open_clip(path: str | Path, *, view: int = 0, frames: slice | None = None) -> Clip:

@@ -1,24 +1,35 @@
-"""Where takes lie: a folder of the file system, or a prefix of an object store (:mod:`quest.data.object_store`).
+"""Where takes lie: a folder of the file system, or a prefix of an object store.
 
 A location knows nothing of arrays. It lists takes, reads their headers, and receives the files of a new take as a draft
 that becomes a take all at once or not at all.
+
+An object store is S3 and what speaks its protocol, Google Cloud Storage, Azure, or this process's memory. There is no
+rename, so a take's header is its commit: it is put last, and only where there is none. Each writer puts its files under
+a prefix of its own inside the take, so that writers of the same take never mix; the header names the prefix that
+counts, and whoever puts the header removes what others left there.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import socket
 import time
 import uuid
+from collections import deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from quest.data.take_format import HEADER_FILE
-from quest.errors import TakeError
+from quest.errors import ConfigError, TakeError
+from quest.extras import require
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -34,80 +45,29 @@ class StoreError(TakeError):
     """A place for takes that cannot be reached: this says nothing about any take."""
 
 
-@runtime_checkable
-class Draft(Protocol):
-    """A take that is being written; nobody sees it before :meth:`commit`."""
+def open_location(root: str | Path) -> Location:
+    """The place that a path or URL names.
 
-    arrays_at: str
-    """Subgroup that the arrays go to; empty for the group itself."""
-
-    def add(self, path: str, data: bytes | memoryview) -> None:
-        """Write a file; ``path`` is relative to the take."""
-        ...
-
-    def commit(self, header: bytes) -> None:
-        """Write the header, which makes the draft a take.
-
-        Raises:
-            TakeError: the take was written by somebody else meanwhile.
-        """
-        ...
-
-
-@runtime_checkable
-class Location(Protocol):
-    """A place for takes."""
-
-    url: str
-    """What the user called it."""
-    parallel: int
-    """How many headers are best read at the same time."""
-
-    def exists(self) -> bool:
-        """Whether anything is there."""
-        ...
-
-    def names(self) -> list[str]:
-        """Names of everything that looks like a take, whole or not, sorted."""
-        ...
-
-    def describe(self, name: str) -> str:
-        """Path or URL of a take, for messages."""
-        ...
-
-    def is_there(self, name: str) -> bool:
-        """Whether anything of a take is there, whole or not."""
-        ...
-
-    def may_write(self, name: str) -> bool:
-        """Whether a take of that name may be written."""
-        ...
-
-    def header(self, name: str) -> bytes | None:
-        """Content of a take's header; None if it has none."""
-        ...
-
-    def sizes(self, name: str, files: Mapping[str, int]) -> dict[str, int]:
-        """Sizes in bytes of those files that are there, by path relative to the take."""
-        ...
-
-    def zarr_group(self, name: str, arrays_at: str) -> tuple[StoreLike, str]:
-        """Zarr store and path in it of the group that holds a take's arrays."""
-        ...
-
-    def draft(self, name: str) -> AbstractContextManager[Draft]:
-        """A new take; what was not committed at the end is removed."""
-        ...
-
-    def reaching(self) -> AbstractContextManager[None]:
-        """Turns what goes wrong between here and there into a StoreError."""
-        ...
+    Raises:
+        ConfigError: it is a URL that cannot be used.
+        MissingExtraError: it is in an object store and obstore is not installed.
+    """
+    text = str(root)
+    if re.match(r"[a-z][a-z0-9]+:/([^/]|$)", text):  # not a drive letter
+        raise ConfigError(f"store {text}: a URL needs two slashes, such as s3://bucket/takes; a Path loses one of them")
+    if "://" not in text:
+        return LocalFolder(Path(root))
+    parts = urlsplit(text)
+    if parts.scheme == "file":
+        return LocalFolder(Path(url2pathname(parts.path)))
+    return ObjectPrefix(text)
 
 
 class LocalFolder:
     """Takes in a folder: each is made in a hidden folder beside the others, and a rename makes it a take."""
 
     parallel = 1
+    """How many headers are best read at the same time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -162,7 +122,7 @@ class LocalFolder:
         return str(self.path(name)), arrays_at
 
     @contextmanager
-    def draft(self, name: str) -> Iterator[Draft]:
+    def draft(self, name: str) -> Iterator[_LocalDraft]:
         """A new take; what was not committed at the end is removed."""
         self.folder.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(self.folder)
@@ -178,7 +138,10 @@ class LocalFolder:
 
 
 class _LocalDraft:
+    """A take that is being written; nobody sees it before :meth:`commit`."""
+
     arrays_at = ""
+    """Subgroup that the arrays go to; empty for the group itself."""
 
     def __init__(self, name: str, temporary: Path, target: Path) -> None:
         self._name, self._temporary, self._target = name, temporary, target
@@ -248,3 +211,209 @@ def _sync_file(file: Path, flags: int = os.O_RDWR) -> None:
 def _sync_folder(folder: Path) -> None:
     if os.name == "posix":  # folders cannot be opened elsewhere
         _sync_file(folder, os.O_RDONLY)
+
+
+SCHEMES = ("s3", "gs", "az", "memory", "s3a", "adl", "abfs", "abfss")
+
+_PUTS_AT_ONCE = 8
+_memories: dict[str, Any] = {}
+
+
+class ObjectPrefix:
+    """Takes under a URL such as ``s3://bucket/takes``.
+
+    Endpoint, region and credentials come from the environment, by the names that the provider's own tools use
+    (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ``GOOGLE_APPLICATION_CREDENTIALS``, ``AZURE_STORAGE_ACCOUNT_NAME``).
+    ``memory://NAME`` lives as long as the process.
+
+    Args:
+        url: the place.
+
+    Raises:
+        ConfigError: no object store is named like that, or its settings contradict each other.
+        MissingExtraError: obstore is not installed.
+    """
+
+    parallel = 16
+
+    def __init__(self, url: str) -> None:
+        self.url = url.rstrip("/")
+        parts = urlsplit(self.url)
+        if parts.scheme not in SCHEMES or not parts.netloc:
+            raise ConfigError(
+                f"store {url}: expected a folder, file://PATH or {', '.join(SCHEMES[:4])}://BUCKET/PREFIX"
+            )
+        self._obstore = require("obstore")
+        self._committing: set[str] = set()
+        if parts.scheme == "memory":
+            self._store = _memories.setdefault(parts.netloc, require("obstore.store").MemoryStore())
+            self._prefix = parts.path.strip("/")
+        else:
+            self._store, self._prefix = self._open(), ""
+
+    def _open(self) -> Any:
+        plain = os.environ.get("AWS_ENDPOINT_URL", "").startswith("http://")
+        try:
+            return require("obstore.store").from_url(
+                self.url,
+                client_options={"allow_http": True} if plain else None,
+                retry_config={"max_retries": 5, "retry_timeout": timedelta(seconds=60)},
+            )
+        except require("obstore.exceptions").BaseError as error:
+            raise ConfigError(f"store {self.url}: {_brief(error)}; see docs/scale.md for its settings") from error
+
+    @contextmanager
+    def reaching(self) -> Iterator[None]:
+        """Turns what goes wrong between here and there into a StoreError."""
+        try:
+            yield
+        except (require("obstore.exceptions").BaseError, PermissionError) as error:
+            raise StoreError(
+                f"store {self.url}: cannot be reached or used ({_brief(error)}); check the URL, the endpoint and "
+                "the credentials in the environment, and try again"
+            ) from error
+
+    def exists(self) -> bool:
+        """Whether any take is there."""
+        return bool(self.names())
+
+    def names(self) -> list[str]:
+        """Names of everything that looks like a take, whole or not, sorted."""
+        with self.reaching():
+            found = self._obstore.list_with_delimiter(self._store, self._prefix or None)["common_prefixes"]
+        last = (path.rpartition("/")[2] for path in found)
+        return sorted(name.removesuffix(SUFFIX) for name in last if name.endswith(SUFFIX) and name[0] != ".")
+
+    def describe(self, name: str) -> str:
+        """URL of a take."""
+        return f"{self.url}/{name}{SUFFIX}"
+
+    def is_there(self, name: str) -> bool:
+        """Whether any object of a take is there."""
+        with self.reaching():
+            return next(iter(self._obstore.list(self._store, self._key(name), chunk_size=1)), None) is not None
+
+    def may_write(self, name: str) -> bool:
+        """Whether there is no header: without one, whatever is there was left by a killed writer."""
+        return self.header(name) is None
+
+    def header(self, name: str) -> bytes | None:
+        """Content of a take's header; None if it has none."""
+        with self.reaching():
+            try:
+                return bytes(self._obstore.get(self._store, self._key(name, HEADER_FILE)).bytes())
+            except FileNotFoundError:
+                return None
+
+    def sizes(self, name: str, files: Mapping[str, int]) -> dict[str, int]:
+        """Sizes in bytes of all objects of a take, by path relative to it; one request however many there are."""
+        start = len(self._key(name)) + 1
+        return {path[start:]: size for path, size in self._listed(name)}
+
+    def zarr_group(self, name: str, arrays_at: str) -> tuple[StoreLike, str]:
+        """Zarr store and path in it of the group that holds a take's arrays."""
+        from zarr.storage import ObjectStore
+
+        return ObjectStore(self._store, read_only=True), self._key(name, arrays_at)
+
+    @contextmanager
+    def draft(self, name: str) -> Iterator[_ObjectDraft]:
+        """A new take; what was not committed at the end is removed, unless its header may have arrived all the same."""
+        writer = f"written-{uuid.uuid4().hex[:12]}"
+        with self.reaching(), _Upload(self._obstore, self._store) as upload:
+            try:
+                yield _ObjectDraft(self, name, writer, upload)
+            except BaseException:
+                upload.cancel()
+                if writer not in self._committing:
+                    self._remove(name, lambda path: path.startswith(writer))
+                raise
+            finally:
+                self._committing.discard(writer)
+
+    def commit(self, name: str, writer: str, header: bytes) -> None:
+        """Put a take's header and remove what other writers left.
+
+        Raises:
+            TakeError: the take has a header already.
+        """
+        errors = require("obstore.exceptions")
+        key = self._key(name, HEADER_FILE)
+        self._committing.add(writer)
+        try:
+            self._obstore.put(self._store, key, header, mode="create")
+        except errors.AlreadyExistsError as error:
+            if self.header(name) != header:  # else it is ours: the answer to the first attempt was lost on its way
+                self._committing.discard(writer)
+                raise TakeError(
+                    f"take {name!r}: {self.describe(name)} was written by another process meanwhile"
+                ) from error
+        except errors.NotSupportedError:
+            # A store that cannot compare: the last of two writers wins, and neither may remove what the other has put.
+            self._obstore.put(self._store, key, header)
+            return
+        self._remove(name, lambda path: path != HEADER_FILE and not path.startswith(writer))
+
+    def _remove(self, name: str, which: Any) -> None:
+        start = len(self._key(name)) + 1
+        try:
+            keys = [path for path, _ in self._listed(name) if which(path[start:])]
+            if keys:
+                self._obstore.delete(self._store, keys)
+        except (require("obstore.exceptions").BaseError, TakeError, OSError):
+            pass  # rubbish in nobody's way; the take itself is either there or not
+
+    def _listed(self, name: str) -> list[tuple[str, int]]:
+        with self.reaching():
+            pages = self._obstore.list(self._store, self._key(name))
+            return [(found["path"], found["size"]) for page in pages for found in page]
+
+    def _key(self, name: str, path: str = "") -> str:
+        return "/".join(filter(None, (self._prefix, f"{name}{SUFFIX}", path)))
+
+
+class _ObjectDraft:
+    def __init__(self, place: ObjectPrefix, name: str, writer: str, upload: _Upload) -> None:
+        self._place, self._name, self.arrays_at, self._upload = place, name, writer, upload
+
+    def add(self, path: str, data: bytes | memoryview) -> None:
+        self._upload.add(self._place._key(self._name, path), data)
+
+    def commit(self, header: bytes) -> None:
+        self._upload.finish()
+        self._place.commit(self._name, self.arrays_at, header)
+
+
+class _Upload(AbstractContextManager["_Upload"]):
+    """Puts objects a few at a time, and no faster than they go."""
+
+    def __init__(self, obstore: Any, store: Any) -> None:
+        self._obstore, self._store = obstore, store
+        self._pool = ThreadPoolExecutor(_PUTS_AT_ONCE, thread_name_prefix="quest-put")
+        self._pending: deque[Future[Any]] = deque()
+
+    def add(self, key: str, data: bytes | memoryview) -> None:
+        if len(self._pending) >= 2 * _PUTS_AT_ONCE:
+            self._pending.popleft().result()
+        self._pending.append(self._pool.submit(self._obstore.put, self._store, key, data))
+
+    def finish(self) -> None:
+        while self._pending:
+            self._pending.popleft().result()
+
+    def cancel(self) -> None:
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def __exit__(self, *exception: object) -> None:
+        self._pool.shutdown(wait=True)
+
+
+def _brief(error: Exception) -> str:
+    """What an error of obstore says before it comes to its sources; of a server's XML only code and message."""
+    text = str(error).partition("\n\nDebug source")[0]
+    told = re.search(r"<Code>(.*?)</Code>\s*<Message>(.*?)</Message>", text, re.DOTALL)
+    return f"{text.partition('<?xml')[0]}{told[1]}, {told[2]}" if told else " ".join(text.split())
+
+
+Location = LocalFolder | ObjectPrefix
+Draft = _LocalDraft | _ObjectDraft

@@ -1,7 +1,14 @@
-"""Tensors to and from safetensors files, with errors for people where that fails."""
+"""Tensors to and from safetensors files, with errors for people where that fails.
+
+Parts of networks that several files have in common, such as a frozen encoder, are stored once. A file may leave such a
+part out and say in which file it is: one of the same folder, or one that ships, by its name. The SHA-256 of the part's
+tensors goes with it, so that another part is never taken for it.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -54,3 +61,69 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping
             partial.chmod(0o644)  # safetensors makes files that only their owner can read
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: cannot be written ({error}); free space there, or name another place") from error
+
+
+SHARED = "shared"
+"""Key of the metadata: JSON of the other file's name and the SHA-256 of every part that is taken from it."""
+
+
+def leave_out(tensors: Mapping[str, Tensor], other: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """What has to be stored of a network if another file is there, and the metadata that says so.
+
+    Args:
+        tensors: of the network, as they would be stored.
+        other: file of a whole network; parts that it has exactly are left out.
+
+    Raises:
+        WeightsError: the other file is torn, shares parts itself, or has no part in common.
+    """
+    metadata, theirs = read_tensors(other)
+    if SHARED in metadata:
+        raise WeightsError(f"{other}: shares parts itself; name the file that has them")
+    ours = {part: _digest(tensors, part) for part in {part_of(name) for name in tensors}}
+    same = {part: digest for part, digest in sorted(ours.items()) if digest == _digest(theirs, part)}
+    if not same:
+        raise WeightsError(f"{other}: no part of the network is the same, so that nothing can be shared")
+    kept = {name: tensor for name, tensor in tensors.items() if part_of(name) not in same}
+    return kept, {SHARED: json.dumps({"file": other.stem, "parts": same})}
+
+
+def fetch_shared(path: Path, metadata: Mapping[str, str], shipped: Mapping[str, Path]) -> dict[str, Tensor]:
+    """Tensors that a file leaves to another one.
+
+    Args:
+        path: the file that leaves parts out.
+        metadata: its metadata.
+        shipped: name and file of weights that ship, where the other one is looked for if it is not in the same folder.
+
+    Raises:
+        WeightsError: the other file is not there, or its parts are not those that were left out.
+    """
+    if SHARED not in metadata:
+        return {}
+    try:
+        said = json.loads(metadata[SHARED])
+        name, parts = str(said["file"]), {str(part): str(digest) for part, digest in said["parts"].items()}
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise WeightsError(f"{path}: what it shares with other weights is torn ({error}); fetch it again") from error
+    beside = path.with_name(f"{name}.safetensors")
+    other = beside if beside.is_file() else shipped.get(name)
+    if other is None:
+        raise WeightsError(
+            f"{path}: it shares {' and '.join(parts)} with {beside.name}, which is not beside it; put that file into "
+            "the same folder, or make a whole one with `quest weights save`"
+        )
+    _, tensors = read_tensors(other, tuple(parts))
+    if wrong := [part for part, digest in parts.items() if _digest(tensors, part) != digest]:
+        raise WeightsError(f"{path}: {other} has another {' and '.join(wrong)} than it shares; fetch both again")
+    return tensors
+
+
+def _digest(tensors: Mapping[str, Tensor], part: str) -> str:
+    """SHA-256 of the names, types, shapes and values of a part's tensors, in hexadecimal."""
+    digest = hashlib.sha256()
+    for name, tensor in sorted(tensors.items()):
+        if part_of(name) == part:
+            digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+            digest.update(tensor.contiguous().numpy().tobytes())
+    return digest.hexdigest()

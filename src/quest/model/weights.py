@@ -16,11 +16,9 @@ from torch import nn
 from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
-from quest.model.hub import FILE, LIBRARY, HubId, download, explained
-from quest.model.model_card import TAGS, model_card
+from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
 from quest.model.network import QuestNetwork
-from quest.model.shared_parts import fetch_shared, leave_out
-from quest.model.tensor_file import read_tensors, save_tensors
+from quest.model.tensor_file import fetch_shared, leave_out, read_tensors, save_tensors
 
 FORMAT = "quest-network-2"
 

@@ -10,13 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim.annotate import entity_mask
-from quest.sim.appearance import Region, sample_appearance
+from quest.sim.appearance import Region, apply_appearance, sample_appearance
 from quest.sim.cameras import CameraPath
-from quest.sim.disturbance import odd_appearance
-from quest.sim.dressing import apply_appearance
 from quest.sim.motion import FRAMES_PER_S
 from quest.sim.objects import SimObject
 from quest.sim.occlusion import stage_occlusion
+from quest.sim.props import odd_appearance
 from quest.sim.renderer import Picture, Renderer
 from quest.sim.sensor import SensorModel, sense
 from quest.sim.settings import TakeSettings

@@ -19,7 +19,7 @@ from quest.sim.cameras import CameraPath, PosedCamera, sample_camera_paths
 from quest.sim.entities import MOVES_AT_LEAST
 from quest.sim.motion import HOLD_FRAMES, minimum_jerk, sample_opening
 from quest.sim.objects import SimObject
-from quest.sim.occluder import Occluder, Shape, fit_shape, sample_occluder_surface, slide_in
+from quest.sim.props import Occluder, Shape, fit_shape, sample_occluder_surface, slide_in
 from quest.sim.renderer import Renderer, Stage
 from quest.sim.settings import TakeSettings
 from quest.sim.staging import Playback, Staging, choose_joints, played_frames, see_entities

@@ -11,10 +11,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from quest.errors import ConfigError
 from quest.sim.annotate import project_points, visible_entities
-from quest.sim.appearance import Light, Region, sample_appearance
+from quest.sim.appearance import Light, Region, apply_appearance, sample_appearance
 from quest.sim.articulation import apply
 from quest.sim.cameras import sample_cameras
-from quest.sim.dressing import apply_appearance
 from quest.sim.objects import SimObject
 from quest.sim.renderer import Renderer
 from quest.sim.surfaces import Surface

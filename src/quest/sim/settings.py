@@ -9,8 +9,8 @@ from typing import Any
 
 from quest.errors import ConfigError
 from quest.sim.cameras import CameraStyle
-from quest.sim.disturbance import DISTURBANCES, Disturbance
 from quest.sim.motion import HOLD_FRAMES, MotionStyle
+from quest.sim.props import DISTURBANCES, Disturbance
 from quest.sim.sensor import SensorModel
 
 

@@ -13,12 +13,11 @@ from quest.errors import ObjectError
 from quest.sim.annotate import project_points, visible_entities
 from quest.sim.articulation import apply
 from quest.sim.cameras import CameraPath, PosedCamera, bump, sample_camera_paths
-from quest.sim.disturbance import change_light, disturbed_at
 from quest.sim.gripper import plan_gripper
 from quest.sim.motion import FRAMES_PER_S, MotionStyle, long_script, motion_script
 from quest.sim.objects import SimObject
 from quest.sim.physics import play_physically
-from quest.sim.props import Prop
+from quest.sim.props import Prop, change_light, disturbed_at
 from quest.sim.renderer import Picture, Renderer, Stage
 from quest.sim.settings import TakeSettings
 

@@ -19,7 +19,6 @@ from quest.errors import ConfigError
 from quest.extras import require
 from quest.model.network import QuestNetwork
 from quest.model.weights import weights_digest
-from quest.train.averaging import RunningMean
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
 from quest.train.devices import (
@@ -30,7 +29,7 @@ from quest.train.devices import (
     part_ways,
     restore_generators,
 )
-from quest.train.optimizer import make_optimizer
+from quest.train.optimizer import RunningMean, make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
 from quest.train.stage import Objective, Scores

@@ -8,8 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from quest.sim.procedural.handle_shapes import SUNK_M
-from quest.sim.procedural.handles import HandleKind, HandleStyle, handle_part
+from quest.sim.procedural.handles import SUNK_M, HandleKind, HandleStyle, handle_part
 from quest.sim.procedural.model import HANDLE_ROLES, Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import box, lathe
 

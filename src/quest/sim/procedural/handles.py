@@ -1,4 +1,8 @@
-"""Handles and knobs in many shapes, mounted on a front that looks along -y."""
+"""Handles and knobs in many shapes, mounted on a front that looks along -y.
+
+A handle's mesh lies along x, stands on y = 0 and reaches towards -y. Some run along their whole front, as those of many
+refrigerators, ovens and kitchens do.
+"""
 
 from __future__ import annotations
 
@@ -8,10 +12,95 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.procedural import handle_shapes
-from quest.sim.procedural.handle_shapes import SUNK_M
-from quest.sim.procedural.model import Mesh, Part, join
-from quest.sim.procedural.shapes import box, centred_box, lathe, tube
+from quest.sim.procedural.model import HANDLE_ROLES, Link, Mesh, ObjectModel, Part, join
+from quest.sim.procedural.shapes import box, centred_box, lathe, prism_between, tube
+
+SUNK_M = 0.001
+"""How deep feet reach into the front, so that no gap shows between them."""
+
+_TO_X = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane and extruded along z into the y-z plane, extruded along x."""
+
+
+def cup(half: float, thickness: float, reach: float) -> Mesh:
+    """A cup pull: a quarter of a barrel over a flange, open below."""
+    wall = min(0.3 * thickness, 0.2 * reach)
+    angle = np.linspace(0, np.pi / 2, 9)
+    # Columns are y and z: from the front's face, above, to the lip at the outer end, below.
+    quarter = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+    outer = reach * quarter - np.array([0.0, 0.5 * reach])
+    inner = (reach - wall) * quarter - np.array([0.0, 0.5 * reach])
+    outer[0, 0] = inner[0, 0] = SUNK_M
+    shell = prism_between(outer, inner, -half, half)
+    core = np.tile([[SUNK_M, -0.49 * reach]], (9, 1)) + 0.02 * (outer - outer[0])
+    ends = [prism_between(outer, core, side * half - wall / 2, side * half + wall / 2) for side in (-1, 1)]
+    barrel = join([shell, *ends]).rotated(_TO_X)
+    return join([barrel, box((-half, -0.003, 0.5 * reach), (half, SUNK_M, 0.75 * reach))])
+
+
+def bow(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    """A bow: a flat arc between two feet."""
+    radius = thickness / 2
+    x = np.linspace(-1, 1, 17)
+    path = np.stack([(half - radius) * x, -(reach - radius) * (1 - np.abs(x) ** 2.6), 0 * x], axis=1)
+    path[[0, -1], 1] = SUNK_M
+    return tube(path, radius_m=0.7 * radius, flatness=1.6 * flatness)
+
+
+def d_pull(half: float, thickness: float, reach: float) -> Mesh:
+    """A D: a bar whose ends are bent back to the front with round corners."""
+    radius = thickness / 2
+    out = reach - radius
+    bend = min(0.55 * out, 0.5 * half)
+    angle = np.linspace(0, np.pi / 2, 6)
+    left = np.stack([-half + radius + bend * (1 - np.cos(angle)), -out + bend * (1 - np.sin(angle))], axis=1)
+    right = left[::-1] * [-1, 1]
+    ends = np.array([[-half + radius, SUNK_M]])
+    path = np.concatenate([ends, left, right, ends * [-1, 1]])
+    return tube(np.column_stack([path, np.zeros(len(path))]), radius_m=radius, sides=12)
+
+
+def t_bar(half: float, thickness: float, reach: float) -> Mesh:
+    """A bar on one post."""
+    radius, half = 0.6 * thickness, min(half, 0.04)
+    bar = tube(np.array([[x, -reach + radius, 0.0] for x in (-half, 0.0, half)]), radius_m=radius)
+    post = lathe(np.array([[0.9 * radius, -SUNK_M], [0.7 * radius, 0.5 * reach], [0.7 * radius, reach - radius]]))
+    return join([bar, post])
+
+
+def edge_pull(half: float, thickness: float, reach: float) -> Mesh:
+    """A thin angle along the front, gripped from below."""
+    depth = 0.6 * reach
+    return join([
+        box((-half, -reach, 0.0), (half, -0.002, 0.003)),
+        box((-half, -reach, -depth), (half, -reach + 0.003, 0.0)),
+        box((-half, -0.002, -0.004), (half, SUNK_M, 0.004 + 0.4 * thickness)),
+    ])  # fmt: skip
+
+
+def loop(half: float, reach: float) -> Mesh:
+    """A strap of leather that stands out in a loop, held by a stud."""
+    half, thick, tall = min(half, 0.016), 0.0025, 0.6 * reach
+    angle = np.linspace(0, np.pi, 13)
+    outer = np.stack([-reach * np.sin(angle) ** 0.8, tall * np.cos(angle)], axis=1)
+    inner = outer * [(reach - thick) / reach, (tall - thick) / tall]
+    outer[[0, -1], 0] = inner[[0, -1], 0] = SUNK_M
+    strap = prism_between(outer, inner, -half, half).rotated(_TO_X)
+    stud = lathe(np.array([[0.006, -SUNK_M], [0.006, 0.002], [0.003, 0.004]]))
+    return join([strap, stud.moved((0, 0, -tall - 0.008)), box((-half, -0.002, -tall - 0.018), (half, SUNK_M, -tall))])
+
+
+def lever(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    """A door's lever: a rosette, a neck, and a bar to the right of it, so that the foot is at its left end."""
+    radius = thickness / 2
+    long, bend = 2 * half - 2 * radius, 0.4 * reach
+    angle = np.linspace(0, np.pi / 2, 6)
+    corner = np.stack([bend * (1 - np.cos(angle)), -reach + radius + bend * (1 - np.sin(angle))], axis=1)
+    path = np.concatenate([[[0.0, SUNK_M]], corner, [[0.6 * long, -reach + radius], [long, -reach + 1.2 * radius]]])
+    bar = tube(np.column_stack([path, np.zeros(len(path))]), radius_m=radius, flatness=flatness, sides=12)
+    rosette = lathe(np.array([[2.4 * radius, -SUNK_M], [2.4 * radius, 0.006], [2.0 * radius, 0.009]]))
+    return join([rosette, bar]).moved((-half + radius, 0, 0))
+
 
 HandleKind = Literal[
     "bar", "square_bar", "arched", "bracket", "lip", "plate", "ring", "knob", "disc", "block",
@@ -149,19 +238,19 @@ def _build(style: HandleStyle, length: float, thickness: float) -> Mesh:
             _bar(0.7 * half, thickness, reach, square=False),
         ])  # fmt: skip
     if style.kind == "cup":
-        return handle_shapes.cup(min(half, 0.055), thickness, min(reach, 0.032))
+        return cup(min(half, 0.055), thickness, min(reach, 0.032))
     if style.kind == "bow":
-        return handle_shapes.bow(half, thickness, reach, style.flatness)
+        return bow(half, thickness, reach, style.flatness)
     if style.kind == "d_pull":
-        return handle_shapes.d_pull(half, thickness, reach)
+        return d_pull(half, thickness, reach)
     if style.kind == "t_bar":
-        return handle_shapes.t_bar(half, thickness, reach)
+        return t_bar(half, thickness, reach)
     if style.kind == "edge_pull":
-        return handle_shapes.edge_pull(half, thickness, min(reach, 0.03))
+        return edge_pull(half, thickness, min(reach, 0.03))
     if style.kind == "loop":
-        return handle_shapes.loop(half, reach)
+        return loop(half, reach)
     if style.kind == "lever":
-        return handle_shapes.lever(half, thickness, reach, style.flatness)
+        return lever(half, thickness, reach, style.flatness)
     if style.kind == "ring":
         return _ring(min(half, 0.035), thickness, reach)
     return _knob(style, thickness, reach)
@@ -206,3 +295,50 @@ def _knob(style: HandleStyle, radius: float, reach: float) -> Mesh:
         profile = [(0.4, -SUNK_M), (0.35, centre - half * np.cos(angle[0]))]
         profile += [(float(np.sin(a)) + 1e-9, float(centre - half * np.cos(a))) for a in angle[1:]]
     return lathe(np.array([(radius * r, h) for r, h in profile]))
+
+
+_KINDS: tuple[HandleKind, ...] = ("bar", "square_bar", "arched", "bracket", "lip", "bow", "d_pull", "edge_pull")
+_SHARE = (0.45, 0.98)
+_SHORTEST_M = 0.05
+_THICKER = (0.9, 2.2)
+_THICKEST = 0.45
+"""Of how far it sticks out."""
+
+
+def with_long_handles(model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+    """The object with one handle on every front that had one or more, nearly as long as the front.
+
+    Upright on what turns about an upright axis, level on all else; where the first of the old ones was across that, and
+    all of one style. Strips of a few centimetres keep theirs.
+
+    Args:
+        model: an object whose fronts look along -y.
+        rng: source of randomness.
+    """
+    style = sample_style(rng, knobs=False)
+    kind = _KINDS[int(rng.integers(len(_KINDS)))]
+    thickness = min(style.thickness_m * float(rng.uniform(*_THICKER)), _THICKEST * style.reach_m)
+    style = replace(style, kind=kind, thickness_m=thickness)
+    share = float(rng.uniform(*_SHARE))
+
+    def with_long(link: Link) -> Link:
+        old = [part for part in link.parts if part.role in HANDLE_ROLES]
+        others = tuple(part for part in link.parts if part.role not in HANDLE_ROLES)
+        if not (old and others):
+            return link
+        bounds = np.stack([part.mesh.bounds for part in others])
+        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+        at, foot = old[0].mesh.bounds.mean(axis=0), float(old[0].mesh.bounds[1, 1])
+        vertical = link.kind == "revolute" and abs(link.axis[2]) > 0.5
+        along = 2 if vertical else 0
+        at[along] = (low[along] + high[along]) / 2
+        length = share * float(high[along] - low[along])
+        if length < _SHORTEST_M:
+            return link
+        # A bowed door is foremost elsewhere.
+        reach = style.reach_m + max(0.0, foot - float(low[1]))
+        place, room = (float(at[0]), foot, float(at[2])), (0.1, length / 0.8) if vertical else (length / 0.8, 0.1)
+        own = replace(style, length_m=length, reach_m=reach)
+        return replace(link, parts=(*others, handle_part(own, at=place, vertical=vertical, room_m=room)))
+
+    return replace(model, links=tuple(with_long(link) for link in model.links))
