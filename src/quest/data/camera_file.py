@@ -36,29 +36,26 @@ _OPTIONAL = (
 
 @dataclass(frozen=True)
 class CameraFile:
-    """The content of ``camera.json``.
-
-    Attributes:
-        camera: intrinsics, pixel centres at half-integers whatever the file's convention.
-        depth_scale_m: metres per unit of the depth images.
-        frames_per_s: frame rate, or None if the file does not tell.
-        stamp_s: time of every frame in seconds, or None.
-        cam_from_world: one pose, or one per frame; None if unknown. Numbers of frames are checked by the reader.
-        distortion: lens of the colour frames.
-        depth_camera: intrinsics of the depth images where they are not aligned to the colours.
-        depth_distortion: their lens.
-        colour_from_depth: rigid transform from the depth camera's axes to the colour camera's, metres.
-    """
+    """The content of ``camera.json``."""
 
     camera: Camera
+    """Intrinsics, pixel centres at half-integers whatever the file's convention."""
     depth_scale_m: float = DEFAULT_DEPTH_SCALE_M
+    """Metres per unit of the depth images."""
     frames_per_s: float | None = None
+    """Frame rate, or None if the file does not tell."""
     stamp_s: Float[np.ndarray, " S"] | None = None
+    """Time of every frame in seconds, or None."""
     cam_from_world: Float[np.ndarray, "4 4"] | Float[np.ndarray, "P 4 4"] | None = None
+    """One pose, or one per frame; None if unknown. Numbers of frames are checked by the reader."""
     distortion: Distortion = field(default_factory=Distortion)
+    """Lens of the colour frames."""
     depth_camera: Camera | None = None
+    """Intrinsics of the depth images where they are not aligned to the colours."""
     depth_distortion: Distortion = field(default_factory=Distortion)
+    """Their lens."""
     colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Rigid transform from the depth camera's axes to the colour camera's, metres."""
 
     @property
     def rig(self) -> Rig:

@@ -38,23 +38,20 @@ _SENSOR_REACH_PX = 2
 
 @dataclass(frozen=True)
 class Check:
-    """What one check found.
-
-    Attributes:
-        name: such as ``reprojection``.
-        passed: whether the worst value keeps the limit.
-        worst: the worst value.
-        limit: up to where it is fine.
-        unit: of both; empty for counts.
-        where: where the worst value is, or what was skipped.
-    """
+    """What one check found."""
 
     name: str
+    """Such as ``reprojection``."""
     passed: bool
+    """Whether the worst value keeps the limit."""
     worst: float
+    """The worst value."""
     limit: float
+    """Up to where it is fine."""
     unit: str
+    """Of both; empty for counts."""
     where: str
+    """Where the worst value is, or what was skipped."""
 
     def __str__(self) -> str:
         place = f" ({self.where})" if self.where else ""

@@ -25,17 +25,14 @@ _NEAR_ZERO = 1e-12
 
 @dataclass(frozen=True)
 class Distortion:
-    """A lens.
-
-    Attributes:
-        model: ``plumb_bob`` (k1 k2 p1 p2, k3), ``rational_polynomial`` (k1 k2 p1 p2 k3 k4 k5 k6, and OpenCV's thin
-            prism and tilt) or ``equidistant`` (k1 k2 k3 k4), also called fisheye.
-        coefficients: in that order; none at all is a lens without distortion, as all zero is, but for an equidistant
-            one, which is never a pinhole.
-    """
+    """A lens."""
 
     model: str = "plumb_bob"
+    """``plumb_bob`` (k1 k2 p1 p2, k3), ``rational_polynomial`` (k1 k2 p1 p2 k3 k4 k5 k6, and OpenCV's thin prism and
+    tilt) or ``equidistant`` (k1 k2 k3 k4), also called fisheye."""
     coefficients: tuple[float, ...] = ()
+    """In that order; none at all is a lens without distortion, as all zero is, but for an equidistant one, which is
+    never a pinhole."""
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():

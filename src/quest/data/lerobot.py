@@ -44,19 +44,16 @@ _VISUAL = ("video", "image")
 
 @dataclass(frozen=True)
 class DepthRange:
-    """How depth is quantised to twelve bits: evenly, or evenly in the logarithm of depth plus a shift.
-
-    Attributes:
-        depth_min: metres of code 0, which also stands for missing.
-        depth_max: metres of the highest code.
-        shift: metres added before the logarithm.
-        use_log: whether the logarithm is taken.
-    """
+    """How depth is quantised to twelve bits: evenly, or evenly in the logarithm of depth plus a shift."""
 
     depth_min: float = 0.01
+    """Metres of code 0, which also stands for missing."""
     depth_max: float = 10.0
+    """Metres of the highest code."""
     shift: float = 3.5
+    """Metres added before the logarithm."""
     use_log: bool = True
+    """Whether the logarithm is taken."""
 
     def __post_init__(self) -> None:
         if not 0 < self.depth_min < self.depth_max or self.depth_min + self.shift <= 0:
@@ -85,19 +82,16 @@ class DepthRange:
 
 @dataclass(frozen=True)
 class _Episode:
-    """One episode of a dataset.
-
-    Attributes:
-        root: of the dataset.
-        info: its ``meta/info.json``.
-        index: of the episode.
-        row: its row of ``meta/episodes``.
-    """
+    """One episode of a dataset."""
 
     root: Path
+    """Of the dataset."""
     info: dict[str, Any]
+    """Its ``meta/info.json``."""
     index: int
+    """Of the episode."""
     row: dict[str, Any]
+    """Its row of ``meta/episodes``."""
 
     def feature(self, key: str) -> dict[str, Any]:
         return self.info["features"][key]

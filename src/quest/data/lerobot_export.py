@@ -102,21 +102,18 @@ _COUNTERS = {"frame_index": "int64", "episode_index": "int64", "index": "int64",
 
 @dataclass(frozen=True)
 class Episode:
-    """One episode to write.
-
-    Attributes:
-        views: clips of the same moments, by the name of their camera: letters, digits and underscores.
-        task: what is done, in words.
-        joint_position: radians or metres per frame; None without a state.
-        joint_names: of its columns.
-        tracks: answers or truth per view, all of the same entities; empty without.
-    """
+    """One episode to write."""
 
     views: dict[str, Clip]
+    """Clips of the same moments, by the name of their camera: letters, digits and underscores."""
     task: str
+    """What is done, in words."""
     joint_position: Float32[np.ndarray, "T J"] | None = None
+    """Radians or metres per frame; None without a state."""
     joint_names: tuple[str, ...] = ()
+    """Of its columns."""
     tracks: dict[str, Tracks] = field(default_factory=dict)
+    """Answers or truth per view, all of the same entities; empty without."""
 
     @classmethod
     def of_take(cls, take: Take, *, task: str | None = None) -> Episode:

@@ -68,21 +68,18 @@ def register_depth(
 
 @dataclass(frozen=True)
 class Rig:
-    """A colour camera and where its depth comes from: raw pictures go in, an RGB-D frame of a pinhole camera comes out.
-
-    Attributes:
-        camera: intrinsics of the colour pictures.
-        distortion: lens of the colour pictures.
-        depth_camera: intrinsics of the depth pictures; None where they are aligned to the colours, pixel by pixel.
-        depth_distortion: lens of the depth pictures, where they are not aligned.
-        colour_from_depth: rigid transform from the depth camera's axes to the colour camera's, metres.
-    """
+    """A colour camera and where its depth comes from: raw pictures go in, RGB-D frames of a pinhole camera come out."""
 
     camera: Camera
+    """Intrinsics of the colour pictures."""
     distortion: Distortion = field(default_factory=Distortion)
+    """Lens of the colour pictures."""
     depth_camera: Camera | None = None
+    """Intrinsics of the depth pictures; None where they are aligned to the colours, pixel by pixel."""
     depth_distortion: Distortion = field(default_factory=Distortion)
+    """Lens of the depth pictures, where they are not aligned."""
     colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Rigid transform from the depth camera's axes to the colour camera's, metres."""
 
     @property
     def depth_grid(self) -> Camera:

@@ -45,29 +45,26 @@ CAMERA_CHANGED = "camera_info changes on the way: the first is used"
 
 @dataclass(frozen=True)
 class _Setting:
-    """What holds for all frames of a bag.
-
-    Attributes:
-        messages: the bag.
-        chosen: its topics.
-        rig: cameras.
-        parts: what was asked for.
-        colour_frame: tf frame of the colours.
-        world: tf frame that is the world; None without tf.
-        scale_m: metres per unit of depth; None for what ROS has it in.
-        pose: of every frame, where the camera file gives one.
-        by_log: whether times are those of logging, because nobody set those of the headers.
-    """
+    """What holds for all frames of a bag."""
 
     messages: Messages
+    """The bag."""
     chosen: Chosen
+    """Its topics."""
     rig: Rig
+    """Cameras."""
     parts: Parts
+    """What was asked for."""
     colour_frame: str
+    """Tf frame of the colours."""
     world: str | None
+    """Tf frame that is the world; None without tf."""
     scale_m: float | None
+    """Metres per unit of depth; None for what ROS has it in."""
     pose: np.ndarray | None
+    """Of every frame, where the camera file gives one."""
     by_log: bool
+    """Whether times are those of logging, because nobody set those of the headers."""
 
     def where(self, topic: str, number: int) -> str:
         return f"bag {self.messages.path}: message {number} of {topic}"

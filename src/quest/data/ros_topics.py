@@ -29,15 +29,12 @@ _ALIGNED = re.compile(r"aligned|registered|depth_to_(rgb|colou?r)", re.IGNORECAS
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag says of a topic.
-
-    Attributes:
-        kind: message type such as ``sensor_msgs/Image``.
-        number: of messages; None if the bag does not tell.
-    """
+    """What a bag says of a topic."""
 
     kind: str
+    """Message type such as ``sensor_msgs/Image``."""
     number: int | None
+    """Of messages; None if the bag does not tell."""
 
 
 @runtime_checkable
@@ -65,25 +62,22 @@ class Messages(Protocol):
 
 @dataclass(frozen=True)
 class Chosen:
-    """The topics that make a recording.
-
-    Attributes:
-        rgb: of colours.
-        depth: of depth; None without.
-        info: CameraInfo of the colours; None if there is none.
-        depth_info: CameraInfo of the depth; None if there is none.
-        moving: of transforms that change.
-        static: of transforms that do not.
-        first: first message of the topics of pictures and cameras.
-    """
+    """The topics that make a recording."""
 
     rgb: str
+    """Of colours."""
     depth: str | None
+    """Of depth; None without."""
     info: str | None
+    """CameraInfo of the colours; None if there is none."""
     depth_info: str | None
+    """CameraInfo of the depth; None if there is none."""
     moving: tuple[str, ...]
+    """Of transforms that change."""
     static: tuple[str, ...]
+    """Of transforms that do not."""
     first: dict[str, Any]
+    """First message of the topics of pictures and cameras."""
 
 
 def choose(messages: Messages, parts: Parts) -> Chosen:

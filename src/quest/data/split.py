@@ -19,15 +19,12 @@ PARTS: tuple[Part, ...] = ("train", "validation", "test")
 
 @dataclass(frozen=True)
 class ObjectSplit:
-    """The object split.
-
-    Attributes:
-        partnet_mobility: folder names per part.
-        procedural_seeds: first and last object seed per part, both included.
-    """
+    """The object split."""
 
     partnet_mobility: dict[str, tuple[str, ...]]
+    """Folder names per part."""
     procedural_seeds: dict[str, tuple[int, int]]
+    """First and last object seed per part, both included."""
 
 
 @cache

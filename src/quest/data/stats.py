@@ -19,23 +19,20 @@ _DEPTH_FRAMES = 4
 
 @dataclass(frozen=True)
 class Spread:
-    """How a quantity is spread over its n values; NaN where there is none.
-
-    Attributes:
-        n: number of values.
-        least: the least.
-        low: 10 % lie below.
-        median: half lie below.
-        high: 90 % lie below.
-        most: the most.
-    """
+    """How a quantity is spread over its n values; NaN where there is none."""
 
     n: int
+    """Number of values."""
     least: float
+    """The least."""
     low: float
+    """10 % lie below."""
     median: float
+    """Half lie below."""
     high: float
+    """90 % lie below."""
     most: float
+    """The most."""
 
     @classmethod
     def of(cls, values: Iterable[np.ndarray | float]) -> Spread:
@@ -48,61 +45,58 @@ class Spread:
 
 @dataclass(frozen=True)
 class StoreStats:
-    """What is in a store. Entities are those that a tracker follows: hinges are counted, and left out of the rest.
-
-    Attributes:
-        takes: whole takes.
-        unreadable: groups that look like takes and cannot be read.
-        objects: different objects.
-        views: over all takes.
-        frames: of all views.
-        hours: of video, all views together.
-        stored_bytes: on disk.
-        sources: takes per source.
-        categories: takes per category.
-        levels: takes per level.
-        suites: takes per suite.
-        labels: entities per label.
-        moving_cameras: views whose camera moves.
-        with_depth_sensor: takes whose depth went through the model of a depth sensor.
-        visible_share: of all (frame, entity, view).
-        visible_share_by_label: the same of each label.
-        never_seen: (entity, view) that are not seen in any frame, as a share.
-        moved_share: entities that are at some time more than 0.1 normalised units from where they were.
-        motion: farthest that an entity comes from where it was first, normalised units.
-        motion_m: the same in metres.
-        diagonal_m: diagonal of the objects' bounding boxes at rest, one value per object.
-        distance_m: from the camera to an entity, at the first and the last frame.
-        image_px: takes per size of their images.
-        depth_missing_share: pixels without depth, in four frames of each view; NaN without depth.
-        depth_missing_share_on_object: the same among the pixels of the object.
-    """
+    """What is in a store. Entities are those that a tracker follows: hinges are counted, and left out of the rest."""
 
     takes: int
+    """Whole takes."""
     unreadable: int
+    """Groups that look like takes and cannot be read."""
     objects: int
+    """Different objects."""
     views: int
+    """Over all takes."""
     frames: int
+    """Of all views."""
     hours: float
+    """Of video, all views together."""
     stored_bytes: int
+    """On disk."""
     sources: Mapping[str, int]
+    """Takes per source."""
     categories: Mapping[str, int]
+    """Takes per category."""
     levels: Mapping[str, int]
+    """Takes per level."""
     suites: Mapping[str, int]
+    """Takes per suite."""
     labels: Mapping[str, int]
+    """Entities per label."""
     moving_cameras: int
+    """Views whose camera moves."""
     with_depth_sensor: int
+    """Takes whose depth went through the model of a depth sensor."""
     visible_share: float
+    """Of all (frame, entity, view)."""
     visible_share_by_label: Mapping[str, float]
+    """The same of each label."""
     never_seen: float
+    """(entity, view) that are not seen in any frame, as a share."""
     moved_share: float
+    """Entities that are at some time more than 0.1 normalised units from where they were."""
     motion: Spread
+    """Farthest that an entity comes from where it was first, normalised units."""
     motion_m: Spread
+    """The same in metres."""
     diagonal_m: Spread
+    """Diagonal of the objects' bounding boxes at rest, one value per object."""
     distance_m: Spread
+    """From the camera to an entity, at the first and the last frame."""
     image_px: Mapping[str, int]
+    """Takes per size of their images."""
     depth_missing_share: float
+    """Pixels without depth, in four frames of each view; NaN without depth."""
     depth_missing_share_on_object: float
+    """The same among the pixels of the object."""
 
 
 def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda done, of: None) -> StoreStats:

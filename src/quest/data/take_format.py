@@ -41,27 +41,24 @@ REMEDY = "delete its folder and generate it again"
 
 @dataclass(frozen=True)
 class TakeHeader:
-    """Everything about a stored take but its arrays.
-
-    Attributes:
-        info: description of the take.
-        frames: number of frames.
-        cameras: one per view.
-        clip_names: one per view.
-        has_depth: whether each view carries depth.
-        data_hash: digest of arrays and description, see :func:`hash_take`.
-        files: size in bytes of every file of the group but the header itself, by relative path.
-        arrays_at: subgroup that holds the arrays; empty where they lie directly in the group.
-    """
+    """Everything about a stored take but its arrays."""
 
     info: TakeInfo
+    """Description of the take."""
     frames: int
+    """Number of frames."""
     cameras: tuple[Camera, ...]
+    """One per view."""
     clip_names: tuple[str, ...]
+    """One per view."""
     has_depth: tuple[bool, ...]
+    """Whether each view carries depth."""
     data_hash: str
+    """Digest of arrays and description, see :func:`hash_take`."""
     files: Mapping[str, int]
+    """Size in bytes of every file of the group but the header itself, by relative path."""
     arrays_at: str = ""
+    """Subgroup that holds the arrays; empty where they lie directly in the group."""
 
     def to_attributes(self) -> dict[str, Any]:
         """JSON-serialisable attributes of the group."""

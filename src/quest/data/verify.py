@@ -17,21 +17,18 @@ from quest.types import Take, View
 
 @dataclass(frozen=True)
 class TakeReport:
-    """What verifying one take found.
-
-    Attributes:
-        name: the take.
-        frames: its frames; 0 if it cannot be read.
-        views: its views.
-        checks: every check, those of views once per view.
-        problem: why it cannot be read; empty if it can.
-    """
+    """What verifying one take found."""
 
     name: str
+    """The take."""
     frames: int
+    """Its frames; 0 if it cannot be read."""
     views: int
+    """Its views."""
     checks: tuple[Check, ...]
+    """Every check, those of views once per view."""
     problem: str = ""
+    """Why it cannot be read; empty if it can."""
 
     @property
     def passed(self) -> bool:
@@ -52,13 +49,10 @@ class TakeReport:
 
 @dataclass(frozen=True)
 class StoreReport:
-    """What verifying the takes of a store found.
-
-    Attributes:
-        takes: one report per take, in order of their names.
-    """
+    """What verifying the takes of a store found."""
 
     takes: tuple[TakeReport, ...]
+    """One report per take, in order of their names."""
 
     @property
     def passed(self) -> bool:

@@ -25,21 +25,18 @@ SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v")
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header says.
-
-    Attributes:
-        width: of the upright picture, pixels.
-        height: of the upright picture, pixels.
-        frames: number of frames that it declares; 0 where it does not tell.
-        frames_per_s: nominal frame rate.
-        turns: quarter turns, against the clock, that make its pictures upright.
-    """
+    """What a video's header says."""
 
     width: int
+    """Of the upright picture, pixels."""
     height: int
+    """Of the upright picture, pixels."""
     frames: int
+    """Number of frames that it declares; 0 where it does not tell."""
     frames_per_s: float
+    """Nominal frame rate."""
     turns: int = 0
+    """Quarter turns, against the clock, that make its pictures upright."""
 
 
 def probe_video(path: Path) -> VideoInfo:
@@ -233,21 +230,18 @@ def write_depth_video(
 
 @dataclass(frozen=True)
 class _Codec:
-    """How pictures become a video.
-
-    Attributes:
-        encoder: FFmpeg's name.
-        options: of the encoder.
-        source: format of the pictures as they come.
-        even: format in the file.
-        odd: format in the file where a side is odd.
-    """
+    """How pictures become a video."""
 
     encoder: str
+    """FFmpeg's name."""
     options: dict[str, str]
+    """Of the encoder."""
     source: str
+    """Format of the pictures as they come."""
     even: str
+    """Format in the file."""
     odd: str
+    """Format in the file where a side is odd."""
 
 
 def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec: _Codec) -> int:

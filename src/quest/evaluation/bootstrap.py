@@ -19,19 +19,16 @@ _ENDS = ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0)
 
 @dataclass(frozen=True)
 class Value:
-    """A number with its interval.
-
-    Attributes:
-        mean: the metric (a median where its name says so).
-        low: lower end of the 95 % interval; None with terms of fewer than two objects.
-        high: upper end of the interval.
-        count: how many terms (frames, records or slots) it is over.
-    """
+    """A number with its interval."""
 
     mean: float
+    """The metric (a median where its name says so)."""
     low: float | None
+    """Lower end of the 95 % interval; None with terms of fewer than two objects."""
     high: float | None
+    """Upper end of the interval."""
     count: int
+    """How many terms (frames, records or slots) it is over."""
 
 
 def draw_objects(objects: int, *, resamples: int, generator: np.random.Generator) -> Int[np.ndarray, "B O"]:

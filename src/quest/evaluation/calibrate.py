@@ -35,25 +35,22 @@ STATISTICS = tuple(Cusum(drift, keep) for keep, drift in product((0.0, 0.5, 0.85
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How the calibrator is fitted.
-
-    Attributes:
-        folds: parts of the objects for cross-validation, and members of the calibrator.
-        hidden: numbers of hidden units to try; 0 is a logistic regression.
-        decay: weight decays to try.
-        epochs: passes over the frames.
-        rate: largest learning rate.
-        batch: frames per step.
-        seed: of folds, weights and order.
-    """
+    """How the calibrator is fitted."""
 
     folds: int = 4
+    """Parts of the objects for cross-validation, and members of the calibrator."""
     hidden: tuple[int, ...] = (0, 24)
+    """Numbers of hidden units to try; 0 is a logistic regression."""
     decay: tuple[float, ...] = (1.0, 10.0)
+    """Weight decays to try."""
     epochs: int = 15
+    """Passes over the frames."""
     rate: float = 0.005
+    """Largest learning rate."""
     batch: int = 1024
+    """Frames per step."""
     seed: int = 0
+    """Of folds, weights and order."""
 
     def __post_init__(self) -> None:
         if self.folds < 2 or self.epochs < 1 or self.batch < 1 or not self.hidden or not self.decay:
@@ -62,46 +59,40 @@ class FitConfig:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What came of it.
-
-    Attributes:
-        calibration: to be stored with the weights.
-        objects: that the calibrator was fitted on.
-        streams: of these.
-        frames: (frame, query) pairs of these.
-        lost_frames: of these.
-        hidden: chosen number of hidden units.
-        decay: chosen weight decay.
-        auroc: per frame, cross-validated over objects.
-        ece: per frame, cross-validated over objects.
-        delay: mean delay of the chosen statistic on these streams, frames.
-    """
+    """What came of it."""
 
     calibration: Calibration
+    """To be stored with the weights."""
     objects: int
+    """That the calibrator was fitted on."""
     streams: int
+    """Of these."""
     frames: int
+    """(frame, query) pairs of these."""
     lost_frames: int
+    """Of these."""
     hidden: int
+    """Chosen number of hidden units."""
     decay: float
+    """Chosen weight decay."""
     auroc: float
+    """Per frame, cross-validated over objects."""
     ece: float
+    """Per frame, cross-validated over objects."""
     delay: float
+    """Mean delay of the chosen statistic on these streams, frames."""
 
 
 @dataclass(frozen=True)
 class _Frames:
-    """Frames to fit on.
-
-    Attributes:
-        x: features.
-        lost: truth.
-        fold: of the frame's object.
-    """
+    """Frames to fit on."""
 
     x: Float32[np.ndarray, "N F"]
+    """Features."""
     lost: Bool[np.ndarray, " N"]
+    """Truth."""
     fold: np.ndarray
+    """Of the frame's object."""
 
 
 def fit_calibration(

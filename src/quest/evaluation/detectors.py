@@ -36,23 +36,20 @@ _PAGE_HINKLEY_DELTAS = (0.0, 0.005, 0.02, 0.05, 0.1, 0.2)
 
 @dataclass(frozen=True)
 class Detector:
-    """Something that raises alarms.
-
-    Attributes:
-        name: what tables call it.
-        statistic: collects evidence.
-        maxima: of the statistic in loss-free calibration streams; ascending.
-        block_frames: length of these streams.
-        calibration: the monitor's; None for the rules on the network's own confidence.
-        probabilistic: whether the score of a frame is meant as a probability.
-    """
+    """Something that raises alarms."""
 
     name: str
+    """What tables call it."""
     statistic: Statistic
+    """Collects evidence."""
     maxima: Float64[np.ndarray, " n"]
+    """Of the statistic in loss-free calibration streams; ascending."""
     block_frames: int
+    """Length of these streams."""
     calibration: Calibration | None = None
+    """The monitor's; None for the rules on the network's own confidence."""
     probabilistic: bool = False
+    """Whether the score of a frame is meant as a probability."""
 
     def limits(self, frames: int, budget: Budget) -> list[Threshold]:
         """The threshold in each frame of a stream.
@@ -71,15 +68,12 @@ class Detector:
 
 @dataclass(frozen=True)
 class Played:
-    """A detector's answers to streams.
-
-    Attributes:
-        score: per stream, frame and query; the larger, the more it speaks for a loss in this frame.
-        path: the statistic; minus infinity before a query was asked.
-    """
+    """A detector's answers to streams."""
 
     score: list[np.ndarray]
+    """Per stream, frame and query; the larger, the more it speaks for a loss in this frame."""
     path: list[np.ndarray]
+    """The statistic; minus infinity before a query was asked."""
 
 
 def play(detector: Detector, records: Sequence[StreamRecord]) -> Played:

@@ -24,19 +24,16 @@ BINS = 15
 
 @dataclass(frozen=True)
 class Loss:
-    """The first loss of a query's identity in a stream.
-
-    Attributes:
-        query: index of the query.
-        start: its first frame.
-        deadline: the frame after the last one in which an alarm still counts.
-        too_late: whether it begins so late in the stream that it is not judged.
-    """
+    """The first loss of a query's identity in a stream."""
 
     query: int
+    """Index of the query."""
     start: int
+    """Its first frame."""
     deadline: int
+    """The frame after the last one in which an alarm still counts."""
     too_late: bool
+    """Whether it begins so late in the stream that it is not judged."""
 
 
 def losses(record: StreamRecord) -> list[Loss]:

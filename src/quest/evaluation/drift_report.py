@@ -38,76 +38,70 @@ TABLE_WIDTH = 170
 
 @dataclass(frozen=True)
 class AlarmRow:
-    """Alarms at one alpha.
-
-    Attributes:
-        alpha: share of loss-free streams that may alarm.
-        alpha_frames: frames of a stream that alpha is for; None for a whole stream.
-        threshold: in the first block; None where the calibration streams are too few for any.
-        extrapolated: whether it is read off a fitted tail.
-        trials: loss-free streams, one per object. Where alpha is for so many frames, one such part of a stream per
-            object, with no loss in it or before.
-        false_alarms: how many of them raised an alarm.
-        low: lower end of the exact 95 % interval of their share; None without streams.
-        high: upper end.
-        all_trials: all loss-free streams or parts, those of one object dependent on each other.
-        all_false_alarms: how many of them raised an alarm.
-        missed: share of judged losses that are missed.
-        early: share of judged losses whose query had alarmed before.
-        delay_median: frames from the loss to the alarm; a missed loss has an infinite delay, and the value is None
-            where the median is infinite or there are no losses.
-        delay_p90: the same for 90 %.
-    """
+    """Alarms at one alpha."""
 
     alpha: float
+    """Share of loss-free streams that may alarm."""
     alpha_frames: int | None
+    """Frames of a stream that alpha is for; None for a whole stream."""
     threshold: float | None
+    """In the first block; None where the calibration streams are too few for any."""
     extrapolated: bool
+    """Whether it is read off a fitted tail."""
     trials: int
+    """Loss-free streams, one per object. Where alpha is for so many frames, one such part of a stream per object, with
+    no loss in it or before."""
     false_alarms: int
+    """How many of them raised an alarm."""
     low: float | None
+    """Lower end of the exact 95 % interval of their share; None without streams."""
     high: float | None
+    """Upper end."""
     all_trials: int
+    """All loss-free streams or parts, those of one object dependent on each other."""
     all_false_alarms: int
+    """How many of them raised an alarm."""
     missed: Value | None
+    """Share of judged losses that are missed."""
     early: Value | None
+    """Share of judged losses whose query had alarmed before."""
     delay_median: Value | None
+    """Frames from the loss to the alarm; a missed loss has an infinite delay, and the value is None where the median is
+    infinite or there are no losses."""
     delay_p90: Value | None
+    """The same for 90 %."""
 
 
 @dataclass(frozen=True)
 class DriftRow:
-    """One detector on one kind of streams.
-
-    Attributes:
-        detector: its name.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        objects: how many.
-        streams: how many.
-        frames: (frame, query) pairs.
-        lost_frames: of these.
-        losses: first losses of queries that are judged.
-        too_late: first losses that begin too near the end of the stream to be judged.
-        auroc: per frame.
-        augrc: per frame.
-        ece: per frame; None where the score is no probability.
-        alarms: at every alpha.
-    """
+    """One detector on one kind of streams."""
 
     detector: str
+    """Its name."""
     part: str
+    """Part of the object split."""
     source: str
+    """``partnet-mobility`` or ``procedural``."""
     objects: int
+    """How many."""
     streams: int
+    """How many."""
     frames: int
+    """(frame, query) pairs."""
     lost_frames: int
+    """Of these."""
     losses: int
+    """First losses of queries that are judged."""
     too_late: int
+    """First losses that begin too near the end of the stream to be judged."""
     auroc: Value | None
+    """Per frame."""
     augrc: Value | None
+    """Per frame."""
     ece: Value | None
+    """Per frame; None where the score is no probability."""
     alarms: tuple[AlarmRow, ...]
+    """At every alpha."""
 
 
 def drift_rows(
@@ -174,15 +168,12 @@ def _row(
 
 @dataclass(frozen=True)
 class _Weights:
-    """Terms and the objects they belong to, for intervals.
-
-    Attributes:
-        owner: object of each term.
-        draws: how often each object is drawn in each resample.
-    """
+    """Terms and the objects they belong to, for intervals."""
 
     owner: np.ndarray
+    """Object of each term."""
     draws: np.ndarray
+    """How often each object is drawn in each resample."""
 
     def value(self, metric: Callable[[np.ndarray], float], count: int) -> Value | None:
         """The metric and its percentile interval; None where it is not defined or infinite."""

@@ -21,19 +21,16 @@ from quest.evaluation.records import (
 
 @dataclass(frozen=True)
 class TakeOutcome:
-    """How all trackers answered in all views of one take.
-
-    Attributes:
-        records: per tracker, protocol, view and scored entity.
-        discoveries: per tracker and view of the semantic protocol.
-        unscored: entities not scored, per view.
-        moving: whether the take already moves in frames 0 to 7, against the protocol.
-    """
+    """How all trackers answered in all views of one take."""
 
     records: tuple[EntityRecord, ...]
+    """Per tracker, protocol, view and scored entity."""
     discoveries: tuple[Discovery, ...]
+    """Per tracker and view of the semantic protocol."""
     unscored: tuple[Unscored, ...]
+    """Entities not scored, per view."""
     moving: bool
+    """Whether the take already moves in frames 0 to 7, against the protocol."""
 
 
 class FinishedTakes:

@@ -40,15 +40,12 @@ NO_IDENTITY = -1
 
 @dataclass(frozen=True)
 class Sums:
-    """A metric before division, per record.
-
-    Attributes:
-        total: what is averaged, summed over the record.
-        count: how many terms the total has; 0 where the metric does not apply to the record.
-    """
+    """A metric before division, per record."""
 
     total: Float[np.ndarray, " N"]
+    """What is averaged, summed over the record."""
     count: Float[np.ndarray, " N"]
+    """How many terms the total has; 0 where the metric does not apply to the record."""
 
     def mean(self) -> float:
         """The metric over all records; NaN where nothing was counted."""

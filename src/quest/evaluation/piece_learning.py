@@ -37,21 +37,18 @@ _RIDGE = 1e-3
 
 @dataclass(frozen=True)
 class Learned:
-    """What came of it.
-
-    Attributes:
-        network: the network with a head that ranks pieces; everything else is as it was.
-        pieces: how many were learned from.
-        right: how many of them were a handle or knob.
-        peaks: how many peaks of the map were learned from.
-        loss: cross-entropy of the pieces at the end.
-    """
+    """What came of it."""
 
     network: QuestNetwork
+    """The network with a head that ranks pieces; everything else is as it was."""
     pieces: int
+    """How many were learned from."""
     right: int
+    """How many of them were a handle or knob."""
     peaks: int
+    """How many peaks of the map were learned from."""
     loss: float
+    """Cross-entropy of the pieces at the end."""
 
 
 @dataclass(frozen=True)

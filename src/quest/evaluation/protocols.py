@@ -48,15 +48,12 @@ class ClipTracker(Protocol):
 
 @dataclass(frozen=True)
 class ViewOutcome:
-    """What one tracker did in one view.
-
-    Attributes:
-        records: one per scored entity.
-        discovery: slots and matches; None in the point protocol.
-    """
+    """What one tracker did in one view."""
 
     records: tuple[EntityRecord, ...]
+    """One per scored entity."""
     discovery: Discovery | None = None
+    """Slots and matches; None in the point protocol."""
 
 
 def first_visible(visible: Bool[np.ndarray, "T E"], tracked: Int[np.ndarray, " R"]) -> tuple[np.ndarray, np.ndarray]:

@@ -21,98 +21,86 @@ from quest.whole_file import whole_file
 
 @dataclass(frozen=True)
 class Subject:
-    """What a table row is about: records with equal subjects but for the object belong to one row.
-
-    Attributes:
-        tracker: its name.
-        protocol: ``point`` or ``semantic``.
-        part: ``train``, ``validation``, ``test``, or ``unlisted`` where the split does not know the object.
-        source: ``partnet-mobility`` or ``procedural``.
-        level: how many joints move one after the other.
-        object_id: the object.
-    """
+    """What a table row is about: records with equal subjects but for the object belong to one row."""
 
     tracker: str
+    """Its name."""
     protocol: str
+    """``point`` or ``semantic``."""
     part: str
+    """``train``, ``validation``, ``test``, or ``unlisted`` where the split does not know the object."""
     source: str
+    """``partnet-mobility`` or ``procedural``."""
     level: int
+    """How many joints move one after the other."""
     object_id: str
+    """The object."""
 
 
 @dataclass(frozen=True)
 class EntityRecord:
-    """How one tracker answered for one entity in one view of one take.
-
-    Attributes:
-        subject: tracker, protocol and object.
-        take: name of the take.
-        view: index of the view.
-        entity: index of the entity in the take.
-        name: the entity's name.
-        label: the entity's label.
-        moved: whether it is at some time more than 0.1 from rest.
-        found: whether an answer was given to it at all (always so in the point protocol).
-        first_frame: frames before it are not scored.
-        distance: normalised units; 1 where the prediction is missing.
-        distance_px: pixels of the letterboxed input; NaN where the entity has no true pixel.
-        follows: index of the entity that the prediction follows, -1 for none.
-        visible: whether the entity is seen.
-    """
+    """How one tracker answered for one entity in one view of one take."""
 
     subject: Subject
+    """Tracker, protocol and object."""
     take: str
+    """Name of the take."""
     view: int
+    """Index of the view."""
     entity: int
+    """Index of the entity in the take."""
     name: str
+    """The entity's name."""
     label: str
+    """The entity's label."""
     moved: bool
+    """Whether it is at some time more than 0.1 from rest."""
     found: bool
+    """Whether an answer was given to it at all (always so in the point protocol)."""
     first_frame: int
+    """Frames before it are not scored."""
     distance: Float32[np.ndarray, " T"]
+    """Normalised units; 1 where the prediction is missing."""
     distance_px: Float32[np.ndarray, " T"]
+    """Pixels of the letterboxed input; NaN where the entity has no true pixel."""
     follows: Int16[np.ndarray, " T"]
+    """Index of the entity that the prediction follows, -1 for none."""
     visible: Bool[np.ndarray, " T"]
+    """Whether the entity is seen."""
 
 
 @dataclass(frozen=True)
 class Discovery:
-    """How many answers a tracker gave unasked in one view, and how many of them were entities.
-
-    Attributes:
-        subject: tracker, protocol and object.
-        take: name of the take.
-        view: index of the view.
-        slots: answers.
-        matched: answers that were assigned to an entity.
-        placed: answers that are assigned to an entity if labels do not count; None in files from before there was this.
-        entities: that could be discovered; None there too.
-    """
+    """How many answers a tracker gave unasked in one view, and how many of them were entities."""
 
     subject: Subject
+    """Tracker, protocol and object."""
     take: str
+    """Name of the take."""
     view: int
+    """Index of the view."""
     slots: int
+    """Answers."""
     matched: int
+    """Answers that were assigned to an entity."""
     placed: int | None = None
+    """Answers that are assigned to an entity if labels do not count; None in files from before there was this."""
     entities: int | None = None
+    """That could be discovered; None there too."""
 
 
 @dataclass(frozen=True)
 class Unscored:
-    """An entity that is not scored in a view, because it is not visible in frames 0 to 7.
-
-    Attributes:
-        take: name of the take.
-        view: index of the view.
-        name: the entity's name.
-        label: the entity's label.
-    """
+    """An entity that is not scored in a view, because it is not visible in frames 0 to 7."""
 
     take: str
+    """Name of the take."""
     view: int
+    """Index of the view."""
     name: str
+    """The entity's name."""
     label: str
+    """The entity's label."""
 
 
 _PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}

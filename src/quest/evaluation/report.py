@@ -25,17 +25,14 @@ RECORDS_SUFFIX = ".records.parquet"
 
 @dataclass(frozen=True)
 class Origin:
-    """A file of records that a report is made from.
-
-    Attributes:
-        records: name of the file.
-        sha256: of the file.
-        run: what made the records, out of the result file beside them; None where there is none.
-    """
+    """A file of records that a report is made from."""
 
     records: str
+    """Name of the file."""
     sha256: str | None
+    """Of the file."""
     run: Run | None
+    """What made the records, out of the result file beside them; None where there is none."""
 
 
 def gather(paths: Sequence[Path]) -> tuple[tuple[EntityRecord, ...], tuple[Origin, ...]]:

@@ -25,15 +25,12 @@ def part_of(info: TakeInfo) -> SplitPart:
 
 @dataclass(frozen=True)
 class Shard:
-    """A part of the takes or streams, for processes side by side.
-
-    Attributes:
-        index: from 0.
-        count: how many parts there are.
-    """
+    """A part of the takes or streams, for processes side by side."""
 
     index: int = 0
+    """From 0."""
     count: int = 1
+    """How many parts there are."""
 
     @classmethod
     def parse(cls, text: str) -> Shard:

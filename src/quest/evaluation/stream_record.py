@@ -33,33 +33,30 @@ FORMAT = 2
 
 @dataclass(frozen=True)
 class StreamRecord:
-    """One stream: a view of a take, watched by a tracker whose monitor was switched off.
-
-    Attributes:
-        take: name of the take.
-        view: index of the view.
-        object_id: the object.
-        source: ``partnet-mobility`` or ``procedural``.
-        part: part of the object split.
-        level: how many joints move one after the other.
-        signals: per frame and query, in the order of :data:`quest.monitor.SIGNALS`; NaN where unknown.
-        lost: whether the identity is truly lost.
-        asked: frame in which each query was asked.
-        moved: whether the entity is at some time more than 0.1 from rest.
-        confidence: the network's own probability that the identity is right.
-    """
+    """One stream: a view of a take, watched by a tracker whose monitor was switched off."""
 
     take: str
+    """Name of the take."""
     view: int
+    """Index of the view."""
     object_id: str
+    """The object."""
     source: str
+    """``partnet-mobility`` or ``procedural``."""
     part: str
+    """Part of the object split."""
     level: int
+    """How many joints move one after the other."""
     signals: Float32[np.ndarray, "T K S"]
+    """Per frame and query, in the order of :data:`quest.monitor.SIGNALS`; NaN where unknown."""
     lost: Bool[np.ndarray, "T K"]
+    """Whether the identity is truly lost."""
     asked: Int[np.ndarray, " K"]
+    """Frame in which each query was asked."""
     moved: Bool[np.ndarray, " K"]
+    """Whether the entity is at some time more than 0.1 from rest."""
     confidence: Float32[np.ndarray, "T K"]
+    """The network's own probability that the identity is right."""
 
     def __len__(self) -> int:
         return len(self.lost)
@@ -191,15 +188,12 @@ def tracker_id(tracker: Tracker) -> str:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a folder has of the streams that were asked for.
-
-    Attributes:
-        records: read back, in the order of stores, takes and views.
-        missing: streams that are left to other shards.
-    """
+    """What a folder has of the streams that were asked for."""
 
     records: tuple[StreamRecord, ...]
+    """Read back, in the order of stores, takes and views."""
     missing: int
+    """Streams that are left to other shards."""
 
 
 def record_streams(

@@ -13,17 +13,14 @@ _TAG = re.compile(r"-L\d+-(?P<suite>[a-z]+?)(\d*(?P<alike>alike)?|-(?P<variant>[
 
 @dataclass(frozen=True)
 class TakeSuite:
-    """The suite of a take.
-
-    Attributes:
-        name: such as ``occlusion`` or ``shift``, or :data:`STANDARD`.
-        look_alike: whether the name says that a look-alike stays in view while an entity is hidden.
-        variant: which kind of the suite, such as ``blur``; empty if there is only one.
-    """
+    """The suite of a take."""
 
     name: str
+    """Such as ``occlusion`` or ``shift``, or :data:`STANDARD`."""
     look_alike: bool
+    """Whether the name says that a look-alike stays in view while an entity is hidden."""
     variant: str = ""
+    """Which kind of the suite, such as ``blur``; empty if there is only one."""
 
     @classmethod
     def of(cls, take: str) -> TakeSuite:

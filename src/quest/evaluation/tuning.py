@@ -39,34 +39,28 @@ _BETA = 2.0
 
 @dataclass(frozen=True)
 class Trial:
-    """One setting that was tried.
-
-    Attributes:
-        name: which setting.
-        value: its value.
-        ape: mean 3D distance of moved entities, normalised units.
-    """
+    """One setting that was tried."""
 
     name: str
+    """Which setting."""
     value: float
+    """Its value."""
     ape: float
+    """Mean 3D distance of moved entities, normalised units."""
 
 
 @dataclass(frozen=True)
 class Tuned:
-    """What came of it.
-
-    Attributes:
-        config: the chosen settings.
-        trials: everything that was tried.
-        precision: of discovery at the chosen threshold.
-        recall: of discovery there.
-    """
+    """What came of it."""
 
     config: TrackerConfig
+    """The chosen settings."""
     trials: tuple[Trial, ...]
+    """Everything that was tried."""
     precision: float
+    """Of discovery at the chosen threshold."""
     recall: float
+    """Of discovery there."""
 
 
 def tune(
@@ -136,17 +130,14 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
 
 @dataclass
 class _Found:
-    """What was found in the first frames of takes of one source.
-
-    Attributes:
-        logits: of all candidates.
-        hits: which of them are right.
-        present: how many entities are seen.
-    """
+    """What was found in the first frames of takes of one source."""
 
     logits: list[float] = field(default_factory=list)
+    """Of all candidates."""
     hits: list[bool] = field(default_factory=list)
+    """Which of them are right."""
     present: int = 0
+    """How many entities are seen."""
 
     def add(self, peaks: Peaks, take: Take, view: int) -> None:
         """Candidates of one view."""

@@ -17,14 +17,12 @@ class Letterbox:
     """Scaling and centred padding of a source image onto a square canvas.
 
     The image is scaled to whole pixels, so that its shorter side may be scaled a little more or less than the longer.
-
-    Attributes:
-        source: intrinsics of the source frames.
-        size: side of the canvas, pixels.
     """
 
     source: Camera
+    """Intrinsics of the source frames."""
     size: int
+    """Side of the canvas, pixels."""
 
     @property
     def scale(self) -> float:

@@ -25,14 +25,12 @@ class AffordanceMap:
 
     The rims of a closed laptop, one to open and one to lift, may lie in one cell: each purpose has scores and offsets
     of its own. A network that knows no intents has one purpose.
-
-    Attributes:
-        logits: score of every label and purpose (index into INTENTS).
-        offset: from the cell's centre to the entity, in cells.
     """
 
     logits: Float[Tensor, "B T C L P"]
+    """Score of every label and purpose (index into INTENTS)."""
     offset: Float[Tensor, "B T C P 2"]
+    """From the cell's centre to the entity, in cells."""
 
     def mirrored(self) -> AffordanceMap:
         """The map of the mirror image."""

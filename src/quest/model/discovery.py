@@ -32,21 +32,18 @@ _VOTES_WITHIN_PX = 12.0
 
 @dataclass(frozen=True)
 class Peaks:
-    """Candidates for entities, best first.
-
-    Attributes:
-        uv: coordinates in [0, 1]^2 of the network's input.
-        point_m: what is seen there, lifted by the nearest depth around: camera axes, metres; NaN without depth.
-        label: index into LABELS.
-        logit: score of the affordance map; log odds of being right where the network ranks pieces.
-        intent: index into INTENTS, or UNKNOWN_INTENT if the network does not know.
-    """
+    """Candidates for entities, best first."""
 
     uv: Float[Tensor, "K 2"]
+    """Coordinates in [0, 1]^2 of the network's input."""
     point_m: Float[Tensor, "K 3"]
+    """What is seen there, lifted by the nearest depth around: camera axes, metres; NaN without depth."""
     label: Int[Tensor, " K"]
+    """Index into LABELS."""
     logit: Float[Tensor, " K"]
+    """Score of the affordance map; log odds of being right where the network ranks pieces."""
     intent: Int[Tensor, " K"]
+    """Index into INTENTS, or UNKNOWN_INTENT if the network does not know."""
 
     def __len__(self) -> int:
         return len(self.label)
@@ -58,15 +55,12 @@ class Peaks:
 
 @dataclass(frozen=True)
 class Candidates:
-    """All peaks of a frame, of which those of one label that are too close to each other cannot all be entities.
-
-    Attributes:
-        peaks: the peaks, best first.
-        clash: which are too close to each other, whatever their labels.
-    """
+    """All peaks of a frame, of which those of one label that are too close to each other cannot all be entities."""
 
     peaks: Peaks
+    """The peaks, best first."""
     clash: Bool[Tensor, "K K"]
+    """Which are too close to each other, whatever their labels."""
 
     def apart(self, among: Sequence[int] | None = None) -> list[int]:
         """Of peaks of one label that are too close to each other the best alone.
@@ -87,19 +81,16 @@ class Candidates:
 
 @dataclass(frozen=True)
 class Sighted:
-    """What a frame has to choose from, before it is ranked.
-
-    Attributes:
-        peaks: of the affordance map, with its scores.
-        pieces: what stands out of planes.
-        on_piece: which peaks of handles and knobs are on which piece.
-        group: of each peak, see :func:`quest.model.pieces.groups`.
-    """
+    """What a frame has to choose from, before it is ranked."""
 
     peaks: Candidates
+    """Of the affordance map, with its scores."""
     pieces: Pieces
+    """What stands out of planes."""
     on_piece: Bool[Tensor, "K P"]
+    """Which peaks of handles and knobs are on which piece."""
     group: Int[Tensor, " K"]
+    """Of each peak, see :func:`quest.model.pieces.groups`."""
 
 
 def find_candidates(

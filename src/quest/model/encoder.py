@@ -23,21 +23,18 @@ _STD = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """Shape of the encoder.
-
-    Attributes:
-        image_size: side of the square input, pixels.
-        patch_size: side of a patch, pixels.
-        width: channels D of a token.
-        depth: number of transformer blocks.
-        heads: attention heads.
-    """
+    """Shape of the encoder."""
 
     image_size: int = 224
+    """Side of the square input, pixels."""
     patch_size: int = 16
+    """Side of a patch, pixels."""
     width: int = 384
+    """Channels D of a token."""
     depth: int = 12
+    """Number of transformer blocks."""
     heads: int = 6
+    """Attention heads."""
 
     @property
     def grid(self) -> int:

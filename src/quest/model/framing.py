@@ -17,20 +17,16 @@ from quest.types import Camera
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference frame of a stream or clip (see :mod:`quest.model.observation`).
-
-    Attributes:
-        cam_from_world: pose of the camera at which it began, on the CPU in double precision, which not every device
-            has.
-        center: its origin in that camera, metres.
-        scale: metres per unit.
-        has_depth: whether it was made from depth; without, units are metres by guess.
-    """
+    """The reference frame of a stream or clip (see :mod:`quest.model.observation`)."""
 
     cam_from_world: Float[Tensor, "4 4"]
+    """Pose of the camera at which it began, on the CPU in double precision, which not every device has."""
     center: Float[Tensor, "1 3"]
+    """Its origin in that camera, metres."""
     scale: Float[Tensor, " 1"]
+    """Metres per unit."""
     has_depth: bool
+    """Whether it was made from depth; without, units are metres by guess."""
 
 
 class Framer:

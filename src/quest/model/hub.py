@@ -45,15 +45,12 @@ _ID = re.compile(r"(?P<repo>[\w.-]+/[\w.-]+?)(@(?P<revision>[^@\s]+))?")
 
 @dataclass(frozen=True)
 class HubId:
-    """A model repository at a revision.
-
-    Attributes:
-        repo: ``owner/name``.
-        revision: branch, tag or commit; None for the newest.
-    """
+    """A model repository at a revision."""
 
     repo: str
+    """``owner/name``."""
     revision: str | None = None
+    """Branch, tag or commit; None for the newest."""
 
     @classmethod
     def parse(cls, text: str) -> HubId | None:

@@ -19,22 +19,19 @@ _LOG_SPREAD = (-4.0, 1.0)
 
 @dataclass(frozen=True)
 class JointBelief:
-    """Joints of queries, in the reference frame.
-
-    Attributes:
-        revolute_logit: above zero where the joint turns rather than slides.
-        slide_axis: unit direction of sliding, of either sign.
-        turn_axis: unit direction of the axis of turning, of either sign.
-        foot: from the entity to the nearest point of the axis of turning.
-        log_spread: logarithms of the spreads of the sine of the angles to ``slide_axis`` and ``turn_axis`` and of the
-            length of the error of ``foot``.
-    """
+    """Joints of queries, in the reference frame."""
 
     revolute_logit: Float[Tensor, "B T K"]
+    """Above zero where the joint turns rather than slides."""
     slide_axis: Float[Tensor, "B T K 3"]
+    """Unit direction of sliding, of either sign."""
     turn_axis: Float[Tensor, "B T K 3"]
+    """Unit direction of the axis of turning, of either sign."""
     foot: Float[Tensor, "B T K 3"]
+    """From the entity to the nearest point of the axis of turning."""
     log_spread: Float[Tensor, "B T K 3"]
+    """Logarithms of the spreads of the sine of the angles to ``slide_axis`` and ``turn_axis`` and of the length of the
+    error of ``foot``."""
 
 
 class JointHead(nn.Module):

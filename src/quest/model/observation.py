@@ -27,30 +27,27 @@ _BENT = 0.5
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Frames as the network takes them, letterboxed to its input size.
-
-    Attributes:
-        features: tokens of the encoder.
-        rgb: colours.
-        depth_m: depth along +z, 0 where missing.
-        cell_depth_m: near depth of each cell (see :func:`cell_depth`), 0 where missing.
-        intrinsics: fx, fy, cx, cy of the letterboxed input, pixels.
-        ref_from_cam: rigid motion from each frame's camera to the reference camera, metres.
-        center: origin of the reference frame in the reference camera, metres.
-        scale: metres per unit of the reference frame.
-        enlarged: tokens of the images at twice their size, one per cell, where they are known already; None where
-            the network is to encode them when it looks for entities.
-    """
+    """Frames as the network takes them, letterboxed to its input size."""
 
     features: Float[Tensor, "B T N E"]
+    """Tokens of the encoder."""
     rgb: UInt8[Tensor, "B T H W 3"]
+    """Colours."""
     depth_m: Float[Tensor, "B T H W"]
+    """Depth along +z, 0 where missing."""
     cell_depth_m: Float[Tensor, "B T Hc Wc"]
+    """Near depth of each cell (see :func:`cell_depth`), 0 where missing."""
     intrinsics: Float[Tensor, "B 4"]
+    """Fx, fy, cx, cy of the letterboxed input, pixels."""
     ref_from_cam: Float[Tensor, "B T 4 4"]
+    """Rigid motion from each frame's camera to the reference camera, metres."""
     center: Float[Tensor, "B 3"]
+    """Origin of the reference frame in the reference camera, metres."""
     scale: Float[Tensor, " B"]
+    """Metres per unit of the reference frame."""
     enlarged: Float[Tensor, "B T C E"] | None = None
+    """Tokens of the images at twice their size, one per cell, where they are known already; None where the network is
+    to encode them when it looks for entities."""
 
     def during(self, frames: slice | list[int]) -> FrameBatch:
         """Some of the frames."""
@@ -167,21 +164,18 @@ class FrameBatch:
 
 @dataclass(frozen=True)
 class Observation:
-    """Tokens and cells of a window.
-
-    Attributes:
-        tokens: one per patch, with position codes.
-        fine: one per cell of the heatmap (no channels without a heatmap).
-        cell_point: lifted point of each cell in the reference frame, NaN where depth is missing.
-        close: one per close cell, half as wide as the heatmap's (no channels without a heatmap).
-        close_point: lifted point of each close cell, NaN where depth is missing.
-    """
+    """Tokens and cells of a window."""
 
     tokens: Float[Tensor, "B T N D"]
+    """One per patch, with position codes."""
     fine: Float[Tensor, "B T C F"]
+    """One per cell of the heatmap (no channels without a heatmap)."""
     cell_point: Float[Tensor, "B T C 3"]
+    """Lifted point of each cell in the reference frame, NaN where depth is missing."""
     close: Float[Tensor, "B T M G"]
+    """One per close cell, half as wide as the heatmap's (no channels without a heatmap)."""
     close_point: Float[Tensor, "B T M 3"]
+    """Lifted point of each close cell, NaN where depth is missing."""
 
     def during(self, frames: slice) -> Observation:
         """Some of the frames."""

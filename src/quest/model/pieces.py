@@ -39,19 +39,16 @@ them, then handles and knobs on a piece, then handles and knobs where depth is m
 
 @dataclass(frozen=True)
 class Pieces:
-    """What stands out in a frame.
-
-    Attributes:
-        uv_px: their middles, pixels of the network's input.
-        inputs: their measures, then the best score of the map on them for each of PIECE_LABELS.
-        purpose: for which purpose that score is, index into INTENTS.
-        shapes: their pixels.
-    """
+    """What stands out in a frame."""
 
     uv_px: Float[Tensor, "P 2"]
+    """Their middles, pixels of the network's input."""
     inputs: Float[Tensor, "P F"]
+    """Their measures, then the best score of the map on them for each of PIECE_LABELS."""
     purpose: Int[Tensor, "P 2"]
+    """For which purpose that score is, index into INTENTS."""
     shapes: tuple[Protrusion, ...]
+    """Their pixels."""
 
     def under(self, uv_px: Float[Tensor, "K 2"]) -> Bool[Tensor, "K P"]:
         """Which pixels lie on which piece, or within a few pixels of it."""

@@ -43,17 +43,14 @@ _EIGHT = np.ones((3, 3), dtype=bool)
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane that many pixels lie in.
-
-    Attributes:
-        normal: towards the camera.
-        middle: a point of it.
-        spread: how far what lies in it is off it, as a standard deviation.
-    """
+    """A plane that many pixels lie in."""
 
     normal: Float[np.ndarray, "3"]
+    """Towards the camera."""
     middle: Float[np.ndarray, "3"]
+    """A point of it."""
     spread: float = 0.0
+    """How far what lies in it is off it, as a standard deviation."""
 
     @property
     def low(self) -> float:
@@ -63,19 +60,16 @@ class Plane:
 
 @dataclass(frozen=True)
 class Protrusion:
-    """A piece of the image that stands out of a plane.
-
-    Attributes:
-        uv_px: the pixel of it that is nearest to its middle, (x, y).
-        rows: of its pixels.
-        columns: of its pixels.
-        measures: see :data:`MEASURES`.
-    """
+    """A piece of the image that stands out of a plane."""
 
     uv_px: tuple[float, float]
+    """The pixel of it that is nearest to its middle, (x, y)."""
     rows: Int[np.ndarray, " N"]
+    """Of its pixels."""
     columns: Int[np.ndarray, " N"]
+    """Of its pixels."""
     measures: Float[np.ndarray, " G"]
+    """See :data:`MEASURES`."""
 
 
 def find_protrusions(image: Float[np.ndarray, "H W 3"]) -> list[Protrusion]:

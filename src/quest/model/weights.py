@@ -36,28 +36,26 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
     It saves itself to folders and to the Hugging Face hub: ``from_pretrained``, ``save_pretrained`` and
     ``push_to_hub`` are those of :class:`huggingface_hub.PyTorchModelHubMixin`. The folder or repository gets the one
     file ``model.safetensors``, which loses nothing, a model card, and a ``config.json`` for people, which is not read.
-
-    Attributes:
-        name: name, path or hub id that it was asked for by.
-        path: file that it came from.
-        network: in evaluation mode, on the CPU.
-        settings: settings of the tracker that were chosen with these weights, as JSON text.
-        about: where the weights come from.
-        sha256: of the file.
-        monitor: calibration of the monitor that was fitted with these weights, as JSON text; None without.
-        licence: under which the weights may be used; empty if the file does not say.
-        version: of the weights; empty if the file does not say.
     """
 
     name: str
+    """Name, path or hub id that it was asked for by."""
     path: Path
+    """File that it came from."""
     network: QuestNetwork
+    """In evaluation mode, on the CPU."""
     settings: str
+    """Settings of the tracker that were chosen with these weights, as JSON text."""
     about: str
+    """Where the weights come from."""
     sha256: str
+    """Of the file."""
     monitor: str | None = None
+    """Calibration of the monitor that was fitted with these weights, as JSON text; None without."""
     licence: str = ""
+    """Under which the weights may be used; empty if the file does not say."""
     version: str = ""
+    """Of the weights; empty if the file does not say."""
 
     # The mixin would set one from the arguments, but this class is frozen and its files carry their own.
     _hub_mixin_config = {"format": FORMAT}  # noqa: RUF012

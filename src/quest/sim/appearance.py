@@ -37,99 +37,84 @@ _MORE_FOR_OBJECTS: tuple[TextureKind, ...] = ("marble", "scratched", "stickers",
 
 @dataclass(frozen=True)
 class Light:
-    """One light.
-
-    Attributes:
-        kind: ``directional`` or ``point``.
-        towards_light: unit vector from the object to the light, z up, front +x.
-        distance: of a point light from the region's centre, in half diagonals of the region.
-        strength: linear red, green, blue.
-    """
+    """One light."""
 
     kind: Literal["directional", "point"]
+    """``directional`` or ``point``."""
     towards_light: tuple[float, float, float]
+    """Unit vector from the object to the light, z up, front +x."""
     distance: float
+    """Of a point light from the region's centre, in half diagonals of the region."""
     strength: Colour
+    """Linear red, green, blue."""
 
 
 @dataclass(frozen=True)
 class Distractor:
-    """A thing that has nothing to do with the object.
-
-    Attributes:
-        kind: its shape.
-        size: half extents in half diagonals of the region (sphere: the first; cylinder: the first two).
-        side: -1, 0 or 1: behind the object and to its right, straight behind it, or to its left.
-        along: where it stands along the line behind which it must stay, in half diagonals from the middle.
-        behind: gap to that line, in half diagonals.
-        turn_rad: turn about the vertical.
-        surface: its material.
-    """
+    """A thing that has nothing to do with the object."""
 
     kind: Literal["box", "sphere", "cylinder"]
+    """Its shape."""
     size: tuple[float, float, float]
+    """Half extents in half diagonals of the region (sphere: the first; cylinder: the first two)."""
     side: int
+    """-1, 0 or 1: behind the object and to its right, straight behind it, or to its left."""
     along: float
+    """Where it stands along the line behind which it must stay, in half diagonals from the middle."""
     behind: float
+    """Gap to that line, in half diagonals."""
     turn_rad: float
+    """Turn about the vertical."""
     surface: Surface
+    """Its material."""
 
 
 @dataclass(frozen=True)
 class ObjectLook:
-    """Materials of the object.
-
-    Attributes:
-        repaint_original: whether objects that come with materials of their own lose them.
-        surfaces: materials that parts which are no handles choose from; the first one is the body's.
-        handle: material of handles and knobs.
-        per_link: whether every link chooses for itself rather than every kind of part.
-        seed: seed of who wears what.
-    """
+    """Materials of the object."""
 
     repaint_original: bool
+    """Whether objects that come with materials of their own lose them."""
     surfaces: tuple[Surface, ...]
+    """Materials that parts which are no handles choose from; the first one is the body's."""
     handle: Surface
+    """Material of handles and knobs."""
     per_link: bool
+    """Whether every link chooses for itself rather than every kind of part."""
     seed: int
+    """Seed of who wears what."""
 
 
 @dataclass(frozen=True)
 class Appearance:
-    """Everything random about how a scene looks.
-
-    Attributes:
-        ambient: linear colour of the light from everywhere.
-        lights: one to three lights.
-        shadows: whether the first directional light casts shadows.
-        floor: material of the floor.
-        wall: material of the wall behind the object, or None for no wall.
-        wall_gap: its distance behind the distractors, in half diagonals.
-        distractors: things around.
-        look: materials of the object; None leaves every material as it came.
-    """
+    """Everything random about how a scene looks."""
 
     ambient: Colour
+    """Linear colour of the light from everywhere."""
     lights: tuple[Light, ...]
+    """One to three lights."""
     shadows: bool
+    """Whether the first directional light casts shadows."""
     floor: Surface
+    """Material of the floor."""
     wall: Surface | None
+    """Material of the wall behind the object, or None for no wall."""
     wall_gap: float
+    """Its distance behind the distractors, in half diagonals."""
     distractors: tuple[Distractor, ...]
+    """Things around."""
     look: ObjectLook | None
+    """Materials of the object; None leaves every material as it came."""
 
 
 @dataclass(frozen=True)
 class Region:
-    """The box that the object sweeps while its joints move.
-
-    Attributes:
-        low: smallest world coordinates, metres; ``low[2]`` is the ground.
-        high: largest world coordinates, metres.
-    """
+    """The box that the object sweeps while its joints move."""
 
     low: Float[np.ndarray, "3"]
+    """Smallest world coordinates, metres; ``low[2]`` is the ground."""
     high: Float[np.ndarray, "3"]
+    """Largest world coordinates, metres."""
 
     @classmethod
     def around(cls, points: Float[np.ndarray, "N 3"]) -> Region:

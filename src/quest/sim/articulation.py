@@ -22,50 +22,44 @@ MAX_TURN_RAD = np.deg2rad(110)
 
 @dataclass(frozen=True)
 class Part:
-    """One visual mesh or primitive of a body.
-
-    Attributes:
-        name: name that tells what it is (``handle-14``, ``drawer_front-31``); empty if unknown.
-        visual: name that the URDF gives the visual itself; empty if none.
-        body: index of the body that it belongs to.
-        body_from_part: pose in the body, metres.
-        mesh: mesh file, or None for a primitive.
-        scale: factors from the mesh file's units to metres, per axis.
-        uv_scale: the same before the object was stretched: for texture coordinates, which takes of one object share.
-        shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
-        rgba: colour given by the URDF, or None.
-        surface: the geometry in the body's frame, metres.
-    """
+    """One visual mesh or primitive of a body."""
 
     name: str
+    """Name that tells what it is (``handle-14``, ``drawer_front-31``); empty if unknown."""
     visual: str
+    """Name that the URDF gives the visual itself; empty if none."""
     body: int
+    """Index of the body that it belongs to."""
     body_from_part: Float[np.ndarray, "4 4"]
+    """Pose in the body, metres."""
     mesh: Path | None
+    """Mesh file, or None for a primitive."""
     scale: tuple[float, float, float]
+    """Factors from the mesh file's units to metres, per axis."""
     uv_scale: tuple[float, float, float]
+    """The same before the object was stretched: for texture coordinates, which takes of one object share."""
     shape: str
+    """``mesh``, ``box``, ``cylinder`` or ``sphere``."""
     rgba: tuple[float, float, float, float] | None
+    """Colour given by the URDF, or None."""
     surface: trimesh.Trimesh
+    """The geometry in the body's frame, metres."""
 
 
 @dataclass(frozen=True)
 class ArticulatedJoint:
-    """A moving joint; it carries body ``1 + its index``.
-
-    Attributes:
-        joint: name, kind and limits (radians or metres).
-        parent: index of the parent body.
-        parent_from_joint: pose of the joint frame in the parent body, metres.
-        axis: unit direction in the joint frame; the axis passes through its origin.
-        rest: closed position: zero, clamped into the limits.
-    """
+    """A moving joint; it carries body ``1 + its index``."""
 
     joint: Joint
+    """Name, kind and limits (radians or metres)."""
     parent: int
+    """Index of the parent body."""
     parent_from_joint: Float[np.ndarray, "4 4"]
+    """Pose of the joint frame in the parent body, metres."""
     axis: Float[np.ndarray, "3"]
+    """Unit direction in the joint frame; the axis passes through its origin."""
     rest: float
+    """Closed position: zero, clamped into the limits."""
 
     def travel(self) -> tuple[float, float]:
         """How far the joint can go below and above its rest position, both >= 0, radians or metres."""
@@ -92,19 +86,16 @@ class ArticulatedJoint:
 
 @dataclass(frozen=True)
 class Articulation:
-    """The bodies and joints of one object.
-
-    Attributes:
-        body_names: name per body.
-        parts: all visuals, of all bodies.
-        joints: moving joints, parents before children; joint ``j`` carries body ``1 + j``.
-        world_from_root: where the root body stands in the world (z up, floor at 0, front towards +x).
-    """
+    """The bodies and joints of one object."""
 
     body_names: tuple[str, ...]
+    """Name per body."""
     parts: tuple[Part, ...]
+    """All visuals, of all bodies."""
     joints: tuple[ArticulatedJoint, ...]
+    """Moving joints, parents before children; joint ``j`` carries body ``1 + j``."""
     world_from_root: Float[np.ndarray, "4 4"]
+    """Where the root body stands in the world (z up, floor at 0, front towards +x)."""
 
     @property
     def rest(self) -> Float[np.ndarray, " J"]:

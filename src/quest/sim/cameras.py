@@ -207,25 +207,21 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class CameraStyle:
-    """Where cameras stand and how they move.
-
-    Attributes:
-        motion: one of :data:`CAMERA_MOTIONS`, or :data:`MIXED`.
-        azimuth_deg: range of the direction to the camera at the first frame; 0 is the front, positive towards +y.
-        elevation_deg: range of its height above the horizon at the first frame; None: by the object, higher for one
-            that lies flat.
-        mirrored: whether half of the cameras stand on the other side, at minus that azimuth.
-        sweep_deg: how far an orbit turns, at most 90.
-        turn: ``around`` (in azimuth, and a little in elevation), ``over`` (from the side, within 10 degrees of the
-            horizon, up to the top) or ``any`` (either one, or down from the top).
-    """
+    """Where cameras stand and how they move."""
 
     motion: str = "static"
+    """One of :data:`CAMERA_MOTIONS`, or :data:`MIXED`."""
     azimuth_deg: tuple[float, float] = AZIMUTH_DEG
+    """Range of the direction to the camera at the first frame; 0 is the front, positive towards +y."""
     elevation_deg: tuple[float, float] | None = None
+    """Range of its height above the horizon at the first frame; None: by the object, higher for one that lies flat."""
     mirrored: bool = False
+    """Whether half of the cameras stand on the other side, at minus that azimuth."""
     sweep_deg: float = 60.0
+    """How far an orbit turns, at most 90."""
     turn: Literal["around", "over", "any"] = "any"
+    """``around`` (in azimuth, and a little in elevation), ``over`` (from the side, within 10 degrees of the horizon, up
+    to the top) or ``any`` (either one, or down from the top)."""
 
     def __post_init__(self) -> None:
         if self.motion not in (*CAMERA_MOTIONS, MIXED):
@@ -250,25 +246,22 @@ class CameraStyle:
 
 @dataclass(frozen=True)
 class PathRequest:
-    """One camera that is to move.
-
-    Attributes:
-        points: world points that it is to see: the object on the origin, in all its joint states.
-        direction: unit vector from the object to the camera at the first frame.
-        frames: how many frames the path has.
-        rng: what the path is drawn from.
-        style: the style of all cameras.
-        width: image width, pixels.
-        height: image height, pixels.
-    """
+    """One camera that is to move."""
 
     points: Float[np.ndarray, "N 3"]
+    """World points that it is to see: the object on the origin, in all its joint states."""
     direction: Float[np.ndarray, "3"]
+    """Unit vector from the object to the camera at the first frame."""
     frames: int
+    """How many frames the path has."""
     rng: np.random.Generator
+    """What the path is drawn from."""
     style: CameraStyle
+    """The style of all cameras."""
     width: int
+    """Image width, pixels."""
     height: int
+    """Image height, pixels."""
 
     def aimed(self, fill_range: tuple[float, float]) -> PosedCamera:
         """A camera that sees all points, which fill so much of the image."""

@@ -39,16 +39,13 @@ _GOODBYE_S = 10.0
 
 @dataclass(frozen=True)
 class ClusterSettings:
-    """Where to work, and how much of it to take.
-
-    Attributes:
-        address: of the cluster's head, ``auto`` for the one that this machine belongs to, or ``local`` for a cluster
-            on this machine alone that ends with the production.
-        cpus_per_worker: processor cores that a worker claims. A node gets as many workers as it has room for.
-    """
+    """Where to work, and how much of it to take."""
 
     address: str = "auto"
+    """Of the cluster's head, ``auto`` for the one that this machine belongs to, or ``local`` for a cluster on this
+    machine alone that ends with the production."""
     cpus_per_worker: int = 2
+    """Processor cores that a worker claims. A node gets as many workers as it has room for."""
 
     def __post_init__(self) -> None:
         if self.cpus_per_worker < 1:

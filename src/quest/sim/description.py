@@ -39,40 +39,34 @@ _ENTITY_KEYS = ("link", "visual", "label", "point")
 
 @dataclass(frozen=True)
 class DescribedEntity:
-    """One entry of ``entities``.
-
-    Attributes:
-        where: file and entry, for messages.
-        label: one of :data:`quest.types.LABELS`.
-        link: name of the URDF's link, or None.
-        visual: pattern of names of visuals or mesh files (``*`` stands for anything), or None.
-        point: position in the link's frame, in the URDF's units, or None.
-    """
+    """One entry of ``entities``."""
 
     where: str
+    """File and entry, for messages."""
     label: str
+    """One of :data:`quest.types.LABELS`."""
     link: str | None
+    """Name of the URDF's link, or None."""
     visual: str | None
+    """Pattern of names of visuals or mesh files (``*`` stands for anything), or None."""
     point: tuple[float, float, float] | None
+    """Position in the link's frame, in the URDF's units, or None."""
 
 
 @dataclass(frozen=True)
 class Description:
-    """What a user says of an object.
-
-    Attributes:
-        category: what it is; None if not told.
-        size_m: its longest extent at rest, or None.
-        height_m: its height at rest, or None.
-        front: a key of :data:`FRONTS`, or None to find out.
-        entities: what can be followed.
-    """
+    """What a user says of an object."""
 
     category: str | None = None
+    """What it is; None if not told."""
     size_m: float | None = None
+    """Its longest extent at rest, or None."""
     height_m: float | None = None
+    """Its height at rest, or None."""
     front: str | None = None
+    """A key of :data:`FRONTS`, or None to find out."""
     entities: tuple[DescribedEntity, ...] = ()
+    """What can be followed."""
 
 
 CORRECTIONS = {

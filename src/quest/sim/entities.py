@@ -51,44 +51,38 @@ _SEEN_FROM_DEG = tuple((a, e) for a in (-45, -15, 15, 45) for e in (10, 30, 50))
 
 @dataclass(frozen=True)
 class PlacedEntity:
-    """An entity that somebody has pointed out.
-
-    Attributes:
-        where: who says so, for messages.
-        label: ``handle``, ``knob``, ``rim`` or ``front``.
-        body: the body that carries it; if there are ``parts``, these tell.
-        point: where it is in its body, metres, or None to find out.
-        parts: indices of the parts that are it.
-    """
+    """An entity that somebody has pointed out."""
 
     where: str
+    """Who says so, for messages."""
     label: str
+    """``handle``, ``knob``, ``rim`` or ``front``."""
     body: int
+    """The body that carries it; if there are ``parts``, these tell."""
     point: Float[np.ndarray, "3"] | None
+    """Where it is in its body, metres, or None to find out."""
     parts: tuple[int, ...]
+    """Indices of the parts that are it."""
 
 
 @dataclass(frozen=True)
 class SimEntity:
-    """An entity of a simulated object.
-
-    Attributes:
-        name: unique within the object, such as ``link_0/handle``.
-        label: ``handle``, ``knob``, ``rim``, ``front`` or ``hinge``.
-        joint: index of the joint that moves it, whose body is ``1 + joint``; -1 if it is fixed in the base, body 0.
-        point: where it is in its body, metres.
-        parts: indices of the parts that it is made of; empty for rims, fronts and hinges.
-        travel_m: how far it gets from its place at rest when only its joint moves.
-        inside: whether nothing of it can be seen from the front while the object is closed.
-    """
+    """An entity of a simulated object."""
 
     name: str
+    """Unique within the object, such as ``link_0/handle``."""
     label: str
+    """``handle``, ``knob``, ``rim``, ``front`` or ``hinge``."""
     joint: int
+    """Index of the joint that moves it, whose body is ``1 + joint``; -1 if it is fixed in the base, body 0."""
     point: Float[np.ndarray, "3"]
+    """Where it is in its body, metres."""
     parts: tuple[int, ...]
+    """Indices of the parts that it is made of; empty for rims, fronts and hinges."""
     travel_m: float
+    """How far it gets from its place at rest when only its joint moves."""
     inside: bool
+    """Whether nothing of it can be seen from the front while the object is closed."""
 
     @property
     def body(self) -> int:

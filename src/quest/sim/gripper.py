@@ -44,21 +44,18 @@ Material = Literal["shell", "metal", "rubber"]
 
 @dataclass(frozen=True)
 class GripperPart:
-    """A box, or a cylinder along z.
-
-    Attributes:
-        kind: which of them.
-        material: what it is made of.
-        half_m: half extents along x, y, z.
-        centre_m: middle; a finger's with its jaw closed.
-        side: -1 or 1 if it moves with the finger on that side along y, else 0.
-    """
+    """A box, or a cylinder along z."""
 
     kind: Literal["box", "cylinder"]
+    """Which of them."""
     material: Material
+    """What it is made of."""
     half_m: tuple[float, float, float]
+    """Half extents along x, y, z."""
     centre_m: tuple[float, float, float]
+    """Middle; a finger's with its jaw closed."""
     side: int = 0
+    """-1 or 1 if it moves with the finger on that side along y, else 0."""
 
 
 def _finger(side: int) -> tuple[GripperPart, ...]:
@@ -84,15 +81,12 @@ GRIPPER_PARTS = (
 
 @dataclass(frozen=True)
 class Boxes:
-    """Boxes along the axes of a gripper's frame, one a part.
-
-    Attributes:
-        low: smallest coordinates, metres.
-        high: largest coordinates, metres.
-    """
+    """Boxes along the axes of a gripper's frame, one a part."""
 
     low: Float[np.ndarray, "P 3"]
+    """Smallest coordinates, metres."""
     high: Float[np.ndarray, "P 3"]
+    """Largest coordinates, metres."""
 
     @classmethod
     def of(cls, scale: float, opening_m: float, *, shrink_m: float = 0.0) -> Boxes:
@@ -160,21 +154,18 @@ def gripper_scale(half_diagonal_m: float) -> float:
 
 @dataclass(frozen=True)
 class Grasp:
-    """How an entity is held.
-
-    Attributes:
-        entity: what is held.
-        body_from_gripper: where the gripper is then.
-        width_m: distance between its pads then; 0 if closed fingers touch.
-        open_m: distance between its pads as it comes and goes.
-        back_m: how far it goes straight back to be clear of the object.
-    """
+    """How an entity is held."""
 
     entity: SimEntity
+    """What is held."""
     body_from_gripper: Float[np.ndarray, "4 4"]
+    """Where the gripper is then."""
     width_m: float
+    """Distance between its pads then; 0 if closed fingers touch."""
     open_m: float
+    """Distance between its pads as it comes and goes."""
     back_m: float
+    """How far it goes straight back to be clear of the object."""
 
 
 class ObjectSamples:
@@ -428,15 +419,12 @@ _STRAYS = 0.03
 
 @dataclass(frozen=True)
 class Gripper:
-    """A gripper that moves; a prop.
-
-    Attributes:
-        parts: its parts with their materials and poses.
-        grasps: name of every entity that it holds, the first frame and the frame after the last.
-    """
+    """A gripper that moves; a prop."""
 
     parts: tuple[Occluder, ...]
+    """Its parts with their materials and poses."""
     grasps: tuple[tuple[str, int, int], ...]
+    """Name of every entity that it holds, the first frame and the frame after the last."""
 
     @property
     def world_from_part(self) -> Float[np.ndarray, "S P 4 4"]:

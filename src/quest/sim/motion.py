@@ -179,22 +179,19 @@ _PAUSE_S = (0.3, 3.0)
 
 @dataclass(frozen=True)
 class MotionStyle:
-    """How joints move.
-
-    Attributes:
-        kind: ``human`` (minimum jerk, stops, returns), ``robot`` (constant speed between ramps, waits, regrasps),
-            ``creep`` (slowly all the way, sticking and slipping) or ``mixed`` (every movement draws one).
-        overlap: part of a joint's share, in [0, 0.9), in which the next one is already on its way. N shares of F frames
-            make a take of ``F + (N - 1) round((1 - overlap) F)`` frames, unless a joint has to wait for itself.
-        margin: frames at the start and at the end of every share in which its joint does not move, after the hold.
-        cycles: how often the joints are gone through: in the first pass they open in order, in the second they close
-            in the opposite order, in the third they open again, and so on.
-    """
+    """How joints move."""
 
     kind: Literal["human", "robot", "creep", "mixed"] = "human"
+    """``human`` (minimum jerk, stops, returns), ``robot`` (constant speed between ramps, waits, regrasps), ``creep``
+    (slowly all the way, sticking and slipping) or ``mixed`` (every movement draws one)."""
     overlap: float = 0.0
+    """Part of a joint's share, in [0, 0.9), in which the next one is already on its way. N shares of F frames make a
+    take of ``F + (N - 1) round((1 - overlap) F)`` frames, unless a joint has to wait for itself."""
     margin: tuple[int, int] = (0, 0)
+    """Frames at the start and at the end of every share in which its joint does not move, after the hold."""
     cycles: int = 1
+    """How often the joints are gone through: in the first pass they open in order, in the second they close in the
+    opposite order, in the third they open again, and so on."""
 
     def __post_init__(self) -> None:
         if self.kind not in (*PROFILES, "mixed"):
@@ -209,23 +206,20 @@ class MotionStyle:
 
 @dataclass(frozen=True)
 class Share:
-    """One movement of one joint.
-
-    Attributes:
-        joint: which one.
-        start: first frame of the share.
-        moves: first frame at which the joint may be elsewhere than before.
-        stops: from here on it stays where it is.
-        end: one past the last frame of the share.
-        opens: whether it opens or closes.
-    """
+    """One movement of one joint."""
 
     joint: int
+    """Which one."""
     start: int
+    """First frame of the share."""
     moves: int
+    """First frame at which the joint may be elsewhere than before."""
     stops: int
+    """From here on it stays where it is."""
     end: int
+    """One past the last frame of the share."""
     opens: bool = True
+    """Whether it opens or closes."""
 
 
 def motion_script(

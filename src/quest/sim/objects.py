@@ -41,29 +41,26 @@ _CATEGORY_OF_BASE = {
 
 @dataclass(frozen=True)
 class SimObject:
-    """An articulated object, ready to be moved and rendered.
-
-    Attributes:
-        source: ``partnet-mobility``, ``procedural``, or ``own`` for a user's own.
-        object_id: the folder's name.
-        category: such as ``StorageFurniture``; ``Unknown`` if the folder does not tell.
-        folder: where it was read from.
-        articulation: bodies, joints and their geometry, metres.
-        entities: what can be followed; hinges come last.
-        half_diagonal_m: half the diagonal of the bounding box at rest.
-        scale: metres per unit of the URDF.
-        warnings: degradations, in words: missing meshes, a category that is not known.
-    """
+    """An articulated object, ready to be moved and rendered."""
 
     source: Literal["partnet-mobility", "procedural", "own"]
+    """``partnet-mobility``, ``procedural``, or ``own`` for a user's own."""
     object_id: str
+    """The folder's name."""
     category: str
+    """Such as ``StorageFurniture``; ``Unknown`` if the folder does not tell."""
     folder: Path
+    """Where it was read from."""
     articulation: Articulation
+    """Bodies, joints and their geometry, metres."""
     entities: tuple[SimEntity, ...]
+    """What can be followed; hinges come last."""
     half_diagonal_m: float
+    """Half the diagonal of the bounding box at rest."""
     scale: float
+    """Metres per unit of the URDF."""
     warnings: tuple[str, ...]
+    """Degradations, in words: missing meshes, a category that is not known."""
 
     @property
     def movable(self) -> tuple[int, ...]:

@@ -37,27 +37,24 @@ _SLIDE_FRAMES = (2, 3)
 
 @dataclass(frozen=True)
 class Episode:
-    """One joint's share of the script; ends are one past the last frame.
-
-    Attributes:
-        joint: the joint that moves.
-        start: first frame of the share.
-        moves: first frame at which the joint is elsewhere.
-        hidden: first frame at which its entity is hidden.
-        stops: first frame at which the joint has stopped.
-        shown: end of the hidden frames.
-        end: end of the share.
-        slide: frames that the occluder takes to come, and to go.
-    """
+    """One joint's share of the script; ends are one past the last frame."""
 
     joint: int
+    """The joint that moves."""
     start: int
+    """First frame of the share."""
     moves: int
+    """First frame at which the joint is elsewhere."""
     hidden: int
+    """First frame at which its entity is hidden."""
     stops: int
+    """First frame at which the joint has stopped."""
     shown: int
+    """End of the hidden frames."""
     end: int
+    """End of the share."""
     slide: int
+    """Frames that the occluder takes to come, and to go."""
 
     def away(self, frames: int) -> Float[np.ndarray, " T"]:
         """How far the occluder is at every frame of the script: 0 while it hides, 1 while it is out of the image."""

@@ -63,24 +63,21 @@ _WITHIN = 1e-6
 
 @dataclass(frozen=True)
 class JointFeel:
-    """How joints resist, and how firmly they are pulled.
-
-    Attributes:
-        pull_hz: natural frequency of the drive with the link that it pulls: stiffness per inertia. The drive is firmer
-            where the weight that it holds would draw it more than 3 % of the joint's travel out.
-        pull_damping: damping ratio of the drive; 1 is critical.
-        friction: dry friction: how far the script must be ahead, as a share of the joint's travel, before it gives way.
-        drag_per_s: viscous drag per inertia.
-        foresight: part of the script's velocity that the drive goes along with; without, it only pulls where it lags.
-        support: part of the weight that springs, counterweights or stiff hinges carry; the drive holds the rest.
-    """
+    """How joints resist, and how firmly they are pulled."""
 
     pull_hz: Float[np.ndarray, " J"]
+    """Natural frequency of the drive with the link that it pulls: stiffness per inertia. The drive is firmer where the
+    weight that it holds would draw it more than 3 % of the joint's travel out."""
     pull_damping: Float[np.ndarray, " J"]
+    """Damping ratio of the drive; 1 is critical."""
     friction: Float[np.ndarray, " J"]
+    """Dry friction: how far the script must be ahead, as a share of the joint's travel, before it gives way."""
     drag_per_s: Float[np.ndarray, " J"]
+    """Viscous drag per inertia."""
     foresight: Float[np.ndarray, " J"]
+    """Part of the script's velocity that the drive goes along with; without, it only pulls where it lags."""
     support: Float[np.ndarray, " J"]
+    """Part of the weight that springs, counterweights or stiff hinges carry; the drive holds the rest."""
 
     @classmethod
     def drawn(cls, joints: int, rng: np.random.Generator) -> JointFeel:
@@ -91,17 +88,14 @@ class JointFeel:
 
 @dataclass(frozen=True)
 class Heft:
-    """What a body weighs.
-
-    Attributes:
-        mass_kg: its mass.
-        centre: its centre of mass, in the body's frame.
-        inertia: about its centre of mass, in the body's axes, kg m^2.
-    """
+    """What a body weighs."""
 
     mass_kg: float
+    """Its mass."""
     centre: Float[np.ndarray, "3"]
+    """Its centre of mass, in the body's frame."""
     inertia: Float[np.ndarray, "3 3"]
+    """About its centre of mass, in the body's axes, kg m^2."""
 
     @classmethod
     def of(cls, parts: list[Part], density: float) -> Heft:

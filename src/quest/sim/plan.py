@@ -17,23 +17,20 @@ from quest.sim.suites import Suite
 
 @dataclass(frozen=True)
 class TakeSpec:
-    """One take to make.
-
-    Attributes:
-        source: ``partnet``, ``procedural`` or ``own``.
-        object_id: folder name, ``category-seed``, or the path of a user's own folder or URDF.
-        level: how many joints move.
-        seed: of the take.
-        settings: how it is made.
-        suite: which suite it belongs to; None for an ordinary take.
-    """
+    """One take to make."""
 
     source: str
+    """``partnet``, ``procedural`` or ``own``."""
     object_id: str
+    """Folder name, ``category-seed``, or the path of a user's own folder or URDF."""
     level: int
+    """How many joints move."""
     seed: int
+    """Of the take."""
     settings: TakeSettings = TakeSettings()
+    """How it is made."""
     suite: Suite | None = None
+    """Which suite it belongs to; None for an ordinary take."""
 
     @property
     def name(self) -> str:

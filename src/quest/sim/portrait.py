@@ -30,19 +30,16 @@ _SUN = Light("directional", (0.55, 0.45, 0.75), 4.0, (1.0, 0.98, 0.95))
 
 @dataclass(frozen=True)
 class Portrait:
-    """One picture of an object.
-
-    Attributes:
-        opened: whether its joints are open.
-        rgb: colours.
-        uv_px: pixel of every entity.
-        visible: which of them are seen.
-    """
+    """One picture of an object."""
 
     opened: bool
+    """Whether its joints are open."""
     rgb: UInt8[np.ndarray, "S S 3"]
+    """Colours."""
     uv_px: Float[np.ndarray, "E 2"]
+    """Pixel of every entity."""
     visible: Bool[np.ndarray, " E"]
+    """Which of them are seen."""
 
 
 def portray(sim_object: SimObject, renderer: Renderer, *, sides: int = 2, size_px: int = 288) -> list[Portrait]:

@@ -32,34 +32,28 @@ _WAIT_FOR_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class TakeMade:
-    """A take is in the store.
-
-    Attributes:
-        spec: which one.
-        frames: its frames, all views counted.
-        seconds: how long it took to make, without writing it.
-        warnings: what was found wrong with its object.
-        node: which machine made it; empty for this one.
-    """
+    """A take is in the store."""
 
     spec: TakeSpec
+    """Which one."""
     frames: int
+    """Its frames, all views counted."""
     seconds: float
+    """How long it took to make, without writing it."""
     warnings: tuple[str, ...] = ()
+    """What was found wrong with its object."""
     node: str = ""
+    """Which machine made it; empty for this one."""
 
 
 @dataclass(frozen=True)
 class TakeSkipped:
-    """A take cannot be made.
-
-    Attributes:
-        spec: which one.
-        reason: why not.
-    """
+    """A take cannot be made."""
 
     spec: TakeSpec
+    """Which one."""
     reason: str
+    """Why not."""
 
 
 @dataclass(frozen=True)
@@ -112,15 +106,12 @@ class StudioOpener(Protocol):
 
 @dataclass(frozen=True)
 class StudioSettings:
-    """Studios that render.
-
-    Attributes:
-        objects_root: folder of PartNet-Mobility folders; None for the environment's ``QUEST_OBJECTS``.
-        command: the command that makes these takes, for their provenance.
-    """
+    """Studios that render."""
 
     objects_root: Path | None = None
+    """Folder of PartNet-Mobility folders; None for the environment's ``QUEST_OBJECTS``."""
     command: str = ""
+    """The command that makes these takes, for their provenance."""
 
     def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> RenderingStudio:
         """A studio that can make these takes.

@@ -49,17 +49,14 @@ _CORNERS = 32
 
 @dataclass(frozen=True)
 class Shape:
-    """A box or a cylinder before a camera.
-
-    Attributes:
-        kind: ``box``, or ``cylinder`` with its axis along x.
-        half_m: half extents along x, y, z; a cylinder's last two are its radius.
-        cam_from_shape: its pose.
-    """
+    """A box or a cylinder before a camera."""
 
     kind: Literal["box", "cylinder"]
+    """``box``, or ``cylinder`` with its axis along x."""
     half_m: Float[np.ndarray, "3"]
+    """Half extents along x, y, z; a cylinder's last two are its radius."""
     cam_from_shape: Float[np.ndarray, "4 4"]
+    """Its pose."""
 
     @property
     def vertices(self) -> Float[np.ndarray, "N 3"]:
@@ -86,17 +83,14 @@ class Shape:
 
 @dataclass(frozen=True)
 class Occluder:
-    """A shape with a material that moves.
-
-    Attributes:
-        shape: what it is, at the place where it hides something.
-        surface: its material.
-        world_from_shape: its pose at every frame of the script.
-    """
+    """A shape with a material that moves."""
 
     shape: Shape
+    """What it is, at the place where it hides something."""
     surface: Surface
+    """Its material."""
     world_from_shape: Float[np.ndarray, "T 4 4"]
+    """Its pose at every frame of the script."""
 
     def add(self, scene: Any) -> Any:
         """Put it into a ``sapien.Scene``; returns the entity that :meth:`place` moves."""
@@ -243,15 +237,12 @@ def disturbed_at(frames: int, rng: np.random.Generator) -> int:
 
 @dataclass(frozen=True)
 class LightChange:
-    """Lamps and daylight that change their strength and colour once, within a few frames; a prop.
-
-    Attributes:
-        ambient: factors of the light from everywhere, linear red, green, blue, at every frame of the script.
-        lamps: factors of all other lights likewise.
-    """
+    """Lamps and daylight that change their strength and colour once, within a few frames; a prop."""
 
     ambient: Float[np.ndarray, "S 3"]
+    """Factors of the light from everywhere, linear red, green, blue, at every frame of the script."""
     lamps: Float[np.ndarray, "S 3"]
+    """Factors of all other lights likewise."""
 
     def add(self, scene: Any) -> Any:
         """Finds the lights of a ``sapien.Scene``; returns them with their colours, and the scene."""

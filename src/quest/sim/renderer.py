@@ -37,19 +37,16 @@ Dress = Callable[["sapien.Scene", list[Any]], None]
 
 @dataclass(frozen=True)
 class Picture:
-    """What one camera sees at one moment.
-
-    Attributes:
-        rgb: colours.
-        depth_m: depth along +z in metres, 0 where nothing is.
-        body: 0 background, else 1 + body index.
-        entity: 0 nothing, else 1 + entity index; only entities that have meshes of their own.
-    """
+    """What one camera sees at one moment."""
 
     rgb: UInt8[np.ndarray, "H W 3"]
+    """Colours."""
     depth_m: Float32[np.ndarray, "H W"]
+    """Depth along +z in metres, 0 where nothing is."""
     body: UInt8[np.ndarray, "H W"]
+    """0 background, else 1 + body index."""
     entity: UInt8[np.ndarray, "H W"]
+    """0 nothing, else 1 + entity index; only entities that have meshes of their own."""
 
 
 class Renderer:

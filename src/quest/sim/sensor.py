@@ -46,35 +46,32 @@ _LASTING = 0.5
 
 @dataclass(frozen=True)
 class DepthSensor:
-    """A depth sensor with two eyes.
-
-    Attributes:
-        baseline_m: from the camera to its second eye, which is on its right.
-        focal_px: its own focal length, in its own pixels.
-        step_px: step of its disparity.
-        noise_m: standard deviation of depth, metres, where it is best: ``noise_m + noise_per_m (z - best_m)^2``.
-        noise_per_m: growth of that, per metre.
-        best_m: depth from which on it grows.
-        slant_m: further standard deviation ``slant_m / sqrt(z) * (a / (90 deg - a))^2`` at an angle ``a``.
-        lateral_px: standard deviation of where it looks, in its own pixels.
-        range_m: nearest and farthest depth.
-        torn: how often a pixel at a discontinuity is a hole.
-        lost_dark: how often a black pixel is a hole.
-        lost_shiny: how often a white highlight is a hole.
-    """
+    """A depth sensor with two eyes."""
 
     baseline_m: float
+    """From the camera to its second eye, which is on its right."""
     focal_px: float
+    """Its own focal length, in its own pixels."""
     step_px: float
+    """Step of its disparity."""
     noise_m: float
+    """Standard deviation of depth, metres, where it is best: ``noise_m + noise_per_m (z - best_m)^2``."""
     noise_per_m: float
+    """Growth of that, per metre."""
     best_m: float
+    """Depth from which on it grows."""
     slant_m: float
+    """Further standard deviation ``slant_m / sqrt(z) * (a / (90 deg - a))^2`` at an angle ``a``."""
     lateral_px: float
+    """Standard deviation of where it looks, in its own pixels."""
     range_m: tuple[float, float]
+    """Nearest and farthest depth."""
     torn: float
+    """How often a pixel at a discontinuity is a hole."""
     lost_dark: float
+    """How often a black pixel is a hole."""
     lost_shiny: float
+    """How often a white highlight is a hole."""
 
     def __post_init__(self) -> None:
         positive = (self.baseline_m, self.focal_px, self.step_px, *self.range_m)
@@ -130,21 +127,18 @@ STEREO = DepthSensor(
 
 @dataclass(frozen=True)
 class SensorModel:
-    """What happens to colours and depth between the scene and the file.
-
-    Attributes:
-        depth: the depth sensor, or None for depth as rendered.
-        rgb_noise: standard deviation of Gaussian noise, as a share of full scale.
-        blur_px: standard deviation of a Gaussian blur, pixels of the picture.
-        motion_blur_px: length of a straight smear in a direction that all frames share.
-        jpeg_quality: 1 to 100, or None for no compression.
-    """
+    """What happens to colours and depth between the scene and the file."""
 
     depth: DepthSensor | None = None
+    """The depth sensor, or None for depth as rendered."""
     rgb_noise: float = 0.0
+    """Standard deviation of Gaussian noise, as a share of full scale."""
     blur_px: float = 0.0
+    """Standard deviation of a Gaussian blur, pixels of the picture."""
     motion_blur_px: float = 0.0
+    """Length of a straight smear in a direction that all frames share."""
     jpeg_quality: int | None = None
+    """1 to 100, or None for no compression."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.rgb_noise <= 1:

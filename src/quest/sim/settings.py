@@ -16,41 +16,37 @@ from quest.sim.sensor import SensorModel
 
 @dataclass(frozen=True)
 class TakeSettings:
-    """How takes are made.
-
-    Attributes:
-        views: how many cameras.
-        size: width and height of the images, pixels; one number for square ones.
-        every: keep every n-th frame of the motion script.
-        frames_per_joint: frames of the script that each joint gets; takes in which things are hidden have scripts of
-            their own.
-        frames: length of a script in which joints open and close again and again; None for one share per joint.
-        randomize_materials: whether objects get random materials, beside random light and surroundings.
-        broad_materials: whether materials are drawn from all textures rather than the usual ones.
-        cameras: where cameras stand and how they move.
-        motion: how joints move.
-        physics: whether joints are driven through a physics engine along their script, or play it as it is.
-        gripper: whether a gripper pulls what moves.
-        sensor: what the sensor makes of colours and depth; the ground truth knows nothing of it.
-        disturbance: what happens to light, materials or cameras.
-        stretch: up to which factor every take has the object stretched along its depth, width and height; 1 leaves it
-            as it is.
-    """
+    """How takes are made."""
 
     views: int = 3
+    """How many cameras."""
     size: int | tuple[int, int] = 224
+    """Width and height of the images, pixels; one number for square ones."""
     every: int = 1
+    """Keep every n-th frame of the motion script."""
     frames_per_joint: int = 60
+    """Frames of the script that each joint gets; takes in which things are hidden have scripts of their own."""
     frames: int | None = None
+    """Length of a script in which joints open and close again and again; None for one share per joint."""
     randomize_materials: bool = True
+    """Whether objects get random materials, beside random light and surroundings."""
     broad_materials: bool = False
+    """Whether materials are drawn from all textures rather than the usual ones."""
     cameras: CameraStyle = CameraStyle()
+    """Where cameras stand and how they move."""
     motion: MotionStyle = MotionStyle()
+    """How joints move."""
     physics: bool = False
+    """Whether joints are driven through a physics engine along their script, or play it as it is."""
     gripper: bool = False
+    """Whether a gripper pulls what moves."""
     sensor: SensorModel = SensorModel()
+    """What the sensor makes of colours and depth; the ground truth knows nothing of it."""
     disturbance: Disturbance = "none"
+    """What happens to light, materials or cameras."""
     stretch: float = 1.0
+    """Up to which factor every take has the object stretched along its depth, width and height; 1 leaves it as it
+    is."""
 
     def __post_init__(self) -> None:
         if self.views < 1 or min(self.width, self.height) < 16:

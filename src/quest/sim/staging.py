@@ -29,23 +29,20 @@ _CAMERA_ATTEMPTS = 12
 
 @dataclass(frozen=True)
 class Playback:
-    """A motion script, played.
-
-    Attributes:
-        kept: frames of the script that the take keeps.
-        position: joint positions, radians or metres.
-        velocity: per second, of the whole script.
-        poses: ``world_from_body``.
-        points: world point of every entity.
-        swept: world points that bound the object, at a few moments.
-    """
+    """A motion script, played."""
 
     kept: Int[np.ndarray, " T"]
+    """Frames of the script that the take keeps."""
     position: Float[np.ndarray, "T J"]
+    """Joint positions, radians or metres."""
     velocity: Float[np.ndarray, "T J"]
+    """Per second, of the whole script."""
     poses: Float[np.ndarray, "T B 4 4"]
+    """``world_from_body``."""
     points: Float[np.ndarray, "T E 3"]
+    """World point of every entity."""
     swept: Float[np.ndarray, "N 3"]
+    """World points that bound the object, at a few moments."""
 
     @classmethod
     def of(cls, sim_object: SimObject, script: Float[np.ndarray, "S J"], every: int = 1) -> Playback:
@@ -59,23 +56,20 @@ class Playback:
 
 @dataclass(frozen=True)
 class Staging:
-    """A take before it is drawn.
-
-    Attributes:
-        moved_joints: the joints that move, in order.
-        playback: the motion.
-        cameras: where it is seen from at every frame of the script.
-        stage: the object before these cameras, not dressed yet.
-        props: what else is in the scene and moves or changes, by frames of the script.
-        about: what the take's provenance says of it.
-    """
+    """A take before it is drawn."""
 
     moved_joints: tuple[int, ...]
+    """The joints that move, in order."""
     playback: Playback
+    """The motion."""
     cameras: tuple[CameraPath, ...]
+    """Where it is seen from at every frame of the script."""
     stage: Stage
+    """The object before these cameras, not dressed yet."""
     props: tuple[Prop, ...] = ()
+    """What else is in the scene and moves or changes, by frames of the script."""
     about: dict[str, Any] = field(default_factory=dict)
+    """What the take's provenance says of it."""
 
 
 def stage_plain(

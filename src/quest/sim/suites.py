@@ -16,21 +16,17 @@ HIDDEN_FRAMES = (10, 120)
 
 @dataclass(frozen=True)
 class Hiding:
-    """How long entities are hidden, and beside what.
-
-    Attributes:
-        frames: frames for which every moving entity is hidden; None draws them from 10 to 120, take by take.
-        look_alike: whether another entity of the same label stays in view meanwhile; if not, none is ever in view.
-        before: fewest and most frames of a joint's share before its entity is hidden; the hold is part of the
-            first one's.
-        after: fewest and most frames of a joint's share that follow; in the first two or three the occluder is
-            still leaving.
-    """
+    """How long entities are hidden, and beside what."""
 
     frames: int | None
+    """Frames for which every moving entity is hidden; None draws them from 10 to 120, take by take."""
     look_alike: bool
+    """Whether another entity of the same label stays in view meanwhile; if not, none is ever in view."""
     before: tuple[int, int]
+    """Fewest and most frames of a joint's share before its entity is hidden; the hold is part of the first one's."""
     after: tuple[int, int]
+    """Fewest and most frames of a joint's share that follow; in the first two or three the occluder is still
+    leaving."""
 
     def __post_init__(self) -> None:
         low, high = HIDDEN_FRAMES
@@ -51,23 +47,20 @@ class Hiding:
 
 @dataclass(frozen=True)
 class Suite:
-    """What sets the takes of a suite apart from ordinary ones.
-
-    Attributes:
-        name: a key of :data:`SUITES`.
-        variant: which of the suite's kinds, such as ``blur``; empty if there is only one.
-        settings: how its takes are made unless a run says otherwise.
-        hiding: what is hidden when, or None if nothing is.
-        level: how many joints move unless a run says otherwise.
-        category: the only category of procedural objects that it takes, or None for all objects.
-    """
+    """What sets the takes of a suite apart from ordinary ones."""
 
     name: str
+    """A key of :data:`SUITES`."""
     variant: str = ""
+    """Which of the suite's kinds, such as ``blur``; empty if there is only one."""
     settings: TakeSettings = TakeSettings(views=1)
+    """How its takes are made unless a run says otherwise."""
     hiding: Hiding | None = None
+    """What is hidden when, or None if nothing is."""
     level: int = 1
+    """How many joints move unless a run says otherwise."""
     category: str | None = None
+    """The only category of procedural objects that it takes, or None for all objects."""
 
     def __post_init__(self) -> None:
         if self.hiding is not None:

@@ -26,21 +26,18 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Texture:
-    """A procedural texture; :func:`paint` makes its image.
-
-    Attributes:
-        kind: pattern.
-        first: main colour.
-        second: colour of the pattern's other half (grout, dark grain, second check).
-        repeats: how often the pattern repeats over the image, at least 1.
-        seed: seed of what is random in the pattern.
-    """
+    """A procedural texture; :func:`paint` makes its image."""
 
     kind: TextureKind
+    """Pattern."""
     first: Colour
+    """Main colour."""
     second: Colour
+    """Colour of the pattern's other half (grout, dark grain, second check)."""
     repeats: int
+    """How often the pattern repeats over the image, at least 1."""
     seed: int
+    """Seed of what is random in the pattern."""
 
 
 def paint(texture: Texture, *, size: int = 128) -> UInt8[np.ndarray, "S S 4"]:
@@ -207,21 +204,18 @@ TILE_M = 0.5
 
 @dataclass(frozen=True)
 class Surface:
-    """A material.
-
-    Attributes:
-        colour: sRGB colour where there is no texture.
-        roughness: 0 mirror, 1 matt.
-        metallic: 0 or near it for paint and wood, near 1 for metal.
-        specular: strength of the highlight of what is not metal.
-        texture: colours instead of ``colour``, or None.
-    """
+    """A material."""
 
     colour: Colour
+    """sRGB colour where there is no texture."""
     roughness: float
+    """0 mirror, 1 matt."""
     metallic: float
+    """0 or near it for paint and wood, near 1 for metal."""
     specular: float
+    """Strength of the highlight of what is not metal."""
     texture: Texture | None = None
+    """Colours instead of ``colour``, or None."""
 
 
 def sample_colour(rng: np.random.Generator) -> Colour:

@@ -23,52 +23,46 @@ _JOINT_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "
 
 @dataclass(frozen=True)
 class UrdfVisual:
-    """One visual of a URDF link: a mesh file or a primitive.
-
-    Attributes:
-        name: the visual's name; empty where the file gives none.
-        link_from_visual: pose in its URDF link.
-        mesh: mesh file, or None for a primitive.
-        scale: factors per axis of the mesh.
-        shape: ``mesh``, ``box``, ``cylinder`` or ``sphere``.
-        size: box edge lengths; or radius and length (cylinder); or radius (sphere).
-        rgba: colour of the visual's material, or None.
-    """
+    """One visual of a URDF link: a mesh file or a primitive."""
 
     name: str
+    """The visual's name; empty where the file gives none."""
     link_from_visual: Float[np.ndarray, "4 4"]
+    """Pose in its URDF link."""
     mesh: Path | None
+    """Mesh file, or None for a primitive."""
     scale: tuple[float, float, float]
+    """Factors per axis of the mesh."""
     shape: str
+    """``mesh``, ``box``, ``cylinder`` or ``sphere``."""
     size: tuple[float, ...]
+    """Box edge lengths; or radius and length (cylinder); or radius (sphere)."""
     rgba: tuple[float, float, float, float] | None
+    """Colour of the visual's material, or None."""
 
 
 @dataclass(frozen=True)
 class UrdfJoint:
-    """One joint of a URDF.
-
-    Attributes:
-        name: the joint's name.
-        kind: ``revolute``, ``prismatic`` or ``fixed``.
-        parent: name of the parent link.
-        child: name of the child link.
-        parent_from_joint: pose of the joint's frame in the parent link.
-        axis: unit direction in the joint's frame.
-        lower: lower limit, radians or URDF units.
-        upper: upper limit, radians or URDF units.
-        mimics: name of the joint that it should follow, or None.
-    """
+    """One joint of a URDF."""
 
     name: str
+    """The joint's name."""
     kind: str
+    """``revolute``, ``prismatic`` or ``fixed``."""
     parent: str
+    """Name of the parent link."""
     child: str
+    """Name of the child link."""
     parent_from_joint: Float[np.ndarray, "4 4"]
+    """Pose of the joint's frame in the parent link."""
     axis: Float[np.ndarray, "3"]
+    """Unit direction in the joint's frame."""
     lower: float
+    """Lower limit, radians or URDF units."""
     upper: float
+    """Upper limit, radians or URDF units."""
     mimics: str | None = None
+    """Name of the joint that it should follow, or None."""
 
 
 @dataclass(frozen=True)

@@ -22,21 +22,18 @@ _SURFACES = ("dark", "metal", "white", "body", "front")
 
 @dataclass(frozen=True)
 class _Panel:
-    """Where dials sit.
-
-    Attributes:
-        width: along x, metres.
-        height: along its own upright, metres.
-        foot: the middle of its lower front edge, in the object's frame.
-        tilt: how far it leans back, radians.
-        depth: how thick it is, metres.
-    """
+    """Where dials sit."""
 
     width: float
+    """Along x, metres."""
     height: float
+    """Along its own upright, metres."""
     foot: tuple[float, float, float]
+    """The middle of its lower front edge, in the object's frame."""
     tilt: float = 0.0
+    """How far it leans back, radians."""
     depth: float = 0.05
+    """How thick it is, metres."""
 
     def turned(self, mesh: Mesh) -> Mesh:
         """What is drawn for an upright panel, leant back with this one."""

@@ -19,48 +19,42 @@ _SIDE = {"door_left": (-1.0, 0.0), "door_right": (1.0, 0.0), "door_top": (0.0, 1
 
 @dataclass(frozen=True)
 class Cell:
-    """A rectangle of the front.
-
-    Attributes:
-        low: smallest x and z, metres.
-        high: largest x and z, metres.
-        kind: what fills it.
-    """
+    """A rectangle of the front."""
 
     low: tuple[float, float]
+    """Smallest x and z, metres."""
     high: tuple[float, float]
+    """Largest x and z, metres."""
     kind: CellKind
+    """What fills it."""
 
 
 @dataclass(frozen=True)
 class FrontStyle:
-    """How the fronts of one piece of furniture look.
-
-    Attributes:
-        handle: style of the handles, or None for fronts without any.
-        bare_share: share of the fronts that carry no handle although the others do.
-        board_m: thickness of a front.
-        gap_m: gap around a front.
-        overlay: whether fronts lie on the carcass rather than inside it.
-        panelled: whether fronts are a frame around a sunk panel.
-        drawer_height: where a drawer's handle sits, 0 at the bottom of its front, 1 at the top.
-        door_height: where a door's handle sits along its free edge.
-        door_vertical: whether long handles on doors run upright.
-        two_from_m: drawers at least this wide have two handles.
-        open_rad: how far doors open.
-    """
+    """How the fronts of one piece of furniture look."""
 
     handle: HandleStyle | None
+    """Style of the handles, or None for fronts without any."""
     bare_share: float
+    """Share of the fronts that carry no handle although the others do."""
     board_m: float
+    """Thickness of a front."""
     gap_m: float
+    """Gap around a front."""
     overlay: bool
+    """Whether fronts lie on the carcass rather than inside it."""
     panelled: bool
+    """Whether fronts are a frame around a sunk panel."""
     drawer_height: float
+    """Where a drawer's handle sits, 0 at the bottom of its front, 1 at the top."""
     door_height: float
+    """Where a door's handle sits along its free edge."""
     door_vertical: bool
+    """Whether long handles on doors run upright."""
     two_from_m: float
+    """Drawers at least this wide have two handles."""
     open_rad: float
+    """How far doors open."""
 
 
 def sample_front_style(rng: np.random.Generator, handle: HandleStyle | None) -> FrontStyle:

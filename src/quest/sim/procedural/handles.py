@@ -114,23 +114,20 @@ _KNOBS = ("knob", "disc", "block")
 
 @dataclass(frozen=True)
 class HandleStyle:
-    """How the handles of one object look.
-
-    Attributes:
-        kind: shape.
-        length_m: length of a long handle; the diameter of a knob follows ``thickness_m``.
-        thickness_m: thickness of the bar, or radius of a knob.
-        reach_m: how far it sticks out of the front.
-        flatness: height of the bar's section over its width.
-        surface: see :data:`quest.sim.procedural.model.SURFACES`.
-    """
+    """How the handles of one object look."""
 
     kind: HandleKind
+    """Shape."""
     length_m: float
+    """Length of a long handle; the diameter of a knob follows ``thickness_m``."""
     thickness_m: float
+    """Thickness of the bar, or radius of a knob."""
     reach_m: float
+    """How far it sticks out of the front."""
     flatness: float
+    """Height of the bar's section over its width."""
     surface: str
+    """See :data:`quest.sim.procedural.model.SURFACES`."""
 
     @property
     def role(self) -> str:

@@ -20,19 +20,16 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh whose vertices are not shared across sharp edges.
-
-    Attributes:
-        vertices: positions in metres.
-        faces: vertex indices, counter-clockwise seen from outside.
-        normals: unit normal per vertex.
-        uv: texture coordinate per vertex; one unit is half a metre, u runs along the grain.
-    """
+    """A triangle mesh whose vertices are not shared across sharp edges."""
 
     vertices: Float[np.ndarray, "N 3"]
+    """Positions in metres."""
     faces: Int[np.ndarray, "M 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
     normals: Float[np.ndarray, "N 3"]
+    """Unit normal per vertex."""
     uv: Float[np.ndarray, "N 2"]
+    """Texture coordinate per vertex; one unit is half a metre, u runs along the grain."""
 
     def moved(self, offset: tuple[float, float, float] | np.ndarray) -> Mesh:
         """The mesh shifted by ``offset`` metres."""
@@ -66,17 +63,14 @@ HANDLE_ROLES = ("handle", "knob")
 
 @dataclass(frozen=True)
 class Part:
-    """One visual of a link.
-
-    Attributes:
-        role: what it is (``handle``, ``knob``, ``drawer_front``, ``frame`` ...); its visual is called ``role-N``.
-        mesh: geometry in the frame of its link.
-        surface: which material of :data:`SURFACES` it wears before any appearance is drawn.
-    """
+    """One visual of a link."""
 
     role: str
+    """What it is (``handle``, ``knob``, ``drawer_front``, ``frame`` ...); its visual is called ``role-N``."""
     mesh: Mesh
+    """Geometry in the frame of its link."""
     surface: str = "body"
+    """Which material of :data:`SURFACES` it wears before any appearance is drawn."""
 
 
 SURFACES = {
@@ -94,23 +88,20 @@ SURFACES = {
 
 @dataclass(frozen=True)
 class Link:
-    """A moving link and the joint that carries it on the body.
-
-    Attributes:
-        name: name of the link; its joint is called ``<name>_joint``.
-        parts: visuals, in the frame whose origin is ``origin``.
-        kind: ``revolute`` or ``prismatic``.
-        origin: joint origin in the object's frame, metres.
-        axis: unit direction of the joint in the object's frame.
-        upper: upper limit in radians or metres; the lower one is 0, which is closed.
-    """
+    """A moving link and the joint that carries it on the body."""
 
     name: str
+    """Name of the link; its joint is called ``<name>_joint``."""
     parts: tuple[Part, ...]
+    """Visuals, in the frame whose origin is ``origin``."""
     kind: Literal["revolute", "prismatic"]
+    """``revolute`` or ``prismatic``."""
     origin: tuple[float, float, float]
+    """Joint origin in the object's frame, metres."""
     axis: tuple[float, float, float]
+    """Unit direction of the joint in the object's frame."""
     upper: float
+    """Upper limit in radians or metres; the lower one is 0, which is closed."""
 
     @property
     def has_handle(self) -> bool:
@@ -120,17 +111,14 @@ class Link:
 
 @dataclass(frozen=True)
 class ObjectModel:
-    """A whole object: a resting body and the links that move on it.
-
-    Attributes:
-        model_cat: category in PartNet-Mobility's words, such as ``StorageFurniture``.
-        body: visuals that do not move, in the object's frame.
-        links: moving links, each a child of the body.
-    """
+    """A whole object: a resting body and the links that move on it."""
 
     model_cat: str
+    """Category in PartNet-Mobility's words, such as ``StorageFurniture``."""
     body: tuple[Part, ...]
+    """Visuals that do not move, in the object's frame."""
     links: tuple[Link, ...]
+    """Moving links, each a child of the body."""
 
     def moved(self, offset: tuple[float, float, float]) -> ObjectModel:
         """The whole object shifted by ``offset`` metres."""
