@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+from quest.baselines import TRACKERS
 from quest.errors import ConfigError
-from quest.evaluation.lineup import FLOW_NOISES
 from quest.model.config import PRESETS, NetworkConfig
 from quest.train.settings import LOSSES, LossWeights, WindowConfig
 
@@ -55,7 +55,7 @@ class Line:
     Attributes:
         label: what the table calls it.
         variant: whose weights.
-        tracker: which tracker uses them (:mod:`quest.evaluation.lineup`).
+        tracker: which tracker uses them (:data:`quest.baselines.TRACKERS`).
         reference: label of the row that it is compared with; None for the reference.
     """
 
@@ -148,7 +148,8 @@ def _parts(preset: PresetName) -> list[Line]:
             Line(f"{preset}: no grounding", whole, "quest-ungrounded", own),
             *(
                 Line(f"{preset}: flow chain{f', noise {noise}' if noise else ''}", whole, name, own)
-                for name, noise in FLOW_NOISES.items()
+                for name, entry in TRACKERS.items()
+                if (noise := entry.settings.get("noise")) is not None
             ),
         ]
     return [*lines, Line(f"{preset}: hold still", whole, "hold-still", own)]

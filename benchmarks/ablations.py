@@ -29,13 +29,13 @@ from ablation_variants import TABLES, Line, PresetName, TableName, Variant, chos
 from cached_encoder import CachedEncoder
 from rich.console import Console
 
-from quest.baselines import HoldStill
+from quest.baselines import TRACKERS, Shared
+from quest.baselines.flow_chain import units_of
+from quest.baselines.memory import remember_frames
+from quest.baselines.pixels_only import PixelsOnly
 from quest.data.provenance import code_commit, combined_hash, file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.lineup import units_of, variant
-from quest.evaluation.memory import remember_frames
-from quest.evaluation.pixels_only import PixelsOnly
 from quest.evaluation.protocols import ClipTracker, ProtocolName
 from quest.evaluation.records import read_records
 from quest.evaluation.report import provenance, write_report
@@ -295,11 +295,7 @@ class Ablations:
             console.print(f"  {name}: {len(records)} answers")
 
     def _tracker(self, tracker: Tracker, name: str, test: TestTakes, seed: int) -> ClipTracker:
-        if name == "quest":
-            return tracker
-        if name == "hold-still":
-            return HoldStill()
-        return variant(tracker, name, unit_m=test.unit_m, seed=seed)
+        return TRACKERS[name].build(name, Shared(tracker, test.unit_m, seed))
 
     def _answers_file(self, item: Variant, seed: int, tracker: str) -> Path:
         return self.work / "runs" / item.name / f"seed-{seed}" / "answers" / f"{tracker}.json"

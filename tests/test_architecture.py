@@ -20,9 +20,10 @@ MODULES = {
 RANKS = {
     **dict.fromkeys(["geometry"], 0),
     **dict.fromkeys(["sim", "data", "model", "grounding", "monitor"], 1),
-    **dict.fromkeys(["train", "track", "baselines"], 2),
-    **dict.fromkeys(["evaluation", "viz"], 3),
-    "cli": 4,
+    **dict.fromkeys(["train", "track"], 2),
+    "baselines": 3,
+    **dict.fromkeys(["evaluation", "viz"], 4),
+    "cli": 5,
 }
 """Rooms may import rooms of lower rank. Modules at the package's root, such as types and errors, have rank 0."""
 

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from quest.baselines import HoldStill, LucasKanade
+from quest.baselines.hold_still import HoldStill
+from quest.baselines.lucas_kanade import LucasKanade
 from quest.baselines.point_queries import hold_last, lift_pixels
 from quest.errors import ConfigError, InputError
 from quest.types import Camera, Clip, Query, State, Take

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from quest.baselines import Detector, FlowChain, Redetect
 from quest.baselines.clip_frames import ClipFrames
-from quest.baselines.redetect import Detections, link
+from quest.baselines.flow_chain import FlowChain
+from quest.baselines.redetect import Detections, Detector, Redetect, link
 from quest.data.cut import cut_clip
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.geometry import project, transform

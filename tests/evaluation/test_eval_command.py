@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import quest
-from quest.baselines import HoldStill
+from quest.baselines.hold_still import HoldStill
 from quest.cli.evaluate import Eval
 from quest.data.split import object_split, split_of
 from quest.data.store import TakeStore
@@ -159,7 +159,6 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
     ("changes", "error", "match"),
     [
         ({"takes": "no-such-folder"}, TakeError, "quest generate"),
-        ({"trackers": ()}, ConfigError, "expected a protocol"),
         ({"resamples": 0}, ConfigError, "resamples"),
         ({"seed": -1}, ConfigError, "seed"),
         ({"out": Path("result.txt")}, ConfigError, "json"),

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from quest.baselines.memory import remember_frames
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation import tuning
-from quest.evaluation.memory import remember_frames
 from quest.evaluation.selection import SplitPart
 from quest.evaluation.tuning import Trial, discovery_bias, tune
 from quest.model.discovery import Peaks

@@ -1,8 +1,136 @@
-"""Other trackers behind the tracker's interface: correspondence, and QueST's network without queries or anchors."""
+"""Trackers to compare: each is one line in :data:`TRACKERS`, from which commands take names, help and errors.
 
-from quest.baselines.flow_chain import FlowChain
-from quest.baselines.hold_still import HoldStill
-from quest.baselines.lucas_kanade import LucasKanade
-from quest.baselines.redetect import Detector, Redetect
+The plain ones follow pixels and need no weights; the others are QueST's network without one of its parts. Nothing
+heavy is imported before a tracker is built.
+"""
 
-__all__ = ["Detector", "FlowChain", "HoldStill", "LucasKanade", "Redetect"]
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+
+from quest.errors import ConfigError
+from quest.types import Clip, Query, Tracks
+
+if TYPE_CHECKING:
+    from quest.track import Tracker
+
+Inputs = Literal["depth and poses", "depth", "colours"]
+"""What of a real recording a tracker is shown."""
+
+_REMEMBERED_FRAMES = 1000
+
+
+@runtime_checkable
+class ClipTracker(Protocol):
+    """Anything that tracks: QueST and the baselines."""
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """Answer the queries; without any, discover entities."""
+        ...
+
+
+@dataclass(frozen=True)
+class Shared:
+    """What trackers that are made of one network share.
+
+    Attributes:
+        tracker: the tracker whose network and settings they use.
+        unit_m: metres per normalised unit of a clip, for the noise of chained flow.
+        seed: of that noise.
+    """
+
+    tracker: Tracker
+    unit_m: Callable[[Clip], float]
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Entry:
+    """How a tracker is made, and what is said of it.
+
+    Attributes:
+        about: what it does, in a few words.
+        maker: ``module:function`` in this package. It is called with the settings; before them, for trackers
+            of weights, with the name and a :class:`Shared`.
+        settings: keyword arguments of the maker.
+        of_weights: whether it needs weights of QueST.
+        inputs: what it is shown of real recordings, one row of the table each; what a recording lacks is left out.
+    """
+
+    about: str
+    maker: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    of_weights: bool = False
+    inputs: tuple[Inputs, ...] = ("colours",)
+
+    def build(self, name: str, shared: Shared | None = None) -> ClipTracker:
+        """The tracker.
+
+        Raises:
+            WeightsError: the network lacks what the tracker needs.
+        """
+        module, _, function = self.maker.partition(":")
+        make = getattr(import_module(f"quest.baselines.{module}"), function)
+        return make(name, shared, **self.settings) if self.of_weights else make(**self.settings)
+
+
+def _of_weights(about: str, maker: str, *inputs: Inputs, **settings: Any) -> Entry:
+    return Entry(about, f"of_weights:{maker}", settings, of_weights=True, inputs=inputs or ("depth and poses",))
+
+
+TRACKERS: dict[str, Entry] = {
+    "quest": _of_weights("this tracker", "whole", "depth and poses", "depth", "colours"),
+    "quest-ungrounded": _of_weights("quest without joints", "ungrounded"),
+    "quest-pixels": _of_weights("quest without depth and joints", "pixels_only"),
+    "redetect": _of_weights("its network without queries, every 4th frame", "redetect", every=4),
+    "redetect-1": _of_weights("the same in every frame", "redetect", every=1),
+    "flow-chain": _of_weights("its flow head, chained", "flow_chain", noise=0.0),
+    "flow-chain-0.01": _of_weights("the same with noise", "flow_chain", noise=0.01),
+    "flow-chain-0.02": _of_weights("the same with noise", "flow_chain", noise=0.02),
+    "flow-chain-0.05": _of_weights("the same with noise", "flow_chain", noise=0.05),
+    "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
+    "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
+    "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),
+    "dis": Entry("dense optical flow, chained", "dense_flow:DenseFlow"),
+    "world-pnp": Entry("still in the world, camera by LK and PnP", "still_world:StillWorld", inputs=("depth",)),
+    "world-given": Entry(
+        "still in the world, given poses", "hold_still:HoldStill", {"name": "world-given"}, inputs=("depth and poses",)
+    ),
+}
+"""Every tracker by the name that commands and tables call it."""
+
+
+def line_up(
+    names: Sequence[str], *, weights: str, unit_m: Callable[[Clip], float], seed: int = 0
+) -> tuple[ClipTracker, ...]:
+    """The trackers of some names; all that need weights share one network and what it sees in a frame.
+
+    Args:
+        names: of :data:`TRACKERS`; each counts once.
+        weights: name or file of the weights.
+        unit_m: metres per normalised unit of a clip, for the noise of chained flow.
+        seed: of that noise.
+
+    Raises:
+        ConfigError: no tracker of that name.
+        WeightsError: the weights cannot be loaded, or lack what a tracker needs.
+    """
+    unknown = [name for name in names if name not in TRACKERS]
+    if unknown:
+        raise ConfigError(f"tracker {unknown[0]!r}: expected one of {', '.join(TRACKERS)}")
+    shared = None
+    if any(TRACKERS[name].of_weights for name in names):
+        import quest
+        from quest.baselines.memory import remember_frames
+
+        shared = Shared(quest.load(weights), unit_m, seed)
+        remember_frames(shared.tracker.network, capacity=_REMEMBERED_FRAMES)  # all of them see the same frames
+    return tuple(TRACKERS[name].build(name, shared) for name in dict.fromkeys(names))

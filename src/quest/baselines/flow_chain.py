@@ -7,7 +7,8 @@ frame the query is bound anew to what is at x_t, looks at the newest T frames, a
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -21,6 +22,9 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.network import UNKNOWN_LABEL
 from quest.model.observation import FrameBatch
 from quest.types import Clip, Query, State, Tracks
+
+if TYPE_CHECKING:
+    from quest.data.store import TakeStore
 
 
 class FlowChain:
@@ -159,3 +163,20 @@ def _heads(
         return names, start.label, start.confidence, () if names else (NOTHING_FOUND,)
     assert queries is not None
     return query_names(queries), tuple(q.label for q in queries), np.ones(len(queries), np.float32), ()
+
+
+def units_of(stores: Sequence[TakeStore]) -> Callable[[Clip], float]:
+    """Metres per normalised unit of the clips of stores, by their names."""
+    known: Mapping[str, float] = {
+        clip: header.info.half_diagonal_m
+        for store in stores
+        for header in store.headers().values()
+        for clip in header.clip_names
+    }
+
+    def unit_m(clip: Clip) -> float:
+        if clip.name not in known:
+            raise ConfigError(f"clip {clip.name!r}: expected one of the stores at hand, which say how large it is")
+        return known[clip.name]
+
+    return unit_m

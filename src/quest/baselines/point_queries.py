@@ -7,11 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from quest.errors import ConfigError, InputError
 from quest.geometry import invert, lift, project, transform
 from quest.types import Clip, Query
+
+OCCLUDED_BY_M = 0.05
+"""Depth that is nearer than a point by more than this is something in front of it."""
 
 NO_DEPTH = "clip without depth: world points are missing"
 NO_FIRST_DEPTH = "query {name!r}: no depth around its pixel at frame {frame}; world points are missing until there is"
@@ -90,6 +93,20 @@ def project_points(clip: Clip, point_world: Float32[np.ndarray, "T K 3"]) -> Flo
     cam_from_world = torch.from_numpy(np.ascontiguousarray(clip.cam_from_world)).to(torch.float64)
     point_cam = transform(cam_from_world[:, None], torch.from_numpy(point_world).to(torch.float64))
     return project(point_cam, clip.camera).numpy().astype(np.float32)
+
+
+def unoccluded(clip: Clip, point_world: Float32[np.ndarray, "T K 3"]) -> Bool[np.ndarray, "T K"]:
+    """Whether world points are in the image and nothing is measured in front of them; False for NaN."""
+    uv_px = project_points(clip, point_world)
+    width, height = clip.camera.width, clip.camera.height
+    inside = np.asarray(((uv_px >= 0) & (uv_px < (width, height))).all(axis=-1))
+    if clip.depth_m is None:
+        return inside
+    column, row = np.where(inside[..., None], uv_px, 0).astype(np.int64).transpose(2, 0, 1)
+    measured_m = clip.depth_m[np.arange(len(clip))[:, None], row, column]
+    pose = clip.cam_from_world
+    point_m = np.einsum("tc,tkc->tk", pose[:, 2, :3], point_world) + pose[:, 2, 3:]
+    return inside & ~((measured_m > 0) & (measured_m < point_m - OCCLUDED_BY_M))
 
 
 def depth_flags(clip: Clip, queries: Sequence[Query], point_world: Float32[np.ndarray, "T K 3"]) -> tuple[str, ...]:

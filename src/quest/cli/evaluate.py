@@ -1,120 +1,184 @@
-"""``quest eval``: track takes of a store under the protocols and print what came of it."""
+"""``quest eval``: score trackers on takes of a store or on labelled real recordings, and print what came of it."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import tyro
+from tyro.extras import literal_type_from_choices
+
+from quest.baselines import TRACKERS
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from rich.console import Console
+    from rich.progress import Progress
 
+    from quest.baselines import ClipTracker
     from quest.data.store import TakeStore
     from quest.evaluation.finished import FinishedTakes
-    from quest.evaluation.protocols import ClipTracker
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
     from quest.evaluation.selection import Shard, SplitPart
+    from quest.types import Clip
 
-TrackerName = Literal[
-    "quest",
-    "quest-ungrounded",
-    "quest-pixels",
-    "redetect",
-    "redetect-1",
-    "flow-chain",
-    "flow-chain-0.01",
-    "flow-chain-0.02",
-    "flow-chain-0.05",
-    "lk",
-    "hold-still",
-]
+if TYPE_CHECKING:
+    TrackerName = str
+else:
+    TrackerName = literal_type_from_choices(TRACKERS)
+
+_TRACKERS_HELP = "What to compare. By default all that take part in --real, or quest, lk and hold-still. " + "; ".join(
+    f"{name}: {entry.about}" for name, entry in TRACKERS.items()
+)
+_OF_TAKES = ("protocol", "split", "level", "objects", "same_objects", "shard")
+_OF_REAL = ("quest", *(name for name, entry in TRACKERS.items() if not entry.of_weights))
 
 
 @dataclass(frozen=True)
 class Eval:
-    """Evaluate trackers on takes: a table in the terminal and, with --out, a result file.
+    """Evaluate trackers on takes or on labelled real recordings: a table and, with --out, result files.
 
-    With --out, takes are kept beside it as they are done (OUT.parts) until the file is written: run a command that was
-    stopped again and it goes on, or run it in several processes with --shard.
+    With --out, what is done is kept beside it (OUT.parts) until the file is written: run a command that was stopped
+    again and it goes on. Takes can be shared by several processes with --shard.
 
-    The protocol point always has the tracker hold-still for comparison; lk and hold-still do not have the protocol
-    semantic.
+    On takes the protocol point always has the tracker hold-still for comparison; trackers that only follow given
+    points do not have the protocol semantic. Formats, measures and trackers: docs/metrics.md.
 
     Attributes:
-        takes: folder of the take store.
+        takes: folder of a take store.
+        real: instead of --takes, folders of labelled recordings: clips with labels.csv or truth.csv, or pictures with
+            labels.csv.
         protocol: point (the true pixel is given) and semantic (nothing is given).
-        trackers: what to compare; quest-ungrounded is quest without joints, quest-pixels without depth, redetect and
-            flow-chain its network without queries or anchors (docs/metrics.md).
-        weights: name or file of the weights of all trackers but lk and hold-still.
+        trackers: what to compare.
+        weights: name or file of the weights of the trackers that need some.
         split: parts of the object split; training objects are reported only if train is named here.
         level: levels to evaluate; all by default.
         objects: object ids to evaluate; all by default.
         same_objects: keep only objects that have takes of every level, so that levels compare.
-        resamples: of the bootstrap over objects.
+        pictures: of labelled pictures, the fifth that is for choosing, the rest, which may teach, or all.
+        resamples: of the bootstrap over objects, clips or pictures.
         seed: of the bootstrap and of the noise of chained flow.
         shard: part of the takes, such as 0/2 and 1/2 for two processes side by side; the last one reports. Needs --out.
-        out: result file (.json); the per-frame records go beside it (.records.parquet).
+        out: of --takes a result file (.json); the per-frame records go beside it (.records.parquet). Of --real a
+            folder, with a file for each set.
     """
 
-    takes: str
+    takes: str | None = None
+    real: tuple[Path, ...] = ()
     protocol: tuple[Literal["point", "semantic"], ...] = ("point",)
-    trackers: tuple[TrackerName, ...] = ("quest", "lk", "hold-still")
+    trackers: Annotated[tuple[TrackerName, ...], tyro.conf.arg(help=_TRACKERS_HELP)] = ()
     weights: str = "quest-s16"
     split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation", "test", "unlisted")
     level: tuple[int, ...] = ()
     objects: tuple[str, ...] = ()
     same_objects: bool = False
+    pictures: Literal["choosing", "teaching", "all"] = "choosing"
     resamples: int = 1000
     seed: int = 0
     shard: str = "0/1"
     out: Path | None = None
 
     def run(self) -> int:
-        """Evaluate, print the table, write the file.
+        """Evaluate, print the table, write the files.
 
         Raises:
             ConfigError: nothing to evaluate, or settings out of range.
+            InputError: a set of recordings is missing or damaged.
             TakeError: the store is missing or a take is torn.
             WeightsError: the weights cannot be loaded.
         """
-        from rich.console import Console
+        from quest.errors import ConfigError
 
+        if (self.takes is None) == (not self.real):
+            raise ConfigError("eval: expected --takes STORE or --real FOLDER..., one of the two")
+        if not self.protocol or self.resamples < 1 or self.seed < 0:
+            raise ConfigError(
+                f"eval: expected a protocol, resamples >= 1 and seed >= 0, got {self.protocol}, {self.resamples}, "
+                f"{self.seed}"
+            )
+        return self._run_takes(self.takes) if self.takes is not None else self._run_real()
+
+    def _run_real(self) -> int:
+        import hashlib
+
+        from quest.data.provenance import code_hash, package_versions
+        from quest.errors import ConfigError
+        from quest.evaluation.real.run import KeptAnswers, RealRow, evaluate_set, write_set
+        from quest.evaluation.real.sets import open_set
+        from quest.evaluation.real.table import FULL_WIDTH, real_table
+
+        given = [f.name for f in fields(self) if f.name in _OF_TAKES and getattr(self, f.name) != f.default]
+        if given:
+            raise ConfigError(f"eval: --{given[0].replace('_', '-')} is for --takes; leave it out with --real")
+        if self.out is not None and self.out.suffix:
+            raise ConfigError(f"eval: expected --out to be a folder, which gets a file for each set, got {self.out}")
+        sets = [open_set(folder, part=self.pictures) for folder in self.real]
+        names = [real.name for real in sets]
+        if len(set(names)) < len(names):
+            raise ConfigError(f"eval: expected sets of different names, got {', '.join(names)}; rename a folder")
+        trackers = self._load_trackers(self.trackers or _OF_REAL, unit_m=_no_unit)
+        console, found = _stderr(), dict[str, list[RealRow]]()
+        with _bar(console) as progress:
+            task = progress.add_task("", total=sum(len(real.clips) + len(real.pictures) for real in sets))
+
+            def advance(doing: str, done: int) -> None:
+                progress.update(task, description=doing, advance=done)
+
+            for real in sets:
+                start_s, data_hash, kept = time.monotonic(), real.data_hash(), None
+                if self.out is not None:
+                    answers = [code_hash(), package_versions(), self.weights, self._weights_hash(trackers), data_hash]
+                    made_by = hashlib.sha256(repr([*answers, self.seed]).encode()).hexdigest()
+                    kept = KeptAnswers(self.out / f"{real.name}.parts", made_by=made_by)
+                rows, single = evaluate_set(
+                    real, trackers, resamples=self.resamples, seed=self.seed, kept=kept, progress=advance
+                )
+                found[real.name] = rows
+                if self.out is not None and kept is not None:
+                    write_set(
+                        self.out / f"{real.name}.json", real, rows, single, self._run(trackers, data_hash, start_s)
+                    )
+                    kept.remove()
+        output = _stdout(FULL_WIDTH)
+        output.print(real_table(found, width=output.width))
+        if self.out is not None:
+            console.print(f"wrote {', '.join(str(self.out / f'{name}.json') for name in found)}", highlight=False)
+        return 0
+
+    def _run_takes(self, takes: str) -> int:
+        from quest.baselines.flow_chain import units_of
+        from quest.data.provenance import combined_hash
         from quest.errors import ConfigError
         from quest.evaluation.results import write_results
         from quest.evaluation.selection import Shard, select_takes
         from quest.evaluation.tables import FULL_WIDTH, results_table
 
-        if not self.protocol or not self.trackers or self.resamples < 1 or self.seed < 0:
-            raise ConfigError(
-                f"eval: expected a protocol, a tracker, resamples >= 1 and seed >= 0, got {self.protocol}, "
-                f"{self.trackers}, {self.resamples}, {self.seed}"
-            )
         if self.out is not None and self.out.suffix != ".json":
             raise ConfigError(f"eval: expected --out to end in .json, got {self.out}")
         shard = Shard.parse(self.shard)
         if self.out is None and shard.count > 1:
             raise ConfigError(f"eval: --shard {self.shard} needs --out, beside which the processes share what is done")
         start_s = time.monotonic()
-        store, broken = self._open_store()
+        store, broken = self._open_store(takes)
         chosen = select_takes(
             store.infos(), split=self.split, levels=self.level, objects=self.objects, same_objects=self.same_objects
         )
-        trackers = self._load_trackers(store)
-        console = Console(stderr=True)
+        names = list(self.trackers or ("quest", "lk", "hold-still"))
+        names += ["hold-still"] * ("point" in self.protocol)
+        trackers = self._load_trackers(names, unit_m=units_of([store]))
+        console = _stderr()
         finished = self._finished(trackers)
         found = self._evaluate(store, chosen, trackers, finished, shard, console)
         if found.missing:
             console.print(f"{found.missing} takes are left to other shards; nothing is reported yet")
             return 0
-        results = self._results(found, broken, self._run(store, chosen, trackers, start_s))
-        output = Console()
-        if not output.is_terminal:  # a file or pipe has no width of its own: show every column
-            output = Console(width=FULL_WIDTH)
+        data_hash = combined_hash((name, store.data_hash(name)) for name in chosen)
+        results = self._results(found, broken, self._run(trackers, data_hash, start_s))
+        output = _stdout(FULL_WIDTH)
         output.print(results_table(results, width=output.width))
         if self.out is not None:
             write_results(results, self.out, records=found.records)
@@ -136,30 +200,25 @@ class Eval:
         digest = hashlib.sha256(repr([*answers, self.weights, self._weights_hash(trackers)]).encode())
         return FinishedTakes(self.out.with_suffix(".parts"), made_by=digest.hexdigest())
 
-    def _weights_hash(self, trackers: list[ClipTracker]) -> str | None:
+    def _weights_hash(self, trackers: Sequence[ClipTracker]) -> str | None:
         from quest.data.provenance import file_hash
 
         return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(self.weights)
 
-    def _open_store(self) -> tuple[TakeStore, list[str]]:
+    def _open_store(self, takes: str) -> tuple[TakeStore, list[str]]:
         """The store, and the names of its torn takes."""
         from quest.data.store import TakeStore
         from quest.errors import TakeError
 
-        store = TakeStore(self.takes)
+        store = TakeStore(takes)
         if not store.exists():
-            raise TakeError(
-                f"take store {self.takes}: expected a store of takes, found none; make one with quest generate"
-            )
+            raise TakeError(f"take store {takes}: expected a store of takes, found none; make one with quest generate")
         return store, sorted(store.problems())
 
-    def _load_trackers(self, store: TakeStore) -> list[ClipTracker]:
-        from quest.evaluation.lineup import line_up, units_of
+    def _load_trackers(self, names: Sequence[str], *, unit_m: Callable[[Clip], float]) -> list[ClipTracker]:
+        from quest.baselines import line_up
 
-        names: list[str] = list(self.trackers)
-        if "point" in self.protocol:
-            names.append("hold-still")
-        return list(line_up(names, weights=self.weights, unit_m=units_of([store]), seed=self.seed))
+        return list(line_up(names, weights=self.weights, unit_m=unit_m, seed=self.seed))
 
     def _evaluate(
         self,
@@ -170,29 +229,13 @@ class Eval:
         shard: Shard,
         console: Console,
     ) -> Evaluated:
-        from rich.progress import (
-            BarColumn,
-            MofNCompleteColumn,
-            Progress,
-            TextColumn,
-            TimeElapsedColumn,
-            TimeRemainingColumn,
-        )
-
         from quest.evaluation.runner import evaluate, has_protocol
 
         runs = sum(has_protocol(t, p) for t in trackers for p in self.protocol)
         headers = store.headers()
         own = [headers[name] for i, name in enumerate(chosen) if i in shard]
         frames = sum(header.frames * len(header.cameras) for header in own) * runs
-        bar = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        with Progress(*bar, console=console, transient=True) as progress:
+        with _bar(console) as progress:
             task = progress.add_task("frames", total=frames)
 
             def advance(doing: str, done: int) -> None:
@@ -208,25 +251,17 @@ class Eval:
                 progress=advance,
             )
 
-    def _run(
-        self, store: TakeStore, chosen: Mapping[str, SplitPart], trackers: list[ClipTracker], start_s: float
-    ) -> Run:
-        from quest.data.provenance import code_commit, combined_hash, command_line, machine, package_versions
+    def _run(self, trackers: Sequence[ClipTracker], data_hash: str, start_s: float) -> Run:
         from quest.evaluation.results import Run
 
-        with_quest = any(name not in ("lk", "hold-still") for name in self.trackers)
-        return Run(
-            command=command_line(),
-            commit=code_commit(),
-            data_hash=combined_hash((name, store.data_hash(name)) for name in chosen),
-            weights=self.weights if with_quest else None,
-            weights_hash=self._weights_hash(trackers) if with_quest else None,
+        of_weights = any(TRACKERS[tracker.name].of_weights for tracker in trackers)
+        return Run.ended(
+            start_s,
+            data_hash=data_hash,
+            weights=self.weights if of_weights else None,
+            weights_hash=self._weights_hash(trackers) if of_weights else None,
             resamples=self.resamples,
             seed=self.seed,
-            machine=machine(),
-            versions=package_versions(),
-            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
-            seconds=round(time.monotonic() - start_s, 1),
         )
 
     def _results(self, found: Evaluated, broken: list[str], run: Run) -> Results:
@@ -244,3 +279,40 @@ class Eval:
         if any(len({frozenset(o) for o in by_level.values()}) > 1 for by_level in levels.values()):
             notes.append("levels rest on different objects; compare levels with --same-objects")
         return Results(run, rows, found.discoveries, found.unscored, tuple(notes))
+
+
+def _no_unit(clip: Clip) -> float:
+    from quest.errors import ConfigError
+
+    raise ConfigError(
+        f"clip {clip.name!r}: the noise of flow-chain is in units of the object's size, which real recordings do not "
+        "tell; use other trackers with --real"
+    )
+
+
+def _stderr() -> Console:
+    from rich.console import Console
+
+    return Console(stderr=True)
+
+
+def _stdout(full_width: int) -> Console:
+    """The terminal; a file or pipe has no width of its own and gets every column."""
+    from rich.console import Console
+
+    output = Console()
+    return output if output.is_terminal else Console(width=full_width)
+
+
+def _bar(console: Console) -> Progress:
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)

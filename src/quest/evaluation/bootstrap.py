@@ -74,6 +74,25 @@ def median_value(
     return Value(float(np.median(value)), low, high, len(value))
 
 
+def statistic_value(
+    statistic: Callable[[Int[np.ndarray, " O"]], float], draws: Int[np.ndarray, "B O"], *, count: int
+) -> Value | None:
+    """A statistic that is no mean or median, and its interval; None where it is NaN.
+
+    Args:
+        statistic: of how often each object is drawn; NaN where it does not apply.
+        draws: from :func:`draw_objects`.
+        count: how many terms it is over.
+    """
+    objects = draws.shape[1]
+    whole = statistic(np.ones(objects, dtype=draws.dtype))
+    if np.isnan(whole):
+        return None
+    drawn = np.array([statistic(times) for times in draws])
+    low, high = _percentiles(drawn[~np.isnan(drawn)], objects=objects)
+    return Value(float(whole), low, high, count)
+
+
 def interval_over(
     units: Float[np.ndarray, "N ..."],
     statistic: Callable[[np.ndarray], np.ndarray],

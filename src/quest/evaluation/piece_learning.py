@@ -14,8 +14,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from quest.baselines.memory import remember_frames
 from quest.errors import ConfigError
-from quest.evaluation.memory import remember_frames
 from quest.evaluation.selection import Chosen
 from quest.geometry import transform
 from quest.model.discovery import FOUND_WITHIN, match_peaks, sight

@@ -10,18 +10,18 @@ Each view of a take is one clip.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
+from quest.baselines import ClipTracker
 from quest.errors import ConfigError
 from quest.evaluation.metrics import GATE, distance, distance_px, identity
 from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
-from quest.types import Clip, Query, Take, Tracks
+from quest.types import Query, Take, Tracks
 
 ProtocolName = Literal["point", "semantic"]
 
@@ -30,20 +30,6 @@ START_FRAMES = 8
 
 MIN_CONFIDENCE = 0.5
 """A slot is an answer when its confidence after the start is above this."""
-
-
-@runtime_checkable
-class ClipTracker(Protocol):
-    """Anything that tracks: QueST and the baselines."""
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        ...
-
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        """Answer the queries; without any, discover entities."""
-        ...
 
 
 @dataclass(frozen=True)

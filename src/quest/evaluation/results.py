@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from quest.data.provenance import file_hash
+from quest.data.provenance import code_commit, command_line, file_hash, machine, package_versions
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.records import (
@@ -55,6 +57,25 @@ class Run:
     versions: dict[str, str]
     stamp: str
     seconds: float
+
+    @classmethod
+    def ended(
+        cls, start_s: float, *, data_hash: str, weights: str | None, weights_hash: str | None, resamples: int, seed: int
+    ) -> Run:
+        """The run of this process, which began at a reading of the monotonic clock and ends now."""
+        return cls(
+            command=command_line(),
+            commit=code_commit(),
+            data_hash=data_hash,
+            weights=weights,
+            weights_hash=weights_hash,
+            resamples=resamples,
+            seed=seed,
+            machine=machine(),
+            versions=package_versions(),
+            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
+            seconds=round(time.monotonic() - start_s, 1),
+        )
 
 
 @dataclass(frozen=True)

@@ -156,5 +156,5 @@ def _notes(unscored: Sequence[Unscored], moving: Sequence[str], protocols: Seque
         shown = ", ".join(moving[:3]) + (", ..." if len(moving) > 3 else "")
         notes.append(f"{len(moving)} takes already move in frames 0 to 7, against the protocol: {shown}")
     if "semantic" in protocols:
-        notes.append("lk and hold-still only have the protocol point; they have no row in semantic")
+        notes.append("trackers that only follow given points have no row in semantic")
     return tuple(notes)

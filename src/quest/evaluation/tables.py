@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -79,7 +80,8 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
     ):
         rows = list(group)
         columns = [c for c in COLUMNS if any(getattr(row.metrics, c.field) is not None for row in rows)]
-        kept = _fitting(columns, rows, width)
+        heads = [("L", "of", "tracker", "n"), *(_head(row) for row in rows)]
+        kept = fitting(columns, heads, lambda column, rows=rows: [_value(row, column) for row in rows], width)
         dropped |= {c.heading for c in columns if c not in kept}
         title = f"{protocol} · {source} · {PART_TITLES.get(part, f'{part} objects')}"
         parts.append(_table(title if suite == STANDARD else f"{title} · suite {suite}", rows, kept))
@@ -94,13 +96,24 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
     return Group(*parts)
 
 
-def _fitting(columns: list[Column], rows: list[Row], width: int) -> list[Column]:
-    """Columns by rank as long as they fit; a number is never cut."""
-    heads = [("L", "of", "tracker", "n"), *(_head(row) for row in rows)]
-    left = width - sum(max(len(h[i]) for h in heads) + GAP for i in range(4))
+def fitting(
+    columns: Sequence[Column],
+    heads: Sequence[tuple[str, ...]],
+    values: Callable[[Column], Sequence[Value | None]],
+    width: int,
+) -> list[Column]:
+    """Columns by rank as long as they fit; a number is never cut.
+
+    Args:
+        columns: to choose from.
+        heads: the texts to the left of them, the headings first.
+        values: what a column shows.
+        width: of the terminal in characters.
+    """
+    left = width - sum(max(map(len, texts)) + GAP for texts in zip(*heads, strict=True))
     kept = []
     for column in sorted(columns, key=lambda c: c.rank):
-        cells = [line for row in rows for line in _cell(row, column).plain.split("\n")]
+        cells = [line for value in values(column) for line in cell(value, column).plain.split("\n")]
         left -= max(len(text) for text in [column.heading, *cells]) + GAP
         if left < 0:
             break
@@ -121,7 +134,7 @@ def _table(title: str, rows: list[Row], columns: list[Column]) -> Table:
         for i, row in enumerate(group):
             level, reading, tracker, count = _head(row)
             lead = (level, reading) if i == 0 else ("", "")
-            table.add_row(*lead, tracker, count, *(_cell(row, column) for column in columns))
+            table.add_row(*lead, tracker, count, *(cell(_value(row, column), column) for column in columns))
         table.add_section()
     return table
 
@@ -130,8 +143,12 @@ def _head(row: Row) -> tuple[str, str, str, str]:
     return str(row.level), row.reading, row.tracker, f"{row.objects}/{row.takes}/{row.tracks}"
 
 
-def _cell(row: Row, column: Column) -> Text:
-    value: Value | None = getattr(row.metrics, column.field)
+def _value(row: Row, column: Column) -> Value | None:
+    return getattr(row.metrics, column.field)
+
+
+def cell(value: Value | None, column: Column) -> Text:
+    """A number, and below it its interval."""
     if value is None:
         return Text("-", style="dim")
 

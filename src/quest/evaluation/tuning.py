@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from quest.baselines.memory import remember_frames
 from quest.errors import ConfigError
-from quest.evaluation.memory import remember_frames
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import Chosen

@@ -1,4 +1,4 @@
-"""Trackers by name, the tracker that sees no depth, and the encoder that reads from a cache."""
+"""The registry of trackers, and the tracker that sees no depth."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import pytest
 import torch
 
 import quest
-from quest.baselines import FlowChain, Redetect
+from quest.baselines import TRACKERS, Shared, line_up
+from quest.baselines.flow_chain import FlowChain, units_of
+from quest.baselines.of_weights import detector_of
+from quest.baselines.pixels_only import PixelsOnly
 from quest.baselines.point_queries import lift_pixels
+from quest.baselines.redetect import Redetect
 from quest.errors import ConfigError, WeightsError
-from quest.evaluation.lineup import FLOW_NOISES, OF_WEIGHTS, detector_of, line_up, units_of, variant
-from quest.evaluation.pixels_only import PixelsOnly
 from quest.evaluation.runner import has_protocol
 from quest.track import Tracker, TrackerConfig
 from quest.types import Clip, Query, Take
@@ -40,7 +42,7 @@ def unit_m(clip: Clip) -> float:
 
 def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, take: Take) -> None:
     monkeypatch.setattr(quest, "load", lambda weights: make_tracker(flow=True), raising=False)
-    names = (*OF_WEIGHTS, "lk", "hold-still", "quest")
+    names = (*TRACKERS, "quest")
     trackers = line_up(names, weights="any", unit_m=unit_m)
     assert [tracker.name for tracker in trackers] == list(dict.fromkeys(names))
     queries = [Query.point(0, 30.0, 20.0)]
@@ -56,14 +58,15 @@ def test_trackers_of_weights_know_which(monkeypatch: pytest.MonkeyPatch) -> None
     tracker = make_tracker(flow=True)
     tracker.weights_hash = "0123"
     monkeypatch.setattr(quest, "load", lambda weights: tracker, raising=False)
-    for name in OF_WEIGHTS:
+    for name in [name for name, entry in TRACKERS.items() if entry.of_weights]:
         (alone,) = line_up([name], weights="runs/mine", unit_m=unit_m)
         assert getattr(alone, "weights_hash", None) == "0123"  # answers of other weights do not count
 
 
 def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quest, "load", None, raising=False)
-    assert [t.name for t in line_up(["lk", "hold-still"], weights="none", unit_m=unit_m)] == ["lk", "hold-still"]
+    names = [name for name, entry in TRACKERS.items() if not entry.of_weights]
+    assert [t.name for t in line_up(names, weights="none", unit_m=unit_m)] == names
 
 
 def test_variants_take_threshold_and_noise_from_their_name() -> None:
@@ -72,14 +75,15 @@ def test_variants_take_threshold_and_noise_from_their_name() -> None:
     detector = detector_of(tracker.with_config(config, name="quest"))
     score = 1 / (1 + np.exp(-config.slot_gain * (detector.min_logit + config.slot_bias)))
     np.testing.assert_allclose(score, 0.8)
-    for name, noise in FLOW_NOISES.items():
-        chain = variant(tracker, name, unit_m=unit_m, seed=3)
+    shared = Shared(tracker, unit_m, seed=3)
+    for name, noise in {"flow-chain": 0.0, "flow-chain-0.01": 0.01, "flow-chain-0.05": 0.05}.items():
+        chain = TRACKERS[name].build(name, shared)
         assert isinstance(chain, FlowChain)
         assert (chain.noise, chain.seed) == (noise, 3)
-    every = [variant(tracker, name, unit_m=unit_m) for name in ("redetect", "redetect-1")]
+    every = [TRACKERS[name].build(name, shared) for name in ("redetect", "redetect-1")]
     assert [t.every for t in every if isinstance(t, Redetect)] == [4, 1]
     with pytest.raises(WeightsError, match="flow head"):
-        variant(make_tracker(), "flow-chain", unit_m=unit_m)
+        TRACKERS["flow-chain"].build("flow-chain", Shared(make_tracker(), unit_m))
 
 
 def test_units_of_stores(tmp_path: Path, take: Take) -> None:

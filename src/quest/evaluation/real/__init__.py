@@ -1,0 +1,1 @@
+"""Scores on labelled real recordings: clips with labelled tracks, pictures with boxed handles."""

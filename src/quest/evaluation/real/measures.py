@@ -1,0 +1,259 @@
+"""From answers on real recordings to numbers with intervals; ``docs/metrics.md`` defines the measures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value, statistic_value
+from quest.evaluation.drift import ranked_auroc
+from quest.evaluation.metrics import Sums
+from quest.evaluation.real.sets import Labels, Picture
+
+NEAR_PX = 16.0
+BEYOND_PX = 50.0
+Measures = Mapping[str, Value | None]
+
+SIZES_PX = (0, 16, 32, 64, np.inf)
+"""Handles are told apart by their longer side in a picture 640 pixels wide."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a tracker says at the scored labels of one clip.
+
+    Attributes:
+        uv_px: pixels; NaN without an answer.
+        visible: whether it says that the entity is seen.
+        lost_p: its P(lost); NaN where it says nothing.
+    """
+
+    uv_px: Float[np.ndarray, "S 2"]
+    visible: Bool[np.ndarray, " S"]
+    lost_p: Float[np.ndarray, " S"]
+
+
+@dataclass(frozen=True)
+class ScoredClip:
+    """One tracker's answers in one clip, compared with the scored labels.
+
+    Attributes:
+        track: index of the label's track.
+        state: what is true of the label.
+        moves: whether its part is moved.
+        error_px: distance from the label where it is visible, the image's diagonal without an answer; else NaN.
+        mixed: whether the answer is not near, and nearer to another labelled entity than to its own.
+        called_visible: what the tracker says.
+        lost_p: its P(lost).
+    """
+
+    track: Int[np.ndarray, " S"]
+    state: np.ndarray
+    moves: Bool[np.ndarray, " S"]
+    error_px: Float[np.ndarray, " S"]
+    mixed: Bool[np.ndarray, " S"]
+    called_visible: Bool[np.ndarray, " S"]
+    lost_p: Float[np.ndarray, " S"]
+
+
+def score_clip(labels: Labels, answers: Answers, *, diagonal_px: float) -> ScoredClip:
+    """Compare answers with labels.
+
+    Args:
+        labels: of the clip.
+        answers: at its scored labels.
+        diagonal_px: what a missing answer counts.
+    """
+    scored, seen = labels.scored, labels.state == "visible"
+    error_px, mixed = np.full(len(scored), np.nan), np.zeros(len(scored), bool)
+    for row, i in enumerate(scored):
+        if seen[i]:
+            present = seen & (labels.frame == labels.frame[i])
+            gap = np.nan_to_num(np.linalg.norm(labels.uv_px - answers.uv_px[row], axis=-1), nan=diagonal_px)
+            others = present & (labels.track != labels.track[i])
+            error_px[row] = gap[i]
+            mixed[row] = gap[i] > NEAR_PX and gap[others].min(initial=np.inf) < gap[i]
+    return ScoredClip(
+        labels.track[scored],
+        labels.state[scored],
+        labels.moves[labels.track[scored]],
+        error_px,
+        mixed,
+        answers.visible,
+        answers.lost_p,
+    )
+
+
+def track_measures(clips: Sequence[ScoredClip], *, far_px: float, resamples: int, seed: int) -> Measures:
+    """Measures of one tracker over clips, with intervals over these.
+
+    Args:
+        clips: the tracker's answers.
+        far_px: beyond this an answer is far off.
+        resamples: of the bootstrap.
+        seed: of the bootstrap.
+    """
+    draws = draw_objects(len(clips), resamples=resamples, generator=np.random.default_rng(seed))
+    clip = np.repeat(np.arange(len(clips)), [len(c.track) for c in clips])
+    track, state, moves, error_px, mixed, called, lost_p = (
+        np.concatenate([getattr(c, name) for c in clips])
+        for name in ("track", "state", "moves", "error_px", "mixed", "called_visible", "lost_p")
+    )
+    seen = state == "visible"
+    near, far = seen & (error_px <= NEAR_PX), seen & (error_px > far_px)
+
+    def share(what: np.ndarray, of: np.ndarray) -> Value | None:
+        return mean_value(Sums((what & of).astype(float), of.astype(float)), clip, draws)
+
+    def median(values: np.ndarray, of: np.ndarray) -> Value | None:
+        return median_value(values[of], clip[of], draws)
+
+    known = np.isfinite(lost_p) & (near | far | ~seen)
+    rank, wrong, owner = np.unique(lost_p[known], return_inverse=True)[1], ~near[known], clip[known]
+    tracks = np.unique(np.stack([clip, track], axis=1)[seen], axis=0)
+    worst = [error_px[seen & (clip == c) & (track == k)].max() for c, k in tracks]
+    never = Sums((np.array(worst) <= BEYOND_PX).astype(float), np.ones(len(worst)))
+    return {
+        "median_px": median(error_px, seen),
+        "within_16": share(near, seen),
+        "moved_median_px": median(error_px, seen & moves),
+        "moved_within_16": share(near, seen & moves),
+        "never_beyond_50": mean_value(never, tracks[:, 0], draws),
+        "identity_errors": share(mixed, seen),
+        "hidden_called_visible": share(called, ~seen),
+        "occluded_called_visible": share(called, state == "occluded"),
+        "out_called_visible": share(called, state == "out"),
+        "lost_p_near": median(lost_p, near),
+        "lost_p_far": median(lost_p, far),
+        "lost_p_hidden": median(lost_p, ~seen),
+        "lost_auroc": statistic_value(
+            lambda times: ranked_auroc(rank, wrong, times[owner].astype(float)), draws, count=int(known.sum())
+        ),
+    }
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a tracker found unasked in one picture.
+
+    Attributes:
+        right: which of its answers are right.
+        again: which of these are at a handle that a better answer has already.
+        found: which handles have an answer.
+        size_px: of each handle, see :data:`SIZES_PX`.
+        score: of each candidate that answers are chosen from.
+        first: which candidates are right, and the best one of their handle.
+    """
+
+    right: Bool[np.ndarray, " A"]
+    again: Bool[np.ndarray, " A"]
+    found: Bool[np.ndarray, " H"]
+    size_px: Float[np.ndarray, " H"]
+    score: Float[np.ndarray, " C"]
+    first: Bool[np.ndarray, " C"]
+
+
+def score_picture(
+    picture: Picture, uv_px: Float[np.ndarray, "A 2"], candidates_px: Float[np.ndarray, "C 2"], score: np.ndarray
+) -> Found:
+    """Compare answers and candidates with the handles of a picture.
+
+    Args:
+        picture: with its handles.
+        uv_px: answers, best first.
+        candidates_px: what they were chosen from.
+        score: of each candidate.
+    """
+    order = np.argsort(-score, kind="stable")
+    right, again, found = _assign(picture, uv_px)
+    right_of_all, again_of_all, _ = _assign(picture, candidates_px[order])
+    sizes_px = picture.sizes_px()[picture.wanted]
+    counted = np.isfinite(right_of_all)
+    first = (right_of_all == 1) & ~again_of_all
+    return Found(
+        right[np.isfinite(right)] == 1,
+        again[np.isfinite(right)],
+        found,
+        sizes_px,
+        score[order][counted],
+        first[counted],
+    )
+
+
+def _assign(picture: Picture, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Give each answer, best first, its handle; one that is near several takes one that has no answer yet.
+
+    Returns:
+        Of each answer whether it is right (1), wrong (0), or at a handle that does not count (NaN), and whether its
+        handle has an answer already; of each handle that counts whether it has one.
+    """
+    right, again = np.zeros(len(uv_px)), np.zeros(len(uv_px), bool)
+    taken = np.zeros(len(picture.boxes), bool)
+    for i, gap in enumerate(picture.closeness(uv_px)):
+        if np.isfinite(gap).any():
+            k = min(np.flatnonzero(np.isfinite(gap)), key=lambda k: (taken[k], gap[k]))
+            right[i], again[i] = 1.0 if picture.wanted[k] else np.nan, taken[k]
+            taken[k] = True
+    return right, again, taken[picture.wanted]
+
+
+def discovery_measures(pictures: Sequence[Found], *, resamples: int, seed: int) -> Measures:
+    """Measures of what was found, over pictures, with intervals over these.
+
+    Args:
+        pictures: what was found in each.
+        resamples: of the bootstrap.
+        seed: of the bootstrap.
+    """
+    draws = draw_objects(len(pictures), resamples=resamples, generator=np.random.default_rng(seed))
+
+    def pooled(name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Values of all pictures, and of which picture each is."""
+        values = [getattr(picture, name) for picture in pictures]
+        return np.concatenate(values), np.repeat(np.arange(len(values)), [len(v) for v in values])
+
+    def share(what: np.ndarray, owner: np.ndarray, of: np.ndarray | None = None) -> Value | None:
+        counted = np.ones(len(what), bool) if of is None else of
+        return mean_value(Sums((what & counted).astype(float), counted.astype(float)), owner, draws)
+
+    (right, own), (again, _), (found, home) = pooled("right"), pooled("again"), pooled("found")
+    (score, candidate), (first, _), (size_px, _) = pooled("score"), pooled("first"), pooled("size_px")
+
+    def f1(times: np.ndarray) -> float:
+        """Second answers at a handle are wrong."""
+        both = times[own].sum() + times[home].sum()
+        hits = (times[own] * (right & ~again)).sum() + (times[home] * found).sum()
+        return float(hits / both) if both else np.nan
+
+    measures: dict[str, Value | None] = {
+        "recall": share(found, home),
+        "precision": share(right, own),
+        "f1": statistic_value(f1, draws, count=len(found)),
+        "ap": statistic_value(_average_precision(score, first, candidate, home), draws, count=len(score)),
+    }
+    for low, high in pairwise(SIZES_PX):
+        name = f"recall_{low}_to_{high}_px" if np.isfinite(high) else f"recall_above_{low}_px"
+        measures[name] = share(found, home, (size_px >= low) & (size_px < high))
+    return measures
+
+
+def _average_precision(
+    score: np.ndarray, first: np.ndarray, own: np.ndarray, home: np.ndarray
+) -> Callable[[np.ndarray], float]:
+    """Area under the precision-recall curve of all candidates, made to fall, by how often pictures are drawn."""
+    order = np.argsort(-score, kind="stable")
+    first, own = first[order], own[order]
+
+    def area(times: np.ndarray) -> float:
+        handles, weight = times[home].sum(), times[own]
+        if not handles:
+            return np.nan
+        hits, answers = np.cumsum(weight * first), np.cumsum(weight)
+        precision = np.maximum.accumulate((hits / np.maximum(answers, 1))[::-1])[::-1]
+        return float(np.sum(np.diff(hits, prepend=0) * precision) / handles)
+
+    return area

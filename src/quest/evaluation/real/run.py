@@ -1,0 +1,272 @@
+"""Ask trackers about sets of labelled real recordings, keep what they answer, and make rows of it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+from zipfile import BadZipFile
+
+import numpy as np
+
+from quest.baselines import TRACKERS, ClipTracker, Inputs
+from quest.errors import InputError
+from quest.evaluation.bootstrap import Value
+from quest.evaluation.real.measures import (
+    Answers,
+    Found,
+    Measures,
+    ScoredClip,
+    discovery_measures,
+    score_clip,
+    score_picture,
+    track_measures,
+)
+from quest.evaluation.real.sets import LabelledClip, Labels, Picture, RealSet
+from quest.evaluation.results import Run
+from quest.geometry.letterbox import Letterbox
+from quest.track import Tracker
+from quest.types import LABELS, Clip
+from quest.whole_file import whole_file
+
+FORMAT = 1
+"""Version of the result file."""
+
+WIDE_STEP_PX = 16.0
+"""Clips whose points move farther than this from frame to frame (median) have rows of their own."""
+
+HANDLES = ("handle", "knob")
+
+T = TypeVar("T", bound=ClipTracker)
+Progress = Callable[[str, int], None]
+
+
+@dataclass(frozen=True)
+class RealRow:
+    """One tracker on a set, or on one clip or picture of it.
+
+    Attributes:
+        of: ``tracks``, ``tracks, wide steps``, ``pictures``, or the name of the clip or picture.
+        tracker: its name.
+        inputs: what it was shown.
+        units: clips or pictures.
+        targets: tracks, or handles.
+        terms: scored labels, or answers given.
+        measures: the numbers.
+    """
+
+    of: str
+    tracker: str
+    inputs: Inputs
+    units: int
+    targets: int
+    terms: int
+    measures: Measures
+
+
+class KeptAnswers:
+    """A folder of answers, one file per clip or picture and row, so that what was stopped goes on.
+
+    Args:
+        folder: made by the first answer.
+        made_by: digest of what the answers depend on beside clip and tracker: code, weights, data.
+    """
+
+    def __init__(self, folder: Path, *, made_by: str) -> None:
+        self.folder = folder
+        self._made_by = made_by
+
+    def get(self, name: str, make: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
+        """Answers of a name, made where they are not known or were made by something else."""
+        path = self.folder / f"{name}.npz"
+        if path.is_file():
+            try:
+                with np.load(path, allow_pickle=False) as known:
+                    if str(known["made_by"]) == self._made_by:
+                        return {key: known[key] for key in known if key != "made_by"}
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+                raise InputError(f"kept answers {path}: damaged ({error}); delete the file and run again") from error
+        made = make()
+        with whole_file(path) as unfinished:
+            np.savez(unfinished, made_by=np.array(self._made_by), **made)  # type: ignore[arg-type]
+        return made
+
+    def remove(self) -> None:
+        """Delete the folder."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+
+def evaluate_set(
+    real: RealSet,
+    trackers: Sequence[ClipTracker],
+    *,
+    resamples: int,
+    seed: int,
+    kept: KeptAnswers | None = None,
+    progress: Progress = lambda doing, done: None,
+) -> tuple[list[RealRow], list[RealRow]]:
+    """Score trackers on a set.
+
+    Args:
+        real: the set.
+        trackers: with names of the registry; those that cannot discover have no rows of pictures.
+        resamples: of the bootstrap over clips or pictures.
+        seed: of the bootstrap.
+        kept: where answers are kept as they come; nowhere by default.
+        progress: called before each clip and picture with what is being done, and how many were done since.
+
+    Returns:
+        Rows of the table, and rows of each clip and picture.
+
+    Raises:
+        InputError: a recording is damaged or does not fit its labels.
+    """
+    rows, single = [], []
+    tracked: dict[tuple[str, str, Inputs], dict[str, ScoredClip]] = {}
+    for clip in real.clips:
+        of = "tracks, wide steps" if clip.labels.step_px > WIDE_STEP_PX else "tracks"
+        for tracker, inputs, scored in _ask_clip(clip, trackers, kept, progress):
+            tracked.setdefault((of, tracker, inputs), {})[clip.name] = scored
+
+    def track_row(of: str, tracker: str, inputs: Inputs, clips: Sequence[ScoredClip], resamples: int) -> RealRow:
+        measures = track_measures(clips, far_px=real.far_px, resamples=resamples, seed=seed)
+        tracks = sum(len(np.unique(c.track)) for c in clips)
+        return RealRow(of, tracker, inputs, len(clips), tracks, sum(len(c.track) for c in clips), measures)
+
+    for (of, tracker, inputs), clips in tracked.items():
+        rows.append(track_row(of, tracker, inputs, list(clips.values()), resamples))
+        single += [track_row(name, tracker, inputs, [clip], 1) for name, clip in clips.items()]
+    found: dict[tuple[str, Inputs], dict[str, Found]] = {}
+    for picture in real.pictures:
+        for tracker, inputs, one in _ask_picture(picture, trackers, kept, progress):
+            found.setdefault((tracker, inputs), {})[picture.name] = one
+
+    def found_row(of: str, tracker: str, inputs: Inputs, pictures: Sequence[Found], resamples: int) -> RealRow:
+        measures = discovery_measures(pictures, resamples=resamples, seed=seed)
+        handles, answers = (sum(len(getattr(p, name)) for p in pictures) for name in ("found", "right"))
+        return RealRow(of, tracker, inputs, len(pictures), handles, answers, measures)
+
+    for (tracker, inputs), pictures in found.items():
+        rows.append(found_row("pictures", tracker, inputs, list(pictures.values()), resamples))
+        single += [found_row(name, tracker, inputs, [p], 1) for name, p in pictures.items()]
+    rows.sort(key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of))
+    return rows, single
+
+
+def shown(clip: Clip) -> dict[Inputs, Clip]:
+    """A clip as trackers may be shown it: all of it, without poses, without depth."""
+    still = np.tile(np.eye(4), (len(clip), 1, 1))
+    ways: dict[Inputs, Clip] = {"colours": replace(clip, depth_m=None, cam_from_world=still)}
+    if clip.depth_m is not None:
+        ways["depth"] = replace(clip, cam_from_world=still)
+        if len(clip) > 1 and (clip.cam_from_world != still).any():
+            ways["depth and poses"] = clip
+    return ways
+
+
+def _ask_clip(
+    clip: LabelledClip, trackers: Sequence[ClipTracker], kept: KeptAnswers | None, progress: Progress
+) -> Iterator[tuple[str, Inputs, ScoredClip]]:
+    recording = clip.read()
+    labels, ways = clip.labels, shown(recording)
+    diagonal_px = float(np.hypot(recording.camera.width, recording.camera.height))
+    for tracker, inputs in _asked(trackers, ways):
+        progress(f"{clip.name}: {tracker.name}, {inputs}", 0)
+        answers = _kept(kept, clip.name, tracker.name, inputs, partial(_follow, tracker, ways[inputs], labels))
+        yield tracker.name, inputs, score_clip(labels, Answers(**answers), diagonal_px=diagonal_px)
+    progress(clip.name, 1)
+
+
+def _ask_picture(
+    picture: Picture, trackers: Sequence[ClipTracker], kept: KeptAnswers | None, progress: Progress
+) -> Iterator[tuple[str, Inputs, Found]]:
+    ways = shown(picture.read())
+    for tracker, inputs in _asked([t for t in trackers if isinstance(t, Tracker)], ways):
+        progress(f"{picture.name}: {tracker.name}, {inputs}", 0)
+        answers = _kept(kept, picture.name, tracker.name, inputs, partial(discover, tracker, ways[inputs]))
+        yield tracker.name, inputs, score_picture(picture, **answers)
+    progress(picture.name, 1)
+
+
+def _asked(trackers: Sequence[T], ways: Mapping[Inputs, Clip]) -> Iterator[tuple[T, Inputs]]:
+    for tracker in trackers:
+        for inputs in TRACKERS[tracker.name].inputs:
+            if inputs in ways:
+                yield tracker, inputs
+
+
+def _kept(
+    kept: KeptAnswers | None, of: str, tracker: str, inputs: Inputs, ask: Callable[[], dict[str, np.ndarray]]
+) -> dict[str, Any]:
+    return dict(ask() if kept is None else kept.get(f"{of}.{tracker}.{inputs.replace(' ', '-')}", ask))
+
+
+def _follow(tracker: ClipTracker, clip: Clip, labels: Labels) -> dict[str, np.ndarray]:
+    """Answers at the scored labels."""
+    tracks = tracker.track(clip, labels.queries())
+    at = labels.frame[labels.scored], labels.track[labels.scored]
+    lost_p = np.full(len(at[0]), np.nan) if tracks.lost_p is None else tracks.lost_p[at]
+    return {"uv_px": tracks.uv_px[at], "visible": tracks.visible[at], "lost_p": lost_p}
+
+
+def discover(tracker: Tracker, clip: Clip) -> dict[str, np.ndarray]:
+    """Handles and knobs that a tracker discovers in a clip of one frame, and what it chose them from.
+
+    Returns:
+        ``uv_px`` of its answers, best first, ``candidates_px`` and their ``score``.
+    """
+    tracks = tracker.track(clip)
+    order = np.argsort(-tracks.confidence[0], kind="stable")
+    answers = [k for k in order if tracks.labels[k] in HANDLES]
+    peaks, size = tracker.candidates(clip.camera, clip.frame(0)), tracker.network.config.encoder.image_size
+    hold = np.isin(peaks.label.cpu().numpy(), [LABELS.index(name) for name in HANDLES])
+    uv_px = Letterbox(clip.camera, size).to_source(peaks.uv.float().cpu().numpy() * size)
+    return {
+        "uv_px": tracks.uv_px[0, answers].astype(np.float64),
+        "candidates_px": uv_px[hold].astype(np.float64),
+        "score": peaks.logit.double().cpu().numpy()[hold],
+    }
+
+
+def write_set(path: Path, real: RealSet, rows: Sequence[RealRow], single: Sequence[RealRow], run: Run) -> None:
+    """Write the result file of a set, whole or not at all.
+
+    Args:
+        path: the file.
+        real: the set.
+        rows: of the table, with intervals.
+        single: of each clip and picture, of which only the numbers are kept.
+        run: what made them.
+    """
+    raw = {
+        "format": FORMAT,
+        "set": real.name,
+        "run": asdict(run),
+        "rows": [{**asdict(row), "measures": {k: _value(v) for k, v in row.measures.items()}} for row in rows],
+        "single": [
+            {**asdict(row), "measures": {k: _short(v.mean) for k, v in row.measures.items() if v is not None}}
+            for row in single
+        ],
+    }
+    with whole_file(path) as unfinished:
+        unfinished.write_text(_compact(raw), encoding="utf-8")
+
+
+def _compact(raw: dict[str, Any]) -> str:
+    """JSON with a line per row, so that files stay small and differences readable."""
+    lists = {key: ",\n  ".join(json.dumps(row, allow_nan=False) for row in raw[key]) for key in ("rows", "single")}
+    head = json.dumps({key: value for key, value in raw.items() if key not in lists}, indent=1, allow_nan=False)
+    return head[:-2] + "".join(f',\n "{key}": [\n  {text}\n ]' for key, text in lists.items()) + "\n}\n"
+
+
+def _value(value: Value | None) -> dict[str, Any] | None:
+    return None if value is None else {key: _short(number) for key, number in asdict(value).items()}
+
+
+def _short(number: float | None) -> float | None:
+    """Five digits, of which no more than three mean anything."""
+    return float(f"{number:.5g}") if isinstance(number, float) else number

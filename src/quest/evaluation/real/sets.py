@@ -1,0 +1,351 @@
+"""Sets of labelled real recordings, as they lie on disk; ``docs/metrics.md`` describes the formats.
+
+A set is a folder of labelled clips, or of labelled pictures; which one is told by what is in it.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from PIL import Image, UnidentifiedImageError
+
+from quest.data.camera_file import read_camera
+from quest.data.frame_source import clean_depth
+from quest.data.pictures import colours_of, upright
+from quest.data.provenance import combined_hash, file_hash
+from quest.data.recording import read_recording
+from quest.errors import InputError
+from quest.types import Camera, Clip, Query
+
+STATES = ("visible", "occluded", "out")
+EXPECTED = (
+    "expected folders of clips that each hold labels.csv or truth.csv, or pictures/ and labels.csv (docs/metrics.md)"
+)
+Part = Literal["choosing", "teaching", "all"]
+"""Part of a set of pictures: a fifth of them chooses between settings, the rest may teach."""
+
+_CHOOSING_EVERY = 5
+_BAR_PX = 12.0
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Labels of K tracks of one clip, one row a label, N in all.
+
+    Attributes:
+        names: of the tracks.
+        moves: whether the part that a track is on is moved against its surroundings.
+        track: index of the label's track.
+        frame: index of its frame.
+        uv_px: pixels, centres at half-integers; NaN where nothing is known.
+        state: one of :data:`STATES`.
+    """
+
+    names: tuple[str, ...]
+    moves: Bool[np.ndarray, " K"]
+    track: Int[np.ndarray, " N"]
+    frame: Int[np.ndarray, " N"]
+    uv_px: Float[np.ndarray, "N 2"]
+    state: np.ndarray
+
+    @cached_property
+    def asked(self) -> Int[np.ndarray, " K"]:
+        """The label of each track with which a tracker is asked for it: the first visible one."""
+        seen = np.flatnonzero(self.state == "visible")
+        return seen[np.unique(self.track[seen], return_index=True)[1]]
+
+    @property
+    def scored(self) -> Int[np.ndarray, " S"]:
+        """The labels that are scored: those after the one with which a track is asked for."""
+        return np.flatnonzero(self.frame > self.frame[self.asked][self.track])
+
+    def queries(self) -> list[Query]:
+        """A point query per track, in their order."""
+        return [
+            Query.point(int(self.frame[i]), *map(float, self.uv_px[i]), name=f"query-{k}")
+            for k, i in enumerate(self.asked)
+        ]
+
+    @property
+    def step_px(self) -> float:
+        """Median way of visible points from frame to frame, pixels."""
+        steps = [
+            np.linalg.norm(np.diff(self.uv_px[i], axis=0), axis=1) / np.diff(self.frame[i])
+            for k in range(len(self.names))
+            if len(i := np.flatnonzero((self.track == k) & (self.state == "visible"))) > 1
+        ]
+        return float(np.median(np.concatenate(steps))) if steps else 0.0
+
+
+@dataclass(frozen=True)
+class LabelledClip:
+    """A recording with labelled tracks.
+
+    Attributes:
+        folder: a recording folder (``docs/recordings.md``); without a camera file the camera is guessed.
+        file: its labels.
+    """
+
+    folder: Path
+    file: Path
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.folder.name
+
+    @cached_property
+    def labels(self) -> Labels:
+        """The labels.
+
+        Raises:
+            InputError: the file cannot be understood.
+        """
+        return read_labels(self.file)
+
+    def read(self) -> Clip:
+        """The frames.
+
+        Raises:
+            InputError: the recording is damaged, or labels are for frames that it has not.
+        """
+        clip = read_recording(self.folder)
+        if len(clip) <= self.labels.frame.max():
+            raise InputError(
+                f"{self.file}: expected frames below {len(clip)}, which {self.folder} has, got "
+                f"{self.labels.frame.max()}; frames count from 0"
+            )
+        return clip
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture with H labelled handles: boxes, or bars between two ends.
+
+    Attributes:
+        path: the picture.
+        boxes: x0, y0, x1, y1 of each handle's box, or the two ends of its bar, pixels.
+        wanted: which handles count; answers at the others are neither right nor wrong.
+        bars: whether handles are bars.
+        depth: its depth image, aligned.
+        camera: its camera file; without one the camera is guessed.
+    """
+
+    path: Path
+    boxes: Float[np.ndarray, "H 4"]
+    wanted: Bool[np.ndarray, " H"]
+    bars: bool = False
+    depth: Path | None = None
+    camera: Path | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the file."""
+        return self.path.name
+
+    def read(self) -> Clip:
+        """The picture as a clip of one frame.
+
+        Raises:
+            InputError: a file is damaged.
+        """
+        rgb = colours_of(upright(_open(self.path)), f"picture {self.path}")
+        setup = None if self.camera is None else read_camera(self.camera)
+        camera = Camera.from_fov(rgb.shape[1], rgb.shape[0]) if setup is None else setup.camera
+        depth_m = None
+        if self.depth is not None and setup is not None:
+            depth_m = clean_depth(np.asarray(_open(self.depth)) * np.float32(setup.depth_scale_m))[None]
+        return Clip(self.name, camera, rgb[None], depth_m, np.zeros(1), np.eye(4)[None])
+
+    def closeness(self, uv_px: Float[np.ndarray, "A 2"]) -> Float[np.ndarray, "A H"]:
+        """How far answers are from handles, in parts of the handle; infinite where they are not right.
+
+        Right is an answer in a box whose edges are moved out by an eighth of its size, at least 4 px, or within 12 px
+        of a bar.
+        """
+        low, high = self.boxes[:, :2], self.boxes[:, 2:]
+        if self.bars:
+            along = np.maximum(np.square(high - low).sum(axis=-1), 1e-9)
+            share = np.clip(((uv_px[:, None] - low) * (high - low)).sum(axis=-1) / along, 0, 1)
+            gap = np.linalg.norm(uv_px[:, None] - low - share[..., None] * (high - low), axis=-1) / _BAR_PX
+            return np.where(gap <= 1, gap, np.inf)
+        out = np.maximum(4.0, 0.125 * (high - low))
+        inside = ((uv_px[:, None] >= low - out) & (uv_px[:, None] <= high + out)).all(axis=-1)
+        gap = np.abs((uv_px[:, None] - (low + high) / 2) / np.maximum((high - low) / 2, 1)).max(axis=-1)
+        return np.where(inside, gap, np.inf)
+
+    def sizes_px(self) -> Float[np.ndarray, " H"]:
+        """The longer side of each handle in a picture 640 pixels wide."""
+        with Image.open(self.path) as image:
+            return np.abs(self.boxes[:, 2:] - self.boxes[:, :2]).max(axis=-1, initial=0) * 640 / image.width
+
+
+@dataclass(frozen=True)
+class RealSet:
+    """A set of labelled recordings: clips with tracks, pictures with handles, or both.
+
+    Attributes:
+        folder: where it is.
+        clips: by name.
+        pictures: by name.
+        far_px: beyond this a tracker's answer is far off, where its P(lost) should be high.
+    """
+
+    folder: Path
+    clips: tuple[LabelledClip, ...]
+    pictures: tuple[Picture, ...]
+    far_px: float = 16.0
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.folder.resolve().name
+
+    def data_hash(self) -> str:
+        """Over all files that answers and scores depend on."""
+        files = [path for clip in self.clips for path in clip.folder.rglob("*") if path.is_file()]
+        files += [path for p in self.pictures for path in (p.path, p.depth, p.camera) if path is not None]
+        files += [
+            path for path in (self.folder / "labels.csv", self.folder / "handles" / "handles.csv") if path.exists()
+        ]
+        root = self.folder
+        return combined_hash((f.relative_to(root).as_posix(), file_hash(f) or "") for f in dict.fromkeys(files))
+
+
+def open_set(folder: Path, *, part: Part = "choosing") -> RealSet:
+    """Find out what a folder holds.
+
+    Args:
+        folder: the set.
+        part: of pictures.
+
+    Raises:
+        InputError: it is no set, or its labels cannot be understood.
+    """
+    if not folder.is_dir():
+        raise InputError(f"real set {folder}: no such folder; {EXPECTED}")
+    if (folder / "pictures").is_dir():
+        return RealSet(folder, (), tuple(_boxed_pictures(folder, part)))
+    clips = [
+        LabelledClip(own, file)
+        for own in sorted(path for path in folder.iterdir() if path.is_dir())
+        for file in (own / "labels.csv", own / "truth.csv")
+        if file.is_file()
+    ]
+    stills = tuple(_stills(folder / "handles")) if (folder / "handles" / "handles.csv").is_file() else ()
+    if not clips and not stills:
+        raise InputError(f"real set {folder}: {EXPECTED}, found neither")
+    for clip in clips:
+        assert clip.labels  # read now: a wrong label must not come to light after an hour
+    exact = all(clip.file.name == "truth.csv" for clip in clips)
+    return RealSet(folder, tuple(clips), stills, far_px=40.0 if exact else 16.0)
+
+
+def may_choose(picture: str) -> bool:
+    """Whether a picture is of the fifth that chooses, by the hash of its name; those of one building stay together."""
+    group = "ward" if picture.startswith("ward-") else picture
+    return int(hashlib.sha256(group.encode()).hexdigest(), 16) % _CHOOSING_EVERY == 0
+
+
+def read_labels(path: Path) -> Labels:
+    """Read ``labels.csv`` (pixel centres at half-integers) or ``truth.csv`` (at integers).
+
+    Raises:
+        InputError: a column is missing, a value makes no sense, or a track is nowhere visible.
+    """
+    shift = 0.5 if path.name == "truth.csv" else 0.0
+    rows = []
+    for line, row in _rows(path, ("track", "frame", "x", "y", "state")):
+        if row["state"] not in STATES:
+            raise InputError(f"{path}, line {line}: expected state {', '.join(STATES)}, got {row['state']!r}")
+        uv_px = [_number(path, line, row, key) + shift for key in ("x", "y")]
+        frame = _number(path, line, row, "frame")
+        if not (frame >= 0 and frame % 1 == 0) or (row["state"] == "visible" and not np.isfinite(uv_px).all()):
+            raise InputError(f"{path}, line {line}: expected a frame from 0 on, and x and y of what is visible")
+        rows.append((row["track"], int(frame), uv_px, row["state"], row.get("moves") == "yes"))
+    rows.sort(key=lambda r: (r[0], r[1]))
+    names = tuple(dict.fromkeys(r[0] for r in rows))
+    unseen = sorted(set(names) - {r[0] for r in rows if r[3] == "visible"})
+    if unseen or not rows:
+        raise InputError(f"{path}: expected a visible label of every track, got none of {', '.join(unseen) or 'any'}")
+    moving = {r[0] for r in rows if r[4]}
+    return Labels(
+        names,
+        np.array([name in moving for name in names]),
+        np.array([names.index(r[0]) for r in rows]),
+        np.array([r[1] for r in rows]),
+        np.array([r[2] for r in rows], dtype=np.float64),
+        np.array([r[3] for r in rows]),
+    )
+
+
+def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
+    file = folder / "labels.csv"
+    boxes: dict[str, list[list[float]]] = {}
+    for line, row in _rows(file, ("file", "class", "x0", "y0", "x1", "y1")):
+        own = boxes.setdefault(row["file"], [])
+        if row["class"] == "handle":
+            own.append([_number(file, line, row, key) for key in ("x0", "y0", "x1", "y1")])
+    for name, found in sorted(boxes.items()):
+        if part == "all" or may_choose(name) == (part == "choosing"):
+            path = folder / "pictures" / name
+            if not path.is_file():
+                raise InputError(f"{file}: expected a picture {path}, found none")
+            yield Picture(path, np.reshape(found, (-1, 4)).astype(float), np.ones(len(found), bool))
+
+
+def _stills(folder: Path) -> Iterator[Picture]:
+    """Pictures whose handles are bars, pixel centres at integers, with depth images of the same name."""
+    file, camera = folder / "handles.csv", folder / "camera.json"
+    bars: dict[str, list[list[float]]] = {}
+    for line, row in _rows(file, ("frame", "x1", "y1", "x2", "y2", "use")):
+        values = [_number(file, line, row, key) for key in ("frame", "x1", "y1", "x2", "y2", "use")]
+        bars.setdefault(f"{int(values[0]):04d}", []).append(values[1:])
+    for stem, found in sorted(bars.items()):
+        ends = np.array(found, dtype=float)
+        depth = folder / f"{stem}.png"
+        yield Picture(
+            folder / f"{stem}.jpg",
+            ends[:, :4] + 0.5,
+            ends[:, 4] > 0,
+            bars=True,
+            depth=depth if depth.is_file() else None,
+            camera=camera if camera.is_file() else None,
+        )
+
+
+def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
+    """Lines of a CSV file with their numbers."""
+    if not path.is_file():
+        raise InputError(f"labels {path}: no such file; {EXPECTED}")
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        missing = [name for name in columns if name not in (reader.fieldnames or ())]
+        if missing:
+            raise InputError(f"{path}: expected columns {', '.join(columns)}, got none named {', '.join(missing)}")
+        for row in reader:
+            yield reader.line_num, {key: value or "" for key, value in row.items() if isinstance(value, str | None)}
+
+
+def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
+    try:
+        return float(row[key] or "nan")
+    except ValueError:
+        raise InputError(f"{path}, line {line}: expected a number for {key}, got {row[key]!r}") from None
+
+
+def _open(path: Path) -> Image.Image:
+    try:
+        with Image.open(path) as image:
+            image.load()
+            return image
+    except (OSError, UnidentifiedImageError) as error:
+        raise InputError(f"picture {path}: cannot be read ({error}); copy it again") from error

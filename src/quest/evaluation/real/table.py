@@ -1,0 +1,79 @@
+"""Rows of real recordings as tables in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import groupby
+
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from quest.evaluation.real.run import RealRow
+from quest.evaluation.tables import Column, cell, fitting
+
+COLUMNS = (
+    Column("median_px", "med px", 1, 1.0, 0),
+    Column("within_16", "≤16 px %", 1, 100.0, 0),
+    Column("moved_median_px", "moved: med px", 1, 1.0, 6),
+    Column("moved_within_16", "moved: ≤16 %", 1, 100.0, 2),
+    Column("never_beyond_50", "never >50 %", 0, 100.0, 7),
+    Column("identity_errors", "id errors %", 1, 100.0, 3),
+    Column("hidden_called_visible", "hidden seen %", 0, 100.0, 2),
+    Column("occluded_called_visible", "occl. seen %", 0, 100.0, 9),
+    Column("out_called_visible", "out seen %", 0, 100.0, 8),
+    Column("lost_p_near", "P(lost) near", 3, 1.0, 5),
+    Column("lost_p_far", "far", 3, 1.0, 4),
+    Column("lost_p_hidden", "hidden", 3, 1.0, 4),
+    Column("lost_auroc", "AUROC", 2, 1.0, 3),
+    Column("recall", "recall %", 1, 100.0, 0),
+    Column("precision", "prec. %", 1, 100.0, 0),
+    Column("f1", "F1 %", 1, 100.0, 0),
+    Column("ap", "AP", 3, 1.0, 1),
+    Column("recall_0_to_16_px", "<16 px", 0, 100.0, 2),
+    Column("recall_16_to_32_px", "16–32", 0, 100.0, 2),
+    Column("recall_32_to_64_px", "32–64", 0, 100.0, 2),
+    Column("recall_above_64_px", ">64", 0, 100.0, 2),
+)
+"""What is shown of a row, in this order; the result file has everything."""
+
+FULL_WIDTH = 190
+LEGEND = (
+    "below each number the 95 % bootstrap interval over clips (pictures). n: clips/tracks/labels after the first, or "
+    "pictures/handles/answers. Medians below 3 px rank nobody: labels are no better"
+)
+
+
+def real_table(sets: Mapping[str, Sequence[RealRow]], *, width: int = FULL_WIDTH) -> RenderableType:
+    """One table per set and kind of row.
+
+    Args:
+        sets: rows by the name of the set.
+        width: of the terminal in characters; columns that do not fit are left out whole.
+    """
+    parts: list[RenderableType] = []
+    for name, rows in sets.items():
+        for of, group in groupby(rows, key=lambda row: row.of):
+            parts.append(_table(f"{name} · {of}", list(group), width))
+    return Group(*parts, Text(LEGEND, style="dim"))
+
+
+def _table(title: str, rows: Sequence[RealRow], width: int) -> Table:
+    heads = [("tracker", "shown", "n"), *(_head(row) for row in rows)]
+    columns = [c for c in COLUMNS if any(row.measures.get(c.field) is not None for row in rows)]
+    kept = fitting(columns, heads, lambda column: [row.measures.get(column.field) for row in rows], width)
+    table = Table(
+        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1)
+    )
+    for heading in heads[0]:
+        table.add_column(heading, no_wrap=True)
+    for column in kept:
+        table.add_column(column.heading, justify="right", no_wrap=True)
+    for row in rows:
+        table.add_row(*_head(row), *(cell(row.measures.get(column.field), column) for column in kept))
+    return table
+
+
+def _head(row: RealRow) -> tuple[str, str, str]:
+    return row.tracker, row.inputs, f"{row.units}/{row.targets}/{row.terms}"
