@@ -25,7 +25,7 @@ class Track(Source):
     """Track a recording or a take; without queries the entities are discovered."""
 
     out: Path | None = None
-    """Folder for tracks.parquet and overlay.mp4; default: outputs/NAME, for a take with the view."""
+    """Folder for tracks.parquet, joints.json and overlay.mp4; default: outputs/NAME, for a take with the view."""
     overlay: bool = True
     """Write the video."""
     rrd: Path | None = None
@@ -38,7 +38,6 @@ class Track(Source):
         self.check_alpha()
         console = Console(highlight=False, soft_wrap=True)
         console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
-        from quest.tracks import write_tracks
         from quest.viz.overlay import write_overlay
         from quest.viz.rerun_tracks import check_viewer, open_tracks, save_tracks
 
@@ -54,12 +53,14 @@ class Track(Source):
         console.print(f"tracking {counted(len(clip), 'frame')} of {size}{depth} on {tracker.device}")
         with counting(console, "tracking", len(clip)) as report:
             tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report)
-        write_tracks(tracks, out / "tracks.parquet")
+        tracks.save(out)
         console.print(_summary(clip, tracks))
         self.say_shortfall(tracker, console, frames=len(clip))
         for flag in tracks.frame_flags:
             console.print(f"[yellow]note:[/] {escape(flag)}")
         console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")
+        if tracks.joints is not None:
+            console.print(f"joints: {escape(str(out / 'joints.json'))}")
         if self.overlay:
             with console.status("drawing"):
                 write_overlay(clip, tracks, out / "overlay.mp4")
@@ -100,15 +101,17 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
             f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
         )
     )
-    for column in ("entity", "label", "seen", "moved", "confidence", "state at the end"):
-        table.add_column(column, justify="left" if column in ("entity", "label") else "right")
+    for column in ("entity", "label", "seen", "moved", "joint", "confidence", "state at the end"):
+        table.add_column(column, justify="left" if column in ("entity", "label", "joint") else "right")
     for k, (name, label) in enumerate(zip(tracks.names, tracks.labels, strict=True)):
+        bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
+        if not bound.any():
+            table.add_row(escape(name), label or "", "", "", "", "", "not found")
+            continue
         points = tracks.point_world[:, k]
         points = points[np.isfinite(points).all(axis=-1)]
         moved = f"{np.linalg.norm(points - points[0], axis=-1).max():.3f} m" if len(points) else "unknown"
-        bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
-        seen, sure = (
-            np.mean(values[bound, k]) if bound.any() else 0.0 for values in (tracks.visible, tracks.confidence)
-        )
-        table.add_row(escape(name), label or "", f"{seen:.0%}", moved, f"{sure:.2f}", str(tracks.state[-1, k]))
+        joint = "unknown" if tracks.joints is None else tracks.joints.describe(k)
+        seen, sure = tracks.visible[bound, k].mean(), tracks.confidence[bound, k].mean()
+        table.add_row(escape(name), label or "", f"{seen:.0%}", moved, joint, f"{sure:.2f}", str(tracks.state[-1, k]))
     return table
