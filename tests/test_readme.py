@@ -1,18 +1,16 @@
-"""The README is run as written: its Python block, its commands as far as their arguments, its figures."""
+"""The README is run as written: its Python block, its commands as far as their arguments."""
 
 from __future__ import annotations
 
-import importlib.util
 import re
 import shlex
-import sys
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
-PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [README, *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def blocks(path: Path, language: str) -> list[str]:
@@ -65,28 +63,3 @@ def test_python_example_runs(monkeypatch, capsys):
     for block in blocks(README, "python"):
         exec(compile(block, "<example of the README>", "exec"), shared)
     assert "knob" in capsys.readouterr().out
-
-
-def benchmark(name: str):
-    """A script of the folder of benchmarks as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / "benchmarks" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_figures_are_those_of_the_result_files():
-    module = benchmark("update_readme")
-    pages = module.pages(ROOT / "benchmarks" / "results")
-    assert README in pages
-    for page, folder in pages.items():
-        text = page.read_text(encoding="utf-8")
-        assert text == module.with_figures(text, module.figures(folder)), page
-
-
-def test_the_page_of_results_is_that_of_the_reports():
-    page = ROOT / "docs" / "results.md"
-    assert page.read_text(encoding="utf-8") == benchmark("update_reports").page(ROOT / "benchmarks" / "results")

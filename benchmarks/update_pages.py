@@ -1,0 +1,518 @@
+"""Write the tables of the README, the model cards and the pages of results out of the result files.
+
+    python benchmarks/update_pages.py            # rewrite what is out of date
+    python benchmarks/update_pages.py --check    # fail if a page would change
+
+The README and the cards keep their text around a pair of markers; the pages of results are written whole.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from quest.model.weights import DEFAULTS
+
+ROOT = Path(__file__).parents[1]
+CARDS = ROOT / "src" / "quest" / "assets" / "weights"
+BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table of a page."""
+
+    file: str
+    """The report, below the folder of results."""
+    title: str
+    columns: Mapping[str, str]
+    """Heading, and where in a row the value is: keys joined by dots; ``%`` first for percent, ``!%`` for the
+    percentage of the complement, ``/`` between several values."""
+    rows: str = "rows"
+    """Key of the rows: a list, or a mapping whose keys become ``key``; empty if the report is the only row."""
+    each: str = ""
+    """Key of a list in a row of which every entry makes a line; its values come after ``each.``."""
+    only: Mapping[str, Any] = field(default_factory=dict)
+    """Values that a row must have."""
+    about: str = ""
+    """A sentence above the table."""
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page that is written whole."""
+
+    title: str
+    about: str
+    tables: tuple[Table, ...]
+
+
+OBJECTS = {"objects": "source", "part": "part"}
+TRACKS = {"objects/takes/tracks": "objects/takes/tracks"}
+MOVED = {"protocol": "point", "reading": "moved"}
+SHARED = ("part", "level", "suite", "in frames", "reading")
+"""Columns that are said once above a table where all its rows agree."""
+
+FOUND = {"protocol": "semantic", "reading": "all"}
+
+
+def tracking(file: str, title: str, about: str = "", **only: Any) -> Table:
+    """Points that were asked for, of entities that move."""
+    columns = OBJECTS | {"level": "level", "suite": "suite", "tracker": "tracker"} | TRACKS
+    columns |= {"median px": "metrics.median_px", "APE": "metrics.ape", "Acc %": "%metrics.acc"}
+    return Table(file, title, columns, only=MOVED | only, about=about)
+
+
+def discovery(file: str, title: str) -> Table:
+    """Entities that nobody pointed at; pixels of those that were not found mean nothing and are not shown."""
+    columns = OBJECTS | {"level": "level"} | TRACKS
+    columns |= {"not found %": "!%metrics.recall", "nor under another label %": "!%metrics.place_recall"}
+    columns |= {"precision %": "%metrics.precision", "Acc %": "%metrics.acc"}
+    return Table(file, title, columns, only=FOUND)
+
+
+def alarms(file: str, title: str, about: str = "") -> Table:
+    """False alarms and losses that were missed, at every alpha."""
+    columns = {"detector": "detector", "alpha": "each.alpha", "in frames": "each.alpha_frames"}
+    columns |= {"extrapolated": "each.extrapolated", "false alarms": "each.false_alarms of each.trials"}
+    columns |= {"95 % interval, %": "%each.low to %each.high", "missed %": "%each.missed"}
+    columns |= {"median delay": "each.delay_median", "90 % within": "each.delay_p90"}
+    return Table(f"{file}.json", title, columns, each="alarms", about=about)
+
+
+def ablation(file: str, title: str, distance: tuple[str, str] = ("APE", "ape")) -> Table:
+    """Variants of the network; Δ is the difference from the first row of the same objects."""
+    heading, key = distance
+    columns = {"objects": "source", "variant": "variant", heading: f"metrics.{key}", "D@100": "metrics.d100"}
+    columns |= {"Acc %": "%metrics.acc", f"Δ {heading}": f"difference.{key}", "Δ Acc %": "%difference.acc"}
+    return Table(f"ablations/{file}.json", title, columns, only={"reading": "moved"})
+
+
+def intents(file: str, title: str) -> Table:
+    """Two rims of one laptop, one to open and one to lift."""
+    columns = OBJECTS | {"objects/takes/views": "objects/takes/views", "both stable %": "%both"}
+    columns |= {"both on their link %": "%kept", "APE open": "open_ape", "APE lift": "lift_ape"}
+    return Table(f"intents/{file}.json", title, columns)
+
+
+ON_OFF = {"with joints": "ape.on", "without": "ape.off", "ratio": "ape.ratio"}
+
+RESULTS = Page(
+    "Results",
+    "Figures of the weights that ship, real recordings first. Written by `python benchmarks/update_pages.py` out of "
+    "`benchmarks/results`; [metrics.md](metrics.md) defines the columns. In brackets are 95 % intervals. Validation "
+    "objects chose settings, test objects did not. Figures of earlier trackers are in "
+    "[history/results.md](history/results.md), those of network variants in [ablations.md](ablations.md).",
+    (
+        tracking("test.json", "Simulated test objects", suite="standard"),
+        discovery("test.json", "Discovery on test objects"),
+        tracking("validation.json", "Simulated validation objects", suite="standard"),
+        discovery("validation.json", "Discovery on validation objects"),
+        tracking("quest-s16-apache/test.json", "Weights trained on procedural objects only", suite="standard"),
+        discovery("quest-s16-apache/test.json", "Discovery with these weights"),
+        tracking("levels/test.json", "Levels 1 to 4 of the same objects"),
+        tracking("robust/test.json", "Colour noise and a camera position that training never had"),
+        Table(
+            "grounding/reappearance.json",
+            "Occluded for 60 frames",
+            OBJECTS
+            | {
+                "beside": "beside",
+                "tracker": "tracker",
+                "occlusions/judged": "episodes/judged",
+                "right before %": "%held_before",
+                "APE while occluded": "ape_hidden",
+                "right 5 frames after %": "%held_again",
+                "of those right before %": "%held_again_if_before",
+            },
+            rows="occlusion",
+            about="The joint moves on while the entity is occluded, and stops.",
+        ),
+        Table(
+            "grounding/reappearance.json",
+            "Sixteen identical doors",
+            OBJECTS
+            | {
+                "reading": "reading",
+                "tracker": "tracker",
+                "objects/tracks": "objects/tracks",
+                "switches per 1,000 frames": "metrics.switches",
+                "Acc %": "%metrics.acc",
+            },
+            rows="lockers",
+        ),
+        Table(
+            "grounding/standard_grounding.json",
+            "Tracking with and without joints: APE on ordinary takes",
+            OBJECTS | {"level": "level", "objects/tracks": "objects/tracks"} | ON_OFF,
+        ),
+        Table(
+            "grounding/suites_grounding.json",
+            "Tracking with and without joints: APE on suites",
+            OBJECTS | {"suite": "suite", "objects/tracks": "objects/tracks"} | ON_OFF,
+        ),
+        Table(
+            "grounding/predicted_joints.json",
+            "Joints from predicted tracks",
+            OBJECTS
+            | {
+                "joint": "kind",
+                "when": "moment",
+                "objects/answers": "objects/answers",
+                "kind right %": "%kind_right",
+                "axis error, degrees": "axis_error_deg",
+                "90 % within": "axis_p90_deg",
+            },
+        ),
+        Table(
+            "monitor/test.json",
+            "The monitor beside plainer rules, per frame",
+            {
+                "detector": "detector",
+                "streams": "streams",
+                "losses": "losses",
+                "AUROC": "auroc",
+                "AUGRC": "augrc",
+                "ECE": "ece",
+            },
+        ),
+        alarms("monitor/test", "Alarms per stream, at equal false alarms"),
+        alarms("monitor/blocks", "Alarms in the same streams, alpha for every 60 frames"),
+        alarms("quest-s16-apache/monitor/test", "Alarms of the weights trained on procedural objects only"),
+        intents("intents", "Open and lift: both rims of a closed laptop"),
+        intents("ajar", "Both rims of a laptop, from where they are 16 pixels apart"),
+        Table(
+            "speed/tracking.json",
+            "Time of a frame on two processor cores, alarms on",
+            {
+                "queries": "queries",
+                "frames": "frames",
+                "median, ms": "median_ms",
+                "95 % within, ms": "p95_ms",
+                "frames/s": "frames_per_s",
+            },
+            about="Measured with tracker revision 8. No GPU was timed.",
+        ),
+        Table(
+            "speed/tracking.json",
+            "Time of the first frame with discovery",
+            {"device": "device", "threads": "threads", "times": "discovery_ms.n", "median, ms": "discovery_ms.median"},
+            rows="",
+        ),
+        Table(
+            "data/verify.json",
+            "Takes of all suites, verified",
+            {"check": "key", "worst": "worst", "limit": "limit", "unit": "unit"},
+            rows="worst",
+        ),
+        Table(
+            "speed/generation.json",
+            "Making takes beside a bare SAPIEN loop",
+            {
+                "takes": "n_takes",
+                "frames": "n_frames",
+                "frames/s": "frames_per_s",
+                "bare loop": "bare_frames_per_s",
+                "share of bare %": "%share_of_bare",
+            },
+            rows="",
+            about="Three views of 224 × 224 pixels.",
+        ),
+        Table(
+            "speed/training.json",
+            "Training steps beside bare steps of the same network",
+            {
+                "preset": "preset",
+                "windows": "batch",
+                "frames/s": "frames_per_s",
+                "bare steps": "bare_frames_per_s",
+                "share of bare %": "%share_of_bare",
+            },
+            rows="",
+        ),
+    ),
+)
+
+ABLATIONS = Page(
+    "Ablations",
+    "Networks trained alike but for one part. Each title names the number of training steps, which are few: the "
+    "weights that ship learned ten times as long. Written by `python benchmarks/update_pages.py` out of "
+    "`benchmarks/results/ablations`; [metrics.md](metrics.md#ablations) defines the rows. Entities that move, point "
+    "queries, test objects, level 1. Δ is the difference from the first row of the same objects; in brackets are 95 % "
+    "bootstrap intervals over objects.",
+    (
+        ablation("parts", "Queries, 3D, smoothness, joints and anchors"),
+        ablation("losses", "Each loss left out"),
+        ablation("window", "Windows of T frames", ("APE_2d", "ape_2d")),
+        ablation("data", "Procedural training objects only"),
+        ablation("slots", "K learned queries"),
+        ablation("design", "Heatmap or regression, anchored or learned queries, 3D position codes"),
+    ),
+)
+
+HISTORY = Page(
+    "Results of earlier trackers",
+    "These figures were not measured again with the tracker that ships; each names its commit. Written by "
+    "`python benchmarks/update_pages.py`. The current figures are in [results.md](../results.md).",
+    (
+        tracking("fine_tune/before.json", "The tool chest of examples/fine_tune.py, shipped weights"),
+        discovery("fine_tune/before.json", "Discovery on the tool chest, shipped weights"),
+        tracking("fine_tune/after.json", "The tool chest, weights fitted to it"),
+        discovery("fine_tune/after.json", "Discovery on the tool chest, weights fitted to it"),
+        alarms("monitor/long", "Streams of 240 frames, alpha for the whole stream"),
+        alarms("monitor/long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
+        Table(
+            "joints/joints.json",
+            "Joints from true tracks with noise",
+            {"how": "key", "tracks": "all.kind_right.n", "kind right %": "%all.kind_right"}
+            | {f"axis error {kind}, degrees": f"{kind}.axis_error_deg.median" for kind in ("prismatic", "revolute")},
+            rows="simulated",
+            about="After 30 degrees or 10 cm; noise of 2 mm unless the row says otherwise.",
+        ),
+        Table(
+            "joints/joints.json",
+            "Joints from real tracks",
+            {"how": "key", "tracks": "kind_right.n", "kind right %": "%kind_right"},
+            rows="recorded",
+        ),
+        Table(
+            "scene_flow/test.json",
+            "Scene flow: EPE3D",
+            OBJECTS
+            | {
+                "stride": "stride",
+                "reading": "reading",
+                "objects/takes/entities": "objects/takes/entities",
+                "flow head": "epe.head",
+                "zero flow": "epe.zero",
+                "lifted points": "epe.lifted",
+            },
+        ),
+        Table(
+            "endurance/endurance.json",
+            "One stream of 100,000 frames",
+            {
+                "frames": "frames_done",
+                "memory at the end +%": "memory_growth_percent.end",
+                "at most +%": "memory_growth_percent.peak",
+                "early, ms": "cpu_change.early_ms",
+                "late, ms": "cpu_change.late_ms",
+                "change %": "cpu_change.percent",
+            },
+            rows="",
+            about="Memory since frame 10,000 and processor time of a frame.",
+        ),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class UpdatePages:
+    """Rewrite the tables of README, cards and pages of results."""
+
+    results: Path = ROOT / "benchmarks" / "results"
+    check: bool = False
+    """Change nothing; exit with 1 if a page is out of date."""
+
+    def run(self) -> int:
+        """Return 0, or 1 if --check finds a page out of date."""
+        stale = 0
+        for path, text in pages(self.results).items():
+            if path.is_file() and path.read_text(encoding="utf-8") == text:
+                continue
+            if self.check:
+                print(f"{path} is out of date: python benchmarks/update_pages.py", file=sys.stderr)
+                stale = 1
+            else:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(text, encoding="utf-8")
+        return stale
+
+
+def pages(folder: Path) -> dict[Path, str]:
+    """Every page with figures, and the text that it should have."""
+    written = {
+        ROOT / "docs" / "results.md": whole(RESULTS, folder),
+        ROOT / "docs" / "ablations.md": whole(ABLATIONS, folder),
+        ROOT / "docs" / "history" / "results.md": whole(HISTORY, folder),
+    }
+    for page in (ROOT / "README.md", *sorted(CARDS.glob("*.md"))):
+        default = page.name == "README.md" or page.stem in DEFAULTS.values()
+        written[page] = between_markers(page.read_text(encoding="utf-8"), summary(folder, "" if default else page.stem))
+    return written
+
+
+def between_markers(text: str, table: str) -> str:
+    """A page's text with another table between the markers."""
+    before, _, rest = text.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    if not rest or END not in rest:
+        raise SystemExit(f"expected the markers {BEGIN} and {END} in the page")
+    return f"{before}{BEGIN}\n{table}\n{END}{after}"
+
+
+def whole(page: Page, folder: Path) -> str:
+    """A page as Markdown; tables whose report is missing or has no such rows are left out."""
+    sections = [section for table in page.tables if (section := as_section(table, folder))]
+    return "\n\n".join([f"# {page.title}", page.about, *sections]) + "\n"
+
+
+SUMMARY = ("measured on", "n", "measure", "QueST", "LK on a grid", "hold still")
+RIVALS = {"lk-grid": "", "lk": " ¹"}
+"""Trackers of the third column: the first that was measured, and its mark."""
+
+SOURCES = {"partnet-mobility": "simulated, PartNet-Mobility", "procedural": "simulated, procedural"}
+
+
+def summary(folder: Path, weights: str = "") -> str:
+    """The one table of README and cards.
+
+    Args:
+        folder: of all results.
+        weights: name of the weights whose results lie in a folder of their own; empty for the default.
+    """
+    report = read_report(folder / weights / "test.json")
+    if not report:
+        return "No results yet."
+    rows = [*simulated(report["rows"])]
+    text = [
+        "In brackets: 95 % bootstrap intervals over objects or clips. n: objects or clips / tracks. Simulated: "
+        "level 1, objects that no training saw, 224 × 224 pixels, entities that move.",
+    ]
+    if any("¹" in row for row in rows):
+        text.append("¹ LK on one point; the grid was not measured there.")
+    text.append(f"Made by `python benchmarks/update_pages.py`; simulated: commit {report['run']['commit'][:9]}.")
+    return "\n".join([line(SUMMARY), line("---" for _ in SUMMARY), *rows, "", *text])
+
+
+def simulated(rows: list[dict[str, Any]]) -> Iterable[str]:
+    """Lines of the summary about simulated test objects."""
+    rows = [row for row in rows if row["level"] == 1 and row["suite"] == "standard"]
+    for source, place in SOURCES.items():
+        moved = {row["tracker"]: row for row in rows if row["source"] == source and matches(row, MOVED)}
+        for measure, where in (("median error, px", "metrics.median_px"), ("right identity, %", "%metrics.acc")):
+            yield summary_line(place, "objects/tracks", measure, where, moved)
+        found = {row["tracker"]: row for row in rows if row["source"] == source and matches(row, FOUND)}
+        yield summary_line(place, "objects/tracks", "not found by itself, %", "!%metrics.recall", found)
+
+
+def summary_line(place: str, count: str, measure: str, where: str, rows: Mapping[str, Any]) -> str:
+    """One line of the summary; a tracker without a row has an empty cell."""
+    rival = next((name for name in RIVALS if name in rows), None)
+    cells = [place, cell(rows["quest"], count), measure, cell(rows["quest"], where)]
+    cells.append(cell(rows[rival], where) + RIVALS[rival] if rival else "")
+    cells.append(cell(rows["hold-still"], where) if "hold-still" in rows else "")
+    return line(cells)
+
+
+def matches(row: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
+    """Whether a row has all of these values."""
+    return all(row[key] == value for key, value in values.items())
+
+
+def as_section(table: Table, folder: Path) -> str:
+    """One table with its heading and notes; empty where there is nothing to show."""
+    report = read_report(folder / table.file)
+    rows = report.get(table.rows, []) if table.rows else [report] if report else []
+    if isinstance(rows, dict):
+        rows = [{"key": key, **row} for key, row in rows.items()]
+    rows = [row for row in rows if matches(row, table.only)]
+    if not rows:
+        return ""
+    entries = [row | {"each": entry} for row in rows for entry in (row[table.each] if table.each else [{}])]
+    columns = {heading: [cell(entry, where) for entry in entries] for heading, where in table.columns.items()}
+    shared = {h: cells[0] for h, cells in columns.items() if h in SHARED and len(cells) > 1 and len(set(cells)) == 1}
+    columns = {heading: cells for heading, cells in columns.items() if heading not in shared and any(cells)}
+    lines = [line(columns), line("---" for _ in columns), *map(line, zip(*columns.values(), strict=True))]
+    title = f"{table.title}, {report['steps']} steps" if "steps" in report else table.title
+    common = "; ".join(f"{heading}: {value}" for heading, value in shared.items() if value)
+    parts = [f"## {title}", table.about, common, "\n".join(lines), "\n".join(notes(report))]
+    return "\n\n".join(part for part in parts if part)
+
+
+def notes(report: Mapping[str, Any]) -> list[str]:
+    """What made a table."""
+    run = report.get("run", report)
+    found = [f"`{run['command']}`, commit {run['commit'][:9]}."]
+    found += [f"Answers: `{r['command']}`, commit {r['commit'][:9]}." for r in origins(report)]
+    if report.get("complete") is False:
+        found.insert(0, "**Unfinished**: these are the takes so far.")
+    if "machine" in report and "n_takes" in report:
+        found.insert(0, f"{report['n_takes']} takes, {report['machine']}.")
+    if "steps" in report:
+        seeds = ", ".join(map(str, report["seeds"]))
+        found.append(f"Steps of {report['batch']} windows on frozen features; seeds {seeds}.")
+    if "calibration" in report:
+        found.append(f"Calibration: {report['calibration']}.")
+    return found
+
+
+def origins(report: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The runs whose records a report was made from."""
+    return [origin["run"] for origin in report.get("origins", ())]
+
+
+def read_report(path: Path) -> dict[str, Any]:
+    """A report; empty where there is no such file."""
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+
+
+def cell(row: Mapping[str, Any], where: str) -> str:
+    """What a column says of a row."""
+    for between in (" of ", " to ", "/"):
+        if between in where:
+            return between.join(cell(row, part) for part in where.split(between))
+    value: Any = row
+    for key in where.lstrip("!%").split("."):
+        value = value.get(key) if isinstance(value, Mapping) else None
+    if where == "variant":
+        value = str(value).removeprefix("default: ")
+    if where.startswith("!") and value is not None:
+        value = {"mean": 1 - value["mean"], "low": less(value["high"]), "high": less(value["low"])}
+    return shown(value, percent="%" in where[:2])
+
+
+def less(bound: float | None) -> float | None:
+    """The complement of a share."""
+    return None if bound is None else 1 - bound
+
+
+def shown(value: Any, *, percent: bool = False) -> str:
+    """A value as text: a number, or a number with its interval."""
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else ""
+    if isinstance(value, Mapping):
+        middle, low, high = value.get("share", value.get("mean")), value.get("low"), value.get("high")
+        if middle is None or low is None:
+            return shown(middle, percent=percent)
+        texts = [number(v, percent=percent, fixed=True) if v is not None else "∞" for v in (middle, low, high)]
+        return f"{texts[0]} ({texts[1]}{' to ' if texts[1].startswith('-') else '–'}{texts[2]})"
+    return number(value, percent=percent) if isinstance(value, float) else str(value)
+
+
+def number(value: float, *, percent: bool = False, fixed: bool = False) -> str:
+    """A number with as many digits as mean something."""
+    if percent:
+        return f"{100 * value:.{int(0 < abs(value) < 0.1)}f}"
+    if abs(value) >= 1000:
+        return f"{value:.0f}"
+    if fixed and abs(value) < 1:
+        return f"{value:.{4 if 0 < abs(value) < 0.0095 else 3}f}"
+    return f"{value:.3g}"
+
+
+def line(cells: Iterable[str]) -> str:
+    """One line of a Markdown table."""
+    return f"| {' | '.join(cells)} |"
+
+
+if __name__ == "__main__":
+    sys.exit(tyro.cli(UpdatePages).run())
