@@ -31,9 +31,9 @@ class Table:
     file: str
     """The report, below the folder of results."""
     title: str
-    columns: Mapping[str, str]
-    """Heading, and where in a row the value is: keys joined by dots; ``%`` first for percent, ``!%`` for the
-    percentage of the complement, ``/`` between several values."""
+    columns: str
+    """Columns as ``heading = where``, divided by ``|``. Where in a row a value is: keys joined by dots; ``%`` first for
+    percent, ``!%`` for the percentage of the complement; ``/``, ``of`` or ``to`` between several values."""
     rows: str = "rows"
     """Key of the rows: a list, or a mapping whose keys become ``key``; empty if the report is the only row."""
     each: str = ""
@@ -53,55 +53,58 @@ class Page:
     tables: tuple[Table, ...]
 
 
-OBJECTS = {"objects": "source", "part": "part"}
-TRACKS = {"objects/takes/tracks": "objects/takes/tracks"}
-MOVED = {"protocol": "point", "reading": "moved"}
 SHARED = ("part", "level", "suite", "in frames", "reading")
 """Columns that are said once above a table where all its rows agree."""
 
+MOVED = {"protocol": "point", "reading": "moved"}
 FOUND = {"protocol": "semantic", "reading": "all"}
+OBJECTS = "objects = source | part = part | "
+TRACKS = "objects/takes/tracks = objects/takes/tracks | "
 
 
-def tracking(file: str, title: str, about: str = "", **only: Any) -> Table:
+def tracking(file: str, title: str, **only: Any) -> Table:
     """Points that were asked for, of entities that move."""
-    columns = OBJECTS | {"level": "level", "suite": "suite", "tracker": "tracker"} | TRACKS
-    columns |= {"median px": "metrics.median_px", "APE": "metrics.ape", "Acc %": "%metrics.acc"}
-    return Table(file, title, columns, only=MOVED | only, about=about)
+    columns = f"{OBJECTS}level = level | suite = suite | tracker = tracker | {TRACKS}"
+    metrics = "median px = metrics.median_px | APE = metrics.ape | Acc % = %metrics.acc"
+    return Table(file, title, columns + metrics, only=MOVED | only)
 
 
 def discovery(file: str, title: str) -> Table:
     """Entities that nobody pointed at; pixels of those that were not found mean nothing and are not shown."""
-    columns = OBJECTS | {"level": "level"} | TRACKS
-    columns |= {"not found %": "!%metrics.recall", "nor under another label %": "!%metrics.place_recall"}
-    columns |= {"precision %": "%metrics.precision", "Acc %": "%metrics.acc"}
-    return Table(file, title, columns, only=FOUND)
+    found = "not found % = !%metrics.recall | nor under another label % = !%metrics.place_recall | "
+    right = "precision % = %metrics.precision | Acc % = %metrics.acc"
+    return Table(file, title, f"{OBJECTS}level = level | {TRACKS}{found}{right}", only=FOUND)
 
 
-def alarms(file: str, title: str, about: str = "") -> Table:
+def alarms(file: str, title: str) -> Table:
     """False alarms and losses that were missed, at every alpha."""
-    columns = {"detector": "detector", "alpha": "each.alpha", "in frames": "each.alpha_frames"}
-    columns |= {"extrapolated": "each.extrapolated", "false alarms": "each.false_alarms of each.trials"}
-    columns |= {"95 % interval, %": "%each.low to %each.high", "missed %": "%each.missed"}
-    columns |= {"median delay": "each.delay_median", "90 % within": "each.delay_p90"}
-    return Table(f"{file}.json", title, columns, each="alarms", about=about)
+    about = (
+        "detector = detector | alpha = each.alpha | in frames = each.alpha_frames | extrapolated = each.extrapolated | "
+    )
+    false = "false alarms = each.false_alarms of each.trials | "
+    false += "95 % interval, % = %each.low to %each.high | "
+    found = "missed % = %each.missed | median delay = each.delay_median | 90 % within = each.delay_p90"
+    return Table(file, title, about + false + found, each="alarms")
 
 
-def ablation(file: str, title: str, distance: tuple[str, str] = ("APE", "ape")) -> Table:
+def ablation(file: str, title: str, distance: str = "ape") -> Table:
     """Variants of the network; Δ is the difference from the first row of the same objects."""
-    heading, key = distance
-    columns = {"objects": "source", "variant": "variant", heading: f"metrics.{key}", "D@100": "metrics.d100"}
-    columns |= {"Acc %": "%metrics.acc", f"Δ {heading}": f"difference.{key}", "Δ Acc %": "%difference.acc"}
+    name = {"ape": "APE", "ape_2d": "APE_2d"}[distance]
+    metrics = f"{name} = metrics.{distance} | D@100 = metrics.d100 | Acc % = %metrics.acc | "
+    differences = f"Δ {name} = difference.{distance} | Δ Acc % = %difference.acc"
+    columns = f"objects = source | variant = variant | {metrics}{differences}"
     return Table(f"ablations/{file}.json", title, columns, only={"reading": "moved"})
 
 
 def intents(file: str, title: str) -> Table:
     """Two rims of one laptop, one to open and one to lift."""
-    columns = OBJECTS | {"objects/takes/views": "objects/takes/views", "both stable %": "%both"}
-    columns |= {"both on their link %": "%kept", "APE open": "open_ape", "APE lift": "lift_ape"}
-    return Table(f"intents/{file}.json", title, columns)
+    counts = f"{OBJECTS}objects/takes/views = objects/takes/views | "
+    shares = "both stable % = %both | both on their link % = %kept | APE open = open_ape | APE lift = lift_ape"
+    return Table(f"intents/{file}.json", title, counts + shares)
 
 
-ON_OFF = {"with joints": "ape.on", "without": "ape.off", "ratio": "ape.ratio"}
+ON_OFF = "objects/tracks = objects/tracks | with joints = ape.on | without = ape.off | ratio = ape.ratio"
+APACHE = "quest-s16-apache"
 
 RESULTS = Page(
     "Results",
@@ -114,126 +117,84 @@ RESULTS = Page(
         discovery("test.json", "Discovery on test objects"),
         tracking("validation.json", "Simulated validation objects", suite="standard"),
         discovery("validation.json", "Discovery on validation objects"),
-        tracking("quest-s16-apache/test.json", "Weights trained on procedural objects only", suite="standard"),
-        discovery("quest-s16-apache/test.json", "Discovery with these weights"),
+        tracking(f"{APACHE}/test.json", "Weights trained on procedural objects only", suite="standard"),
+        discovery(f"{APACHE}/test.json", "Discovery with these weights"),
         tracking("levels/test.json", "Levels 1 to 4 of the same objects"),
         tracking("robust/test.json", "Colour noise and a camera position that training never had"),
         Table(
             "grounding/reappearance.json",
             "Occluded for 60 frames",
-            OBJECTS
-            | {
-                "beside": "beside",
-                "tracker": "tracker",
-                "occlusions/judged": "episodes/judged",
-                "right before %": "%held_before",
-                "APE while occluded": "ape_hidden",
-                "right 5 frames after %": "%held_again",
-                "of those right before %": "%held_again_if_before",
-            },
+            OBJECTS + "beside = beside | tracker = tracker | occlusions/judged = episodes/judged | right before % = "
+            "%held_before | APE while occluded = ape_hidden | right 5 frames after % = %held_again | "
+            "of those right before % = %held_again_if_before",
             rows="occlusion",
             about="The joint moves on while the entity is occluded, and stops.",
         ),
         Table(
             "grounding/reappearance.json",
             "Sixteen identical doors",
-            OBJECTS
-            | {
-                "reading": "reading",
-                "tracker": "tracker",
-                "objects/tracks": "objects/tracks",
-                "switches per 1,000 frames": "metrics.switches",
-                "Acc %": "%metrics.acc",
-            },
+            OBJECTS + "reading = reading | tracker = tracker | objects/tracks = objects/tracks | "
+            "switches per 1,000 frames = metrics.switches | Acc % = %metrics.acc",
             rows="lockers",
         ),
         Table(
             "grounding/standard_grounding.json",
             "Tracking with and without joints: APE on ordinary takes",
-            OBJECTS | {"level": "level", "objects/tracks": "objects/tracks"} | ON_OFF,
+            f"{OBJECTS}level = level | {ON_OFF}",
         ),
         Table(
             "grounding/suites_grounding.json",
             "Tracking with and without joints: APE on suites",
-            OBJECTS | {"suite": "suite", "objects/tracks": "objects/tracks"} | ON_OFF,
+            f"{OBJECTS}suite = suite | {ON_OFF}",
         ),
         Table(
             "grounding/predicted_joints.json",
             "Joints from predicted tracks",
-            OBJECTS
-            | {
-                "joint": "kind",
-                "when": "moment",
-                "objects/answers": "objects/answers",
-                "kind right %": "%kind_right",
-                "axis error, degrees": "axis_error_deg",
-                "90 % within": "axis_p90_deg",
-            },
+            OBJECTS + "joint = kind | when = moment | objects/answers = objects/answers | kind right % = %kind_right | "
+            "axis error, degrees = axis_error_deg | 90 % within = axis_p90_deg",
         ),
         Table(
             "monitor/test.json",
             "The monitor beside plainer rules, per frame",
-            {
-                "detector": "detector",
-                "streams": "streams",
-                "losses": "losses",
-                "AUROC": "auroc",
-                "AUGRC": "augrc",
-                "ECE": "ece",
-            },
+            "detector = detector | streams = streams | losses = losses | AUROC = auroc | AUGRC = augrc | ECE = ece",
         ),
-        alarms("monitor/test", "Alarms per stream, at equal false alarms"),
-        alarms("monitor/blocks", "Alarms in the same streams, alpha for every 60 frames"),
-        alarms("quest-s16-apache/monitor/test", "Alarms of the weights trained on procedural objects only"),
+        alarms("monitor/test.json", "Alarms per stream, at equal false alarms"),
+        alarms("monitor/blocks.json", "Alarms in the same streams, alpha for every 60 frames"),
+        alarms(f"{APACHE}/monitor/test.json", "Alarms of the weights trained on procedural objects only"),
         intents("intents", "Open and lift: both rims of a closed laptop"),
         intents("ajar", "Both rims of a laptop, from where they are 16 pixels apart"),
         Table(
             "speed/tracking.json",
             "Time of a frame on two processor cores, alarms on",
-            {
-                "queries": "queries",
-                "frames": "frames",
-                "median, ms": "median_ms",
-                "95 % within, ms": "p95_ms",
-                "frames/s": "frames_per_s",
-            },
+            "queries = queries | frames = frames | median, ms = median_ms | 95 % within, ms = p95_ms | "
+            "frames/s = frames_per_s",
             about="Measured with tracker revision 8. No GPU was timed.",
         ),
         Table(
             "speed/tracking.json",
             "Time of the first frame with discovery",
-            {"device": "device", "threads": "threads", "times": "discovery_ms.n", "median, ms": "discovery_ms.median"},
+            "threads = threads | times = discovery_ms.n | median, ms = discovery_ms.median",
             rows="",
         ),
         Table(
             "data/verify.json",
             "Takes of all suites, verified",
-            {"check": "key", "worst": "worst", "limit": "limit", "unit": "unit"},
+            "check = key | worst = worst | limit = limit | unit = unit",
             rows="worst",
         ),
         Table(
             "speed/generation.json",
             "Making takes beside a bare SAPIEN loop",
-            {
-                "takes": "n_takes",
-                "frames": "n_frames",
-                "frames/s": "frames_per_s",
-                "bare loop": "bare_frames_per_s",
-                "share of bare %": "%share_of_bare",
-            },
+            "takes = n_takes | frames = n_frames | frames/s = frames_per_s | bare loop = bare_frames_per_s | "
+            "share of bare % = %share_of_bare",
             rows="",
             about="Three views of 224 × 224 pixels.",
         ),
         Table(
             "speed/training.json",
             "Training steps beside bare steps of the same network",
-            {
-                "preset": "preset",
-                "windows": "batch",
-                "frames/s": "frames_per_s",
-                "bare steps": "bare_frames_per_s",
-                "share of bare %": "%share_of_bare",
-            },
+            "windows = batch | frames/s = frames_per_s | bare steps = bare_frames_per_s | "
+            "share of bare % = %share_of_bare",
             rows="",
         ),
     ),
@@ -242,14 +203,14 @@ RESULTS = Page(
 ABLATIONS = Page(
     "Ablations",
     "Networks trained alike but for one part. Each title names the number of training steps, which are few: the "
-    "weights that ship learned ten times as long. Written by `python benchmarks/update_pages.py` out of "
+    "weights that ship had more than ten times as many. Written by `python benchmarks/update_pages.py` out of "
     "`benchmarks/results/ablations`; [metrics.md](metrics.md#ablations) defines the rows. Entities that move, point "
     "queries, test objects, level 1. Δ is the difference from the first row of the same objects; in brackets are 95 % "
     "bootstrap intervals over objects.",
     (
         ablation("parts", "Queries, 3D, smoothness, joints and anchors"),
         ablation("losses", "Each loss left out"),
-        ablation("window", "Windows of T frames", ("APE_2d", "ape_2d")),
+        ablation("window", "Windows of T frames", "ape_2d"),
         ablation("data", "Procedural training objects only"),
         ablation("slots", "K learned queries"),
         ablation("design", "Heatmap or regression, anchored or learned queries, 3D position codes"),
@@ -265,46 +226,34 @@ HISTORY = Page(
         discovery("fine_tune/before.json", "Discovery on the tool chest, shipped weights"),
         tracking("fine_tune/after.json", "The tool chest, weights fitted to it"),
         discovery("fine_tune/after.json", "Discovery on the tool chest, weights fitted to it"),
-        alarms("monitor/long", "Streams of 240 frames, alpha for the whole stream"),
-        alarms("monitor/long_blocks", "Streams of 240 frames, alpha for every 60 frames"),
+        alarms("monitor/long.json", "Streams of 240 frames, alpha for the whole stream"),
+        alarms("monitor/long_blocks.json", "Streams of 240 frames, alpha for every 60 frames"),
         Table(
             "joints/joints.json",
             "Joints from true tracks with noise",
-            {"how": "key", "tracks": "all.kind_right.n", "kind right %": "%all.kind_right"}
-            | {f"axis error {kind}, degrees": f"{kind}.axis_error_deg.median" for kind in ("prismatic", "revolute")},
+            "how = key | tracks = all.kind_right.n | kind right % = %all.kind_right | axis error prismatic, degrees = "
+            "prismatic.axis_error_deg.median | revolute = revolute.axis_error_deg.median",
             rows="simulated",
             about="After 30 degrees or 10 cm; noise of 2 mm unless the row says otherwise.",
         ),
         Table(
             "joints/joints.json",
             "Joints from real tracks",
-            {"how": "key", "tracks": "kind_right.n", "kind right %": "%kind_right"},
+            "how = key | tracks = kind_right.n | kind right % = %kind_right",
             rows="recorded",
         ),
         Table(
             "scene_flow/test.json",
             "Scene flow: EPE3D",
-            OBJECTS
-            | {
-                "stride": "stride",
-                "reading": "reading",
-                "objects/takes/entities": "objects/takes/entities",
-                "flow head": "epe.head",
-                "zero flow": "epe.zero",
-                "lifted points": "epe.lifted",
-            },
+            OBJECTS + "stride = stride | reading = reading | objects/takes/entities = objects/takes/entities | "
+            "flow head = epe.head | zero flow = epe.zero | lifted points = epe.lifted",
         ),
         Table(
             "endurance/endurance.json",
             "One stream of 100,000 frames",
-            {
-                "frames": "frames_done",
-                "memory at the end +%": "memory_growth_percent.end",
-                "at most +%": "memory_growth_percent.peak",
-                "early, ms": "cpu_change.early_ms",
-                "late, ms": "cpu_change.late_ms",
-                "change %": "cpu_change.percent",
-            },
+            "frames = frames_done | memory at the end +% = memory_growth_percent.end | at most +% = "
+            "memory_growth_percent.peak | early, ms = cpu_change.early_ms | late, ms = cpu_change.late_ms | "
+            "change % = cpu_change.percent",
             rows="",
             about="Memory since frame 10,000 and processor time of a frame.",
         ),
@@ -426,7 +375,8 @@ def as_section(table: Table, folder: Path) -> str:
     if not rows:
         return ""
     entries = [row | {"each": entry} for row in rows for entry in (row[table.each] if table.each else [{}])]
-    columns = {heading: [cell(entry, where) for entry in entries] for heading, where in table.columns.items()}
+    wanted = dict(column.strip().split(" = ") for column in table.columns.split("|"))
+    columns = {heading: [cell(entry, where) for entry in entries] for heading, where in wanted.items()}
     shared = {h: cells[0] for h, cells in columns.items() if h in SHARED and len(cells) > 1 and len(set(cells)) == 1}
     columns = {heading: cells for heading, cells in columns.items() if heading not in shared and any(cells)}
     lines = [line(columns), line("---" for _ in columns), *map(line, zip(*columns.values(), strict=True))]

@@ -55,7 +55,7 @@ def test_a_report_becomes_a_table(update, tmp_path):
         {"part": "test", "kind": "lid", "share": {"mean": 1.0, "low": None, "high": None}, "left_out": None},
     ]
     (tmp_path / "a.json").write_text(json.dumps({"run": REPORT, "rows": rows, "steps": 20, "seeds": [0], "batch": 4}))
-    columns = {"part": "part", "kind": "kind", "right %": "%share", "wrong %": "!%share", "empty": "left_out"}
+    columns = "part = part | kind = kind | right % = %share | wrong % = !%share | empty = left_out"
     section = update.as_section(update.Table("a.json", "Doors", columns), tmp_path)
     assert section.splitlines()[:7] == [
         "## Doors, 20 steps",
@@ -71,7 +71,7 @@ def test_a_report_becomes_a_table(update, tmp_path):
 
 
 def test_without_a_report_there_is_no_table(update, tmp_path):
-    assert update.as_section(update.Table("none.json", "Nothing", {"kind": "kind"}), tmp_path) == ""
+    assert update.as_section(update.Table("none.json", "Nothing", "kind = kind"), tmp_path) == ""
     assert update.summary(tmp_path) == "No results yet."
 
 
