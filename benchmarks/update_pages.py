@@ -69,6 +69,17 @@ def tracking(file: str, title: str, **only: Any) -> Table:
     return Table(file, title, columns + metrics, only=MOVED | only)
 
 
+def real_tracks(file: str, title: str, of: str, about: str = "") -> Table:
+    """Points that were asked for in real recordings."""
+    counts = "tracker = tracker | shown = inputs | clips/tracks/labels = units/targets/terms | "
+    errors = "median px = measures.median_px | within 16 px % = %measures.within_16 | "
+    errors += "moved: within 16 px % = %measures.moved_within_16 | identity errors % = %measures.identity_errors | "
+    errors += "never beyond 50 px % = %measures.never_beyond_50 | "
+    hidden = "not visible, called visible % = %measures.hidden_called_visible | "
+    lost = "P(lost) near = measures.lost_p_near | P(lost) far = measures.lost_p_far"
+    return Table(f"real/{file}.json", title, counts + errors + hidden + lost, only={"of": of}, about=about)
+
+
 def discovery(file: str, title: str) -> Table:
     """Entities that nobody pointed at; pixels of those that were not found mean nothing and are not shown."""
     found = "not found % = !%metrics.recall | nor under another label % = !%metrics.place_recall | "
@@ -113,6 +124,17 @@ RESULTS = Page(
     "objects chose settings, test objects did not. Figures of earlier trackers are in "
     "[history/results.md](history/results.md), those of network variants in [ablations.md](ablations.md).",
     (
+        real_tracks("video", "Real videos of furniture and appliances", "tracks", "Colours; the camera is guessed."),
+        real_tracks("posed", "Real rooms filmed by a moving depth camera", "tracks", "Nothing in the room moves."),
+        real_tracks("posed", "The same with wide steps between frames", "tracks, wide steps"),
+        Table(
+            "real/images.json",
+            "Handles in real pictures",
+            "tracker = tracker | shown = inputs | pictures/handles/answers = units/targets/terms | not found % = "
+            "!%measures.recall | precision % = %measures.precision | F1 % = %measures.f1 | AP = measures.ap",
+            only={"of": "pictures"},
+            about="Discovery, without any query.",
+        ),
         tracking("test.json", "Simulated test objects", suite="standard"),
         discovery("test.json", "Discovery on test objects"),
         tracking("validation.json", "Simulated validation objects", suite="standard"),
@@ -316,6 +338,20 @@ SUMMARY = ("measured on", "n", "measure", "QueST", "LK on a grid", "hold still")
 RIVALS = {"lk-grid": "", "lk": " ¹"}
 """Trackers of the third column: the first that was measured, and its mark."""
 
+REAL = (
+    ("video.json", "real video, colours", "colours"),
+    ("posed.json", "real RGB-D, camera poses given", "depth and poses"),
+    ("posed.json", "real RGB-D, moving camera, no poses", "depth"),
+    ("images.json", "real pictures", "colours"),
+)
+"""Result files of real recordings, what they are called, and what QueST is shown."""
+
+REAL_MEASURES = (
+    ("median error, px", "measures.median_px"),
+    ("within 16 px, %", "%measures.within_16"),
+    ("handles not found by itself, %", "!%measures.recall"),
+)
+
 SOURCES = {"partnet-mobility": "simulated, PartNet-Mobility", "procedural": "simulated, procedural"}
 
 
@@ -329,15 +365,26 @@ def summary(folder: Path, weights: str = "") -> str:
     report = read_report(folder / weights / "test.json")
     if not report:
         return "No results yet."
-    rows = [*simulated(report["rows"])]
+    rows = [*([] if weights else real(folder / "real")), *simulated(report["rows"])]
     text = [
-        "In brackets: 95 % bootstrap intervals over objects or clips. n: objects or clips / tracks. Simulated: "
-        "level 1, objects that no training saw, 224 × 224 pixels, entities that move.",
+        "In brackets: 95 % bootstrap intervals. n: clips / tracks or pictures / handles; simulated: objects / tracks. "
+        "Simulated objects were never trained on; level 1, 224 × 224 pixels; errors and identities are of entities "
+        "that move.",
     ]
     if any("¹" in row for row in rows):
-        text.append("¹ LK on one point; the grid was not measured there.")
+        text.append("¹ One point, not a grid.")
     text.append(f"Made by `python benchmarks/update_pages.py`; simulated: commit {report['run']['commit'][:9]}.")
     return "\n".join([line(SUMMARY), line("---" for _ in SUMMARY), *rows, "", *text])
+
+
+def real(folder: Path) -> Iterable[str]:
+    """Lines of the summary about real recordings."""
+    for file, place, inputs in REAL:
+        rows = [row for row in read_report(folder / file).get("rows", []) if row["of"] in ("tracks", "pictures")]
+        asked = {row["tracker"]: row for row in rows if row["tracker"] != "quest" or row["inputs"] == inputs}
+        for measure, where in REAL_MEASURES:
+            if "quest" in asked and cell(asked["quest"], where):
+                yield summary_line(place, "units/targets", measure, where, asked)
 
 
 def simulated(rows: list[dict[str, Any]]) -> Iterable[str]:

@@ -42,6 +42,24 @@ def test_the_summary_has_at_most_six_columns(update):
     assert {line.count("|") for line in table} == {len(update.SUMMARY) + 1}
 
 
+def test_real_recordings_come_first_in_the_summary(update, tmp_path):
+    rows = [
+        {"of": "tracks", "tracker": name, "inputs": inputs, "units": 2, "targets": 5, "measures": {"within_16": share}}
+        for name, inputs, share in [
+            ("quest", "depth and poses", {"mean": 0.5, "low": 0.25, "high": 0.75}),
+            ("quest", "depth", {"mean": 0.25, "low": 0.125, "high": 0.5}),
+            ("lk-grid", "colours", {"mean": 0.75, "low": 0.5, "high": 1.0}),
+        ]
+    ]
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real" / "posed.json").write_text(json.dumps({"run": REPORT, "rows": rows}))
+    (tmp_path / "test.json").write_text((RESULTS / "test.json").read_text())
+    lines = update.summary(tmp_path).splitlines()[2:]
+    assert lines[0] == ("| real RGB-D, camera poses given | 2/5 | within 16 px, % | 50 (25–75) | 75 (50–100) |  |")
+    assert lines[1] == "| real RGB-D, moving camera, no poses | 2/5 | within 16 px, % | 25 (12–50) | 75 (50–100) |  |"
+    assert lines[2].startswith("| simulated")
+
+
 def test_text_around_the_markers_stays(update):
     text = f"before\n{update.BEGIN}\nold\n{update.END}\nafter\n"
     assert update.between_markers(text, "new") == text.replace("old", "new")
