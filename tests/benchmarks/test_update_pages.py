@@ -2,47 +2,34 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import sys
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
+from benchmarks import update_pages as update
+
+RESULTS = update.ROOT / "benchmarks" / "results"
 REPORT = {"command": "quest eval", "commit": "0123456789abcdef"}
 
 
-@pytest.fixture(scope="module")
-def update():
-    spec = importlib.util.spec_from_file_location("update_pages", ROOT / "benchmarks" / "update_pages.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
-
-
-def test_pages_are_up_to_date(update):
+def test_pages_are_up_to_date():
     pages = update.pages(RESULTS)
     assert {page.name for page in pages} >= {"README.md", "results.md", "ablations.md", "quest-s16-research.md"}
     assert [page for page, text in pages.items() if page.read_text(encoding="utf-8") != text] == []
 
 
-def test_a_missing_answer_has_no_pixels(update):
+def test_a_missing_answer_has_no_pixels():
     """224 sqrt(2) px is how `quest eval` counts it, and no distance that anybody measured."""
     assert [page for page, text in update.pages(RESULTS).items() if "316.8" in text] == []
 
 
-def test_the_summary_has_at_most_six_columns(update):
+def test_the_summary_has_at_most_six_columns():
     assert len(update.SUMMARY) <= 6
     table = [line for line in update.summary(RESULTS).splitlines() if line.startswith("|")]
     assert {line.count("|") for line in table} == {len(update.SUMMARY) + 1}
 
 
-def test_real_recordings_come_first_in_the_summary(update, tmp_path):
+def test_real_recordings_come_first_in_the_summary(tmp_path):
     rows = [
         {"of": "tracks", "tracker": name, "inputs": inputs, "units": 2, "targets": 5, "measures": {"within_16": share}}
         for name, inputs, share in [
@@ -60,14 +47,14 @@ def test_real_recordings_come_first_in_the_summary(update, tmp_path):
     assert lines[2].startswith("| simulated")
 
 
-def test_text_around_the_markers_stays(update):
+def test_text_around_the_markers_stays():
     text = f"before\n{update.BEGIN}\nold\n{update.END}\nafter\n"
     assert update.between_markers(text, "new") == text.replace("old", "new")
     with pytest.raises(SystemExit, match="markers"):
         update.between_markers("no markers", "new")
 
 
-def test_a_report_becomes_a_table(update, tmp_path):
+def test_a_report_becomes_a_table(tmp_path):
     rows = [
         {"part": "test", "kind": "door", "share": {"mean": 0.25, "low": 0.125, "high": 0.5}, "left_out": None},
         {"part": "test", "kind": "lid", "share": {"mean": 1.0, "low": None, "high": None}, "left_out": None},
@@ -88,12 +75,12 @@ def test_a_report_becomes_a_table(update, tmp_path):
     assert "`quest eval`, commit 012345678." in section
 
 
-def test_without_a_report_there_is_no_table(update, tmp_path):
+def test_without_a_report_there_is_no_table(tmp_path):
     assert update.as_section(update.Table("none.json", "Nothing", "kind = kind"), tmp_path) == ""
     assert update.summary(tmp_path) == "No results yet."
 
 
-def test_check_changes_nothing(update, tmp_path, monkeypatch, capsys):
+def test_check_changes_nothing(tmp_path, monkeypatch, capsys):
     page = tmp_path / "page.md"
     page.write_text("old")
     monkeypatch.setattr(update, "pages", lambda folder: {page: "new"})
