@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shlex
+import time
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -12,11 +13,13 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.progress import Report, counting
 from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CAMERA_MOTIONS, MIXED
 from quest.wording import counted
 
 if TYPE_CHECKING:
+    from quest.sim.production import Event
     from quest.sim.settings import TakeSettings
     from quest.sim.suites import Suite
 
@@ -24,6 +27,8 @@ if TYPE_CHECKING:
 else:
     CameraMotion = tyro.extras.literal_type_from_choices((*CAMERA_MOTIONS, MIXED))
 
+_LEAST_S = 5.0
+"""Less says nothing of the speed: takes are written while the next ones are rendered, so two may end together."""
 FRAMES_WITH_GRIPPER = 90
 """Frames that each joint gets if a gripper has to come and go."""
 
@@ -103,7 +108,6 @@ class Generate:
         Raises:
             ObjectError: there is no folder of objects to take the named ones from, or not one planned take can be made.
         """
-        from quest.cli.generate_progress import GenerateProgress
         from quest.data.store import TakeStore
         from quest.sim.cluster import ClusterSettings, produce_on_cluster
         from quest.sim.plan import plan_takes
@@ -132,15 +136,19 @@ class Generate:
         if not missing:
             return 0
         studio = StudioSettings(self.objects_root, self.command_line())
-        with GenerateProgress(console, store.url, len(missing)) as progress:
-            if self.ray is None:
-                produce(missing, store, studio, report=progress)
-            else:
-                cluster = ClusterSettings(self.ray, self.ray_cpus_per_worker)
-                produce_on_cluster(missing, store, studio, cluster, report=progress)
-        skipped = progress.skipped
-        if skipped == len(takes):
-            raise ObjectError(f"generate: no planned take can be made ({skipped} skipped), for the reasons above")
+        with counting(console, "rendering", len(missing), "takes") as report:
+            made = _Made(console, report)
+            try:
+                if self.ray is None:
+                    produce(missing, store, studio, report=made)
+                else:
+                    cluster = ClusterSettings(self.ray, self.ray_cpus_per_worker)
+                    produce_on_cluster(missing, store, studio, cluster, report=made)
+            finally:
+                if made.takes or made.skipped:
+                    console.print(f"{made}; store {escape(store.url)}", soft_wrap=True)
+        if made.skipped == len(takes):
+            raise ObjectError(f"generate: no planned take can be made ({len(takes)} skipped), for the reasons above")
         return 0
 
     def command_line(self) -> str:
@@ -251,3 +259,48 @@ def _seed_range(text: str) -> tuple[int, int]:
     if not (first.isdecimal() and last.isdecimal() and int(first) <= int(last)):
         raise ConfigError(f"generate: expected --seeds A..B, or one seed, with 0 <= A <= B, got {text!r}")
     return int(first), int(last)
+
+
+class _Made:
+    """Counts the takes of a production, and says once what is odd about them.
+
+    Args:
+        console: where to say it.
+        report: the bar.
+    """
+
+    def __init__(self, console: Console, report: Report) -> None:
+        self.takes = self.skipped = 0
+        self._console, self._report = console, report
+        self._said: set[str] = set()
+        self._frames, self._first_s, self._last_s = 0, 0.0, 0.0
+
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        from quest.sim.production import Notice, TakeMade
+
+        if isinstance(event, Notice):
+            self._warn(event.text)
+            return
+        if isinstance(event, TakeMade):
+            self.takes, self._last_s = self.takes + 1, time.perf_counter()
+            if self.takes == 1:  # the first take pays for the shaders
+                self._first_s = self._last_s
+            else:
+                self._frames += event.frames
+            for warning in event.warnings:
+                self._warn(f"{event.spec.object_id}: {warning}")
+        else:
+            self.skipped += 1
+            self._warn(f"skipped {event.spec.object_id}: {event.reason}")
+        self._report(self.takes + self.skipped)
+
+    def __str__(self) -> str:
+        took_s = self._last_s - self._first_s
+        speed = f" at {self._frames / took_s:.1f} frames/s" if took_s >= _LEAST_S else ""
+        return f"{counted(self.takes, 'take')} written{speed}, {self.skipped} skipped"
+
+    def _warn(self, line: str) -> None:
+        if line not in self._said:
+            self._said.add(line)
+            self._console.print(f"[yellow]{escape(line)}[/]")

@@ -184,7 +184,6 @@ class TuneWeights:
 
     def run(self) -> int:
         """Tune, print every trial, rewrite the file."""
-        from quest.cli.takes import open_store
         from quest.evaluation.stream_record import tracker_id
         from quest.evaluation.tuning import tune
         from quest.model.weights import load_network
@@ -192,8 +191,7 @@ class TuneWeights:
 
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
-        stores = [open_store(url) for url in self.takes]
-        takes = [(store, _to_choose_by(store, levels=self.level, objects=self.objects)) for store in stores]
+        takes = _to_choose_by(self.takes, levels=self.level, objects=self.objects)
         tracker = load(self.weights, monitor=False)
         tuned = tune(
             tracker,
@@ -279,7 +277,6 @@ class CalibrateWeights:
 
     def run(self) -> int:
         """Record, fit, rewrite the file."""
-        from quest.cli.takes import open_store
         from quest.errors import ConfigError
         from quest.evaluation.calibrate import fit_calibration
         from quest.evaluation.selection import Shard
@@ -291,8 +288,7 @@ class CalibrateWeights:
         if self.block_frames is not None and self.block_frames < 1:
             raise ConfigError(f"calibrate: expected block_frames of at least 1, got {self.block_frames}")
         console = Console(highlight=False)
-        stores = [open_store(url) for url in self.takes]
-        takes = [(store, _to_choose_by(store, levels=self.level)) for store in stores]
+        takes = _to_choose_by(self.takes, levels=self.level)
         recorded = record_streams(
             load(self.weights, monitor=False),
             takes,
@@ -379,11 +375,16 @@ def _pairs(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in values.items())
 
 
-def _to_choose_by(store: TakeStore, *, levels: tuple[int, ...], objects: tuple[str, ...] = ()) -> dict[str, SplitPart]:
-    """Takes of validation objects, and of objects in no part of the split, which count as such here."""
-    from quest.cli.takes import say_corrupt
+def _to_choose_by(
+    stores: tuple[str, ...], *, levels: tuple[int, ...], objects: tuple[str, ...] = ()
+) -> list[tuple[TakeStore, dict[str, SplitPart]]]:
+    """Takes of validation objects, and of objects in no part of the split, which count as such here, store by store."""
+    from quest.cli.takes import open_store, say_corrupt
     from quest.evaluation.selection import select_takes
 
-    say_corrupt([store])
-    chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
-    return dict.fromkeys(chosen, "validation")
+    found = []
+    for store in map(open_store, stores):
+        say_corrupt([store])
+        chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
+        found.append((store, dict.fromkeys(chosen, "validation")))
+    return found
