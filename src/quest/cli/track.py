@@ -55,6 +55,7 @@ class Track(Source):
             tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report)
         tracks.save(out)
         console.print(_summary(clip, tracks))
+        console.print("\n".join(map(escape, narrate(tracks))))
         self.say_shortfall(tracker, console, frames=len(clip))
         for flag in tracks.frame_flags:
             console.print(f"[yellow]note:[/] {escape(flag)}")
