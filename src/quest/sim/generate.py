@@ -73,27 +73,67 @@ def generate_take(
         staging = stage_occlusion(
             sim_object, level, hiding, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
         )
-    name = take_name(sim_object.object_id, level, seed, suite)
+    about = {**(provenance or {}), **_conditions(settings, suite), **shape}
+    return record_take(
+        sim_object,
+        staging,
+        name=take_name(sim_object.object_id, level, seed, suite),
+        seed=seed,
+        appearance_rng=appearance_rng,
+        sensor_rng=sensor_rng,
+        settings=settings,
+        suite="standard" if suite is None else suite.name,
+        provenance=about,
+    )
+
+
+def record_take(
+    sim_object: SimObject,
+    staging: Staging,
+    *,
+    name: str,
+    seed: int,
+    appearance_rng: np.random.Generator,
+    sensor_rng: np.random.Generator,
+    settings: TakeSettings,
+    suite: str = "standard",
+    provenance: dict[str, Any] | None = None,
+) -> Take:
+    """Renders a take that is staged, with its ground truth.
+
+    Args:
+        sim_object: the object.
+        staging: what moves when, seen from where.
+        name: of the take.
+        seed: for the take's metadata.
+        appearance_rng: what light, surroundings and materials are drawn from.
+        sensor_rng: what noise is drawn from.
+        settings: how objects look, and sensors.
+        suite: for the take's metadata.
+        provenance: likewise; what the staging says of itself is added.
+
+    Raises:
+        RendererError: the renderer broke.
+    """
     played = staging.playback
     stamp_s = played.kept / FRAMES_PER_S
     views = _record(sim_object, staging, appearance_rng, settings)
     flow = np.zeros_like(played.points)
     flow[:-1] = np.diff(played.points, axis=0)
-    about = {**(provenance or {}), **_conditions(settings, suite), **shape, **staging.about}
     info = TakeInfo(
         name=name,
         source=sim_object.source,
         object_id=sim_object.object_id,
         category=sim_object.category,
-        level=level,
+        level=len(staging.moved_joints),
         seed=seed,
         half_diagonal_m=sim_object.half_diagonal_m,
         frames_per_s=FRAMES_PER_S / settings.every,
         entities=tuple(Entity(e.name, e.label, e.body, e.joint) for e in sim_object.entities),
         joints=tuple(j.joint for j in sim_object.articulation.joints),
         moved_joints=staging.moved_joints,
-        provenance=about,
-        suite="standard" if suite is None else suite.name,
+        provenance={**(provenance or {}), **staging.about},
+        suite=suite,
     )
     return Take(
         info=info,

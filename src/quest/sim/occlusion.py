@@ -220,7 +220,7 @@ def _hide(
         alike = [i for i, e in enumerate(sim_object.entities) if e.label == label and i != entity]
         if not hiding.look_alike and visible[:, alike].any():
             continue
-        slopes = _slopes_to_hide(sim_object, playback, entity, episode, posed)
+        slopes = slopes_to_hide(sim_object, playback, entity, episode, posed)
         nearest_m = float(apply(posed.cam_from_world, playback.swept)[:, 2].min())
         shape = fit_shape(slopes, posed, nearest_m, rng) if nearest_m > 0 else None
         if shape is None:
@@ -261,7 +261,7 @@ def _travel(playback: Playback, entity: int, episode: Episode) -> float:
     return float(np.linalg.norm(playback.points[episode.hidden - 1, entity] - playback.points[episode.start, entity]))
 
 
-def _slopes_to_hide(
+def slopes_to_hide(
     sim_object: SimObject, playback: Playback, entity: int, episode: Episode, posed: PosedCamera
 ) -> Float[np.ndarray, "N 2"]:
     """Rays, as x / z and y / z, that bound an entity and its surroundings on its whole hidden path."""
