@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+import re
+from dataclasses import fields, is_dataclass
 
 import pytest
 
@@ -24,6 +26,20 @@ PUBLIC = [
     "load",
     "read",
 ]
+
+MEMBERS = {
+    "Camera": "cx cy from_opencv fx fy height matrix width",
+    "Clip": "cam_from_world camera depth_m frame name rgb stamp_s",
+    "Frame": "cam_from_world depth_m rgb stamp_s",
+    "Query": "frame intent kind label name point semantic slot uv_px",
+    "State": "HELD LOST TRACKING",
+    "Stream": "add budget camera frame looking on_alarm rename restore retire state step unbound",
+    "StreamState": "alarm confidence flags has_depth joint labels lost_p names point_world q query signals stamp_s "
+    "state uv_px visible",
+    "Tracker": "calibration candidates config device name network restore save stream track weights_hash with_config",
+    "Tracks": "alarm confidence frame_flags joints labels lost_p names point_world select stamp_s state uv_px visible",
+}
+"""Fields, methods and properties of the public classes."""
 
 COMMANDS = ["data", "doctor", "eval", "eval-monitor", "generate", "monitor", "objects", "track", "train", "weights"]
 
@@ -49,6 +65,25 @@ def test_public_names_exist_and_are_explained(name):
     value = getattr(quest, name)
     if inspect.isclass(value) or inspect.isroutine(value):
         assert inspect.getdoc(value)
+
+
+def members(owner: type) -> set[str]:
+    """Public fields, methods and properties of a class, and what its objects are given when they are made."""
+    own = {field.name for field in fields(owner)} if is_dataclass(owner) else set()
+    own |= set(re.findall(r"self\.([a-z]\w*)(?:: [^=\n]+)? = ", inspect.getsource(owner)))
+    return own | {name for name in dir(owner) if not name.startswith("_")}
+
+
+@pytest.mark.parametrize("name", MEMBERS)
+def test_members_of_public_classes(name):
+    owner = getattr(quest, name)
+    inherited = set(dir(str)) if issubclass(owner, str) else set()
+    assert sorted(members(owner) - inherited) == MEMBERS[name].split()
+
+
+def test_members_are_listed_of_every_public_class():
+    classes = {name for name in PUBLIC if inspect.isclass(getattr(quest, name))}
+    assert classes - {"QuestError"} == set(MEMBERS)
 
 
 def test_commands():

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 
 import quest
+from tests.test_api_surface import members
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -84,13 +85,6 @@ def resolve(path: str) -> Any:
                 raise AttributeError(path) from error
         found = getattr(found, name)
     return found
-
-
-def members(owner: type) -> set[str]:
-    """Public fields, methods and properties of a class, and what its objects are given when they are made."""
-    own = {field.name for field in fields(owner)} if is_dataclass(owner) else set()
-    own |= set(re.findall(r"self\.([a-z]\w*)(?:: [^=\n]+)? = ", inspect.getsource(owner)))
-    return own | {name for name in dir(owner) if not name.startswith("_")}
 
 
 def owner(name: str) -> type:
