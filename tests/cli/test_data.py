@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from quest.cli import main as program
-from quest.cli.data_stats import finite
+from quest.cli.data import finite
 from quest.cli.takes import write_picture
-from quest.data.consistency import Check
 from quest.data.store import TakeStore
+from quest.data.verify import Check
 from quest.errors import ConfigError
 from quest.extras import is_installed
 from tests.synthetic import make_take
@@ -155,7 +155,7 @@ def test_verify_writes_finite_json(broken: Path, tmp_path: Path, monkeypatch: py
             super().__init__(*arguments, **named)
             object.__setattr__(self, "worst", math.inf)
 
-    monkeypatch.setattr("quest.data.consistency.Check", Endless)
+    monkeypatch.setattr("quest.data.verify.Check", Endless)
     path = tmp_path / "verify.json"
     assert quest("verify", broken / "whole.zarr", "--json", path) == 0
     found = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))

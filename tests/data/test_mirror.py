@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quest.data.consistency import Check, check_truth, check_view
 from quest.data.mirror import mirror_take, mirrored_name
+from quest.data.verify import Check, check_truth, check_view
 from quest.types import Take
 from tests.synthetic import make_take
 

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quest.data.consistency import check_truth, check_view, has_sensed_depth
 from quest.data.store import TakeStore
-from quest.data.verify import verify_store, verify_take
+from quest.data.verify import check_truth, check_view, has_sensed_depth, verify_store, verify_take
 from quest.types import Take, View
 from tests.synthetic import make_take
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quest.model.protrusions import MEASURES, Protrusion, find_protrusions
+from quest.model.pieces import MEASURES, Protrusion, find_protrusions
 
 SIDE = 160
 FOCAL = 200.0

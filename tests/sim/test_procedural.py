@@ -12,9 +12,9 @@ import trimesh
 from quest.errors import ConfigError
 from quest.sim.objects import load_object
 from quest.sim.procedural import CATEGORIES, MIXES, category_for_seed, make_object
+from quest.sim.procedural.appliances import with_dials
 from quest.sim.procedural.catalogue import build_model
 from quest.sim.procedural.clutter import with_clutter
-from quest.sim.procedural.dials import with_dials
 from quest.sim.procedural.handles import HANDLE_KINDS, HandleStyle, handle_part
 from quest.sim.procedural.model import Link, Mesh, ObjectModel
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from quest.data.consistency import has_sensed_depth
 from quest.data.store import TakeStore
 from quest.data.take_format import TakeHeader
+from quest.data.verify import has_sensed_depth
 from quest.types import LABELS
 
 _DEPTH_FRAMES = 4

@@ -18,9 +18,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 
 from quest.errors import ConfigError
-from quest.evaluation.detectors import choose, fit_part, loss_free_maxima
+from quest.evaluation.detectors import choose, fit_part, loss_free_maxima, replay_features, replay_logits
 from quest.evaluation.drift import auroc, calibration_error
-from quest.evaluation.replay import replay_features, replay_logits
 from quest.evaluation.stream_record import StreamRecord, by_unit
 from quest.monitor import SIGNALS, Calibration
 from quest.monitor import memory as memories

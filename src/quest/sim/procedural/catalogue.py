@@ -11,18 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from quest.errors import ConfigError
-from quest.sim.procedural.appliances import APPLIANCES
+from quest.sim.procedural.appliances import APPLIANCES, with_dials
 from quest.sim.procedural.clutter import with_clutter
-from quest.sim.procedural.dials import with_dials
+from quest.sim.procedural.furniture import STORAGE, TABLES
 from quest.sim.procedural.handles import with_long_handles
-from quest.sim.procedural.laptop import build_laptop, build_trunk
 from quest.sim.procedural.layouts import FURNITURE
 from quest.sim.procedural.model import HANDLE_ROLES, ObjectModel, write_object
 from quest.sim.procedural.room_door import build_room_door
-from quest.sim.procedural.storage import STORAGE
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
-from quest.sim.procedural.tables import TABLES
-from quest.sim.procedural.things import THINGS
+from quest.sim.procedural.things import THINGS, build_laptop, build_trunk
 
 _OFTEN_BARE = (
     "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
