@@ -17,6 +17,7 @@ from quest.errors import InputError
 from quest.types import LABELS, Take, View
 from quest.viz.ink import (
     Canvas,
+    blank,
     draw_box,
     draw_disc,
     draw_line,
@@ -25,6 +26,7 @@ from quest.viz.ink import (
     draw_ring,
     draw_text,
     fit_text,
+    grid,
 )
 from quest.viz.palette import BACKGROUND, LINE, MUTED, RGB, SURFACE, TEXT, query_colour
 
@@ -66,14 +68,8 @@ def contact_sheet(
             )
     width = max(rows[0].shape[1], 900)
     foot = _draw_foot(take, shown, colours, width)
-    height = _HEAD + sum(len(row) for row in rows) + len(foot) + _MARGIN
-    sheet = np.empty((height, width + 2 * _MARGIN, 3), dtype=np.uint8)
-    sheet[:] = BACKGROUND
+    sheet = grid([[part] for part in (*rows, foot)], head=_HEAD, foot=_MARGIN, sides=_MARGIN)
     _draw_head(sheet[:_HEAD], take, shown, tile_width_px, every)
-    top = _HEAD
-    for part in (*rows, foot):
-        sheet[top : top + len(part), _MARGIN : _MARGIN + part.shape[1]] = part
-        top += len(part)
     return sheet
 
 
@@ -105,15 +101,9 @@ def takes_sheet(
         suite = " ".join(str(word) for word in (info.suite, info.provenance.get("variant", "")) if word)
         facts = (info.name, info.category, suite, f"level {info.level}", f"{take.stamp_s[-1]:.1f} s")
         rows.append(_row(tiles, "    ".join((*facts, _camera_motion(view)))))
-    width = max(max(row.shape[1] for row in rows), 600)
-    head = _HEAD - 40
-    sheet = np.empty((head + sum(map(len, rows)) + _MARGIN, width + 2 * _MARGIN, 3), dtype=np.uint8)
-    sheet[:] = BACKGROUND
-    draw_text(sheet, fit_text(title, 24, width), (_MARGIN, 28), size=24, colour=TEXT)
-    top = head
-    for row in rows:
-        sheet[top : top + len(row), _MARGIN : _MARGIN + row.shape[1]] = row
-        top += len(row)
+    sheet = grid([[row] for row in rows], head=_HEAD - 40, foot=_MARGIN, sides=_MARGIN, least_width=600)
+    title = fit_text(title, 24, sheet.shape[1] - 2 * _MARGIN)
+    draw_text(sheet, title, (_MARGIN, 28), size=24, colour=TEXT)
     return sheet
 
 
@@ -186,12 +176,8 @@ def _draw_depth(depth_m: np.ndarray, near_m: float, far_m: float, width: int) ->
 
 
 def _row(tiles: list[Canvas], name: str) -> Canvas:
-    height, width = tiles[0].shape[:2]
-    row = np.empty((_NAME + height + _GAP, len(tiles) * (width + _GAP) - _GAP, 3), dtype=np.uint8)
-    row[:] = BACKGROUND
+    row = grid([tiles], gap=_GAP, head=_NAME, foot=_GAP)
     draw_text(row, fit_text(name, 14, row.shape[1]), (0, _NAME / 2 + 2), size=14, colour=MUTED)
-    for i, tile in enumerate(tiles):
-        row[_NAME : _NAME + height, i * (width + _GAP) : i * (width + _GAP) + width] = tile
     return row
 
 
@@ -228,9 +214,7 @@ def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int, eve
 
 def _draw_foot(take: Take, shown: np.ndarray, colours: list[RGB], width: int) -> Canvas:
     """Left the entities, right the joints over time."""
-    height = _NAME + max(len(colours) * _ROW, 7 * _ROW) + _MARGIN
-    foot = np.empty((height, width, 3), dtype=np.uint8)
-    foot[:] = BACKGROUND
+    foot = blank(_NAME + max(len(colours), 7) * _ROW + _MARGIN, width)
     left = round(0.55 * width)
     _draw_entities(foot[:, :left], take, colours)
     _draw_joints(foot[:, left + _MARGIN :], take, shown)

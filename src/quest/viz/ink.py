@@ -7,6 +7,7 @@ the same words on every frame.
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
 
@@ -21,6 +22,49 @@ Canvas = UInt8[np.ndarray, "_ _ 3"]
 Number = float | int
 XY = tuple[Number, Number]
 _SUBPIXEL_BITS = 4
+
+
+def blank(height: int, width: int, colour: RGB = BACKGROUND) -> Canvas:
+    """A canvas of one colour."""
+    return np.full((height, width, 3), colour, dtype=np.uint8)
+
+
+def grid(
+    rows: Sequence[Sequence[Canvas]],
+    *,
+    gap: int = 0,
+    head: int = 0,
+    foot: int = 0,
+    sides: int = 0,
+    least_width: int = 0,
+    colour: RGB = BACKGROUND,
+    behind: RGB = BACKGROUND,
+) -> Canvas:
+    """Pictures beside and below each other, from the top left.
+
+    Args:
+        rows: pictures of any sizes.
+        gap: between two pictures.
+        head: free pixels above.
+        foot: below.
+        sides: left and right.
+        least_width: of the room for pictures.
+        colour: of what is free.
+        behind: colour below pictures that are lower than their row.
+    """
+    width = max(least_width, *(sum(len(p[0]) + gap for p in row) - gap for row in rows))
+    heights = [max(map(len, row)) for row in rows]
+    sheet = blank(head + sum(heights) + gap * (len(rows) - 1) + foot, width + 2 * sides, colour)
+    top = head
+    for row, height in zip(rows, heights, strict=True):
+        left = sides
+        for picture in row:
+            right = left + picture.shape[1]
+            sheet[top : top + height, left:right] = behind
+            sheet[top : top + len(picture), left:right] = picture
+            left = right + gap
+        top += height + gap
+    return sheet
 
 
 def text_size(text: str, size: int) -> tuple[int, int]:

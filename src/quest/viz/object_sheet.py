@@ -14,7 +14,7 @@ from quest.errors import InputError
 from quest.sim.objects import SimObject
 from quest.sim.portrait import Portrait
 from quest.types import LABELS
-from quest.viz.ink import Canvas, draw_disc, draw_outlined, draw_ring, draw_text, fit_text, text_size
+from quest.viz.ink import Canvas, draw_disc, draw_outlined, draw_ring, draw_text, fit_text, grid, text_size
 from quest.viz.palette import BACKGROUND, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
 
 _GAP, _PAD, _HEAD, _ROW = 4, 10, 46, 20
@@ -48,19 +48,7 @@ def object_sheet(cards: Sequence[Card], *, columns: int = 1) -> UInt8[np.ndarray
         )
     drawn = [_draw_card(card) for card in cards]
     rows = [drawn[i : i + columns] for i in range(0, len(drawn), columns)]
-    width = max(sum(card.shape[1] + _GAP for card in row) - _GAP for row in rows)
-    heights = [max(len(card) for card in row) for row in rows]
-    sheet = np.empty((sum(heights) + _GAP * (len(rows) - 1) + 2 * _MARGIN, width + 2 * _MARGIN, 3), dtype=np.uint8)
-    sheet[:] = BACKGROUND
-    top = _MARGIN
-    for row, height in zip(rows, heights, strict=True):
-        left = _MARGIN
-        for card in row:
-            sheet[top : top + height, left : left + card.shape[1]] = SURFACE
-            sheet[top : top + len(card), left : left + card.shape[1]] = card
-            left += card.shape[1] + _GAP
-        top += height + _GAP
-    return sheet
+    return grid(rows, gap=_GAP, head=_MARGIN, foot=_MARGIN, sides=_MARGIN, behind=SURFACE)
 
 
 def entity_words(sim_object: SimObject) -> str:
@@ -86,16 +74,13 @@ def _draw_card(card: Card) -> Canvas:
     edge = len(tiles[0])
     width = len(tiles) * (edge + _GAP) - _GAP + 2 * _PAD
     lines = _legend_lines(thing, colours, width - 2 * _PAD)
-    canvas = np.empty((_HEAD + edge + _PAD + _ROW * len(lines) + _PAD // 2, width, 3), dtype=np.uint8)
-    canvas[:] = SURFACE
+    foot = _PAD + _ROW * len(lines) + _PAD // 2
+    canvas = grid([tiles], gap=_GAP, head=_HEAD, foot=foot, sides=_PAD, colour=SURFACE)
     facts = (
         f"{thing.category}   {size_words(thing)} m   {len(thing.articulation.joints)} joints   {entity_words(thing)}"
     )
     draw_text(canvas, fit_text(thing.object_id, 16, width - 2 * _PAD), (_PAD, 14), size=16, colour=TEXT)
     draw_text(canvas, fit_text(facts, 12, width - 2 * _PAD), (_PAD, 34), size=12, colour=MUTED)
-    for i, tile in enumerate(tiles):
-        left = _PAD + i * (edge + _GAP)
-        canvas[_HEAD : _HEAD + edge, left : left + edge] = tile
     for n, line in enumerate(lines):
         for x, text, colour in line:
             y = _HEAD + edge + _PAD + (n + 0.5) * _ROW
