@@ -18,10 +18,10 @@ from jaxtyping import Bool, Float, Int
 from PIL import Image, UnidentifiedImageError
 
 from quest.data.camera_file import read_camera
-from quest.data.frame_source import clean_depth
 from quest.data.pictures import colours_of, upright
 from quest.data.provenance import combined_hash, file_hash
 from quest.data.recording import read_recording
+from quest.depth import clean_depth
 from quest.errors import InputError
 from quest.types import Camera, Clip, Query
 
