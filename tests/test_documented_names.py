@@ -108,7 +108,7 @@ def named_members(page: Path) -> Iterator[tuple[str, str]]:
     for line in code(page):
         yield from re.findall(rf"(?<![\w.])({classes})\.([A-Za-z_]\w*)", line)
         if not line.lstrip().startswith(("quest ", "from ", "import ")):
-            for variable, member in re.findall(rf"(?<![\w./-])({variables})\.(?!json|mcap)([a-z_]\w*)", line):
+            for variable, member in re.findall(rf"(?<![\w./-])({variables})\.(?!json|mcap|parquet)([a-z_]\w*)", line):
                 yield OF_VARIABLES[variable], member
 
 
@@ -133,9 +133,9 @@ def commands() -> dict[tuple[str, ...], frozenset[str]]:
         text = StringIO()
         with redirect_stdout(text), pytest.raises(SystemExit):
             main([name, "--help"])
-        inner = re.search(r"\{([a-z0-9,-]+)\}", text.getvalue().split("options", 1)[0])
+        listed = f"usage: quest {name} COMMAND" in text.getvalue()
         found[(name,)] = options_of(name)
-        for word in inner[1].split(",") if inner else ():
+        for word in re.findall(r"^  ([a-z-]+)  ", text.getvalue(), re.MULTILINE) if listed else ():
             found[(name, word)] = options_of(name, word)
     return found
 
