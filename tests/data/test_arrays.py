@@ -12,6 +12,7 @@ import torch
 from jaxtyping import TypeCheckError
 
 import quest
+from quest.data.frame_source import Parts
 from quest.data.recording import read_recording, write_recording
 from quest.errors import InputError, RecordingError, TakeError
 from quest.types import GUESSED_CAMERA, Camera, Clip, Joints, Query
@@ -144,12 +145,10 @@ def test_whatever_can_be_tracked_is_read(clip: Clip, tmp_path: Path):
     assert quest.read("sample").depth_m is not None
     with pytest.raises(RecordingError, match="no such file or folder"):
         quest.read(tmp_path / "nothing")
-    with pytest.raises(RecordingError, match="is for takes"):
-        quest.read(tmp_path / "mine", view=1)
+    with pytest.raises(RecordingError, match="is for a take"):
+        quest.read(tmp_path / "mine", parts=Parts(view=1))
     with pytest.raises(TakeError):
         quest.read(tmp_path / "none.zarr")
-    with pytest.raises(RecordingError, match="camera of its own"):
-        quest.read(tmp_path / "none.zarr", camera=clip.camera)
 
 
 def test_what_is_printed_is_short(clip: Clip):

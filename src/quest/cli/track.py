@@ -57,7 +57,7 @@ class Track(Source):
         console.print(_summary(clip, tracks))
         console.print("\n".join(map(escape, narrate(tracks))))
         self.say_shortfall(tracker, console, frames=len(clip))
-        for flag in tracks.frame_flags:
+        for flag in tracks.frame_flags[len(clip.notes) :]:  # those of the clip were said when it was read
             console.print(f"[yellow]note:[/] {escape(flag)}")
         console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")
         if tracks.joints is not None:
@@ -100,10 +100,16 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
     table = Table(
         title=escape(
             f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
-        )
+        ),
+        box=None,
+        pad_edge=False,
+        padding=(0, 2, 0, 0),
+        header_style="dim",
+        title_justify="left",
     )
-    for column in ("entity", "label", "seen", "moved", "joint", "confidence", "state at the end"):
-        table.add_column(column, justify="left" if column in ("entity", "label", "joint") else "right")
+    for column in ("entity", "label", "seen", "moved", "joint", "confidence", "at the end"):
+        left = column in ("entity", "label", "joint")
+        table.add_column(column, justify="left" if left else "right", no_wrap=column == "joint")
     for k, (name, label) in enumerate(zip(tracks.names, tracks.labels, strict=True)):
         bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
         if not bound.any():
