@@ -110,14 +110,14 @@ class Joints:
         return f"Joints({', '.join(self.describe(k) for k in range(len(self)))})"
 
     def describe(self, k: int, t: int | None = None) -> str:
-        """A joint in a few words: see :func:`joint_words`.
+        """A joint in a few words: see :func:`describe_joint`.
 
         Args:
             k: the query.
             t: a frame, to say where on the joint the entity is in it.
         """
         q = None if t is None else float(self.q[t, k])
-        return joint_words(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
+        return describe_joint(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
 
     def select(self, queries: np.ndarray) -> Joints:
         """The joints of some queries only."""
@@ -132,7 +132,7 @@ class Joints:
         )
 
 
-def joint_words(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
+def describe_joint(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
     """Kind of a joint and the range that was seen, in degrees or metres: ``revolute 0 to 34 deg``.
 
     Args:

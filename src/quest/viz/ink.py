@@ -157,6 +157,12 @@ def draw_path(canvas: Canvas, path: Float[np.ndarray, "N 2"], *, colour: RGB, wi
         cv2.polylines(canvas, [fixed], False, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
+def draw_cased_path(canvas: Canvas, path: Float[np.ndarray, "N 2"], *, colour: RGB, width: int = 1) -> None:
+    """Draw a polyline with a dark edge, which reads on any background; interrupted where points are NaN."""
+    draw_path(canvas, path, colour=BACKGROUND, width=width + 2)
+    draw_path(canvas, path, colour=colour, width=width)
+
+
 def draw_disc(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB) -> None:
     """Draw a filled disc."""
     cv2.circle(canvas, _fixed(centre), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)

@@ -1,11 +1,14 @@
-"""A small 3D picture of world tracks: a box with the world's axes, the paths so far, and where they are now."""
+"""A small 3D picture of world tracks: a box with the world's axes, joints, the paths so far, and where they are now."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from quest.viz.ink import Canvas, draw_disc, draw_line, draw_path, draw_ring, draw_text
+from quest.viz.joint_lines import JointLines
 from quest.viz.palette import LINE, MUTED, RGB, TEXT
 
 AXIS_COLOURS: tuple[RGB, ...] = ((255, 107, 107), (105, 219, 124), (92, 160, 255))
@@ -21,6 +24,7 @@ class Inset:
     Args:
         point_world: all points that will ever be drawn, metres; NaN where there is none.
         cam_from_world: pose of the camera that the view is turned from.
+        joints: lines of joints, of which the box takes in what is not far away.
         size: width and height, pixels.
         unit: scale of lines and letters; 1 suits a picture 720 pixels high.
     """
@@ -30,11 +34,13 @@ class Inset:
         point_world: Float[np.ndarray, "T K 3"],
         cam_from_world: Float[np.ndarray, "4 4"],
         *,
+        joints: Sequence[JointLines | None] = (),
         size: tuple[int, int],
         unit: float = 1.0,
     ) -> None:
         self._unit = unit
-        self._low, self._high = _bounds(point_world)
+        lines = [line for joint in joints if joint for line in (joint.path, joint.axis) if line is not None]
+        self._low, self._high = _bounds(point_world, lines)
         cos, sin = np.cos(_YAW_RAD), np.sin(_YAW_RAD)
         yaw = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
         cos, sin = np.cos(_PITCH_RAD), np.sin(_PITCH_RAD)
@@ -69,6 +75,15 @@ class Inset:
         at = (canvas.shape[1] - 10 * self._unit, canvas.shape[0] - 12 * self._unit)
         draw_text(canvas, text, at, size=round(12 * self._unit), colour=MUTED, align="right")
 
+    def draw_joint(self, canvas: Canvas, joint: JointLines, colour: RGB) -> None:
+        """Draw the axis of a joint and the path over its range."""
+        if joint.axis is not None:
+            axis = self.project(joint.axis)
+            draw_line(canvas, tuple(axis[0]), tuple(axis[1]), colour=colour, width=max(1, round(1.5 * self._unit)))
+        for arm in map(self.project, joint.arms):
+            draw_line(canvas, tuple(arm[0]), tuple(arm[1]), colour=colour, opacity=0.4)
+        draw_path(canvas, self.project(joint.path), colour=colour, width=max(2, round(2 * self._unit)))
+
     def draw_tracks(self, canvas: Canvas, t: int, colours: list[RGB], visible: Bool[np.ndarray, "T K"]) -> None:
         """Draw every path up to frame ``t`` and a mark where it is at ``t``: filled where visible, else hollow."""
         for k, colour in enumerate(colours):
@@ -83,12 +98,16 @@ class Inset:
         return self._low + _CORNERS * (self._high - self._low)
 
 
-def _bounds(point_world: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners of a box round the points; a few wild ones may fall outside."""
+def _bounds(point_world: np.ndarray, lines: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box round the points and what is near of lines; a few wild points may fall outside."""
     points = point_world[np.isfinite(point_world).all(axis=-1)].astype(np.float64)
     if len(points) == 0:
         return np.zeros(3), np.ones(3)
     low, high = np.percentile(points, [1, 99], axis=0)
+    reach = max(float((high - low).max()), _SMALLEST_BOX_M)
+    for line in lines:
+        if (line > low - reach).all() and (line < high + reach).all():
+            low, high = np.minimum(low, line.min(axis=0)), np.maximum(high, line.max(axis=0))
     centre, half = (low + high) / 2, np.maximum((high - low) * 0.55, _SMALLEST_BOX_M / 2)
     half = np.maximum(half, half.max() / 4)  # a box, not a plate
     return centre - half, centre + half

@@ -14,10 +14,11 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from quest.grounding import Joint, JointKind
+from quest.grounding import Joint
 from quest.monitor import Budget
 from quest.track import StreamState
 from quest.track.events import Event, Events, Happening
+from quest.tracks import describe_joint
 from quest.types import Query, State
 from quest.viz.palette import query_colour
 
@@ -216,13 +217,7 @@ def joint_words(joint: Joint | None, q: float) -> str:
     """
     if joint is None:
         return "?"
-    if joint.kind is JointKind.STATIC:
-        return "static"
-    turning = joint.kind is JointKind.REVOLUTE
-    factor, digits, unit = (180 / np.pi, 0, "deg") if turning else (1.0, 2, "m")
-    lower, upper = factor * joint.lower, factor * joint.upper
-    now = f"{factor * q:z.{digits}f}" if np.isfinite(q) else "?"
-    return f"{joint.kind.value} {now} {unit} ({lower:z.{digits}f} to {upper:z.{digits}f})"
+    return describe_joint(joint.kind.value, joint.lower, joint.upper, q=q)
 
 
 def event_line(event: Event) -> Text:

@@ -1,7 +1,9 @@
 """Overlay videos: what a tracker answered, drawn on the frames that it saw.
 
-The picture keeps to itself; a panel at its side has the world tracks in 3D and a row per query with its confidence over
-time. A filled mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost.
+A panel at the side has the world tracks in 3D and a row per query with its joint and its confidence over time. A filled
+mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost. A joint is drawn as it
+is known at the end, in all frames: the axis about which something turns with the arc that was seen, or the line on which
+it slides.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from quest.types import Clip, State, Tracks
 from quest.viz.ink import (
     Canvas,
     draw_box,
+    draw_cased_path,
     draw_disc,
     draw_line,
     draw_ring,
@@ -27,9 +30,11 @@ from quest.viz.ink import (
     text_size,
 )
 from quest.viz.inset import Inset
+from quest.viz.joint_lines import joint_lines
 from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
 
 SMALLEST_HEIGHT_PX = 720
+_NEAREST_M = 0.02
 MOST_TAGS = 12
 """With more queries than this, tags on the picture carry numbers only; names stay in the panel."""
 
@@ -78,8 +83,13 @@ class OverlayPainter:
         self._uv = tracks.uv_px.astype(np.float64) * self._scale
         self._colours = [query_colour(k) for k in range(len(tracks.names))]
         self._held, self._lost = (np.asarray(tracks.state == state.value) for state in (State.HELD, State.LOST))
+        self._joints = joint_lines(tracks)
         self._inset = Inset(
-            tracks.point_world, clip.cam_from_world[0], size=(self._panel, round(0.86 * self._panel)), unit=self._unit
+            tracks.point_world,
+            clip.cam_from_world[0],
+            joints=self._joints,
+            size=(self._panel, round(0.86 * self._panel)),
+            unit=self._unit,
         )
         self._tag_side: dict[int, int] = {}
         self._still = self._draw_still()
@@ -101,6 +111,7 @@ class OverlayPainter:
         enlarged = self._scale > 1
         method = cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA
         picture[:] = cv2.resize(self._clip.rgb[t], (self._width, self._height), interpolation=method)
+        self._draw_joints(picture, t)
         self._draw_trails(picture, t)
         size = np.array([self._width, self._height])
         known = [k for k, uv in enumerate(self._uv[t]) if (uv > 0).all() and (uv < size).all()]  # NaN compares false
@@ -122,10 +133,40 @@ class OverlayPainter:
         canvas[:] = BACKGROUND
         side = canvas[:, self._width :]
         u = self._unit
-        self._inset.draw_frame(side[: round(0.86 * self._panel)])
+        inset = side[: round(0.86 * self._panel)]
+        self._inset.draw_frame(inset)
+        for joint, colour in zip(self._joints, self._colours, strict=True):
+            if joint is not None:
+                self._inset.draw_joint(inset, joint, colour)
         draw_text(side, "world", (14 * u, 18 * u), size=round(14 * u), colour=MUTED)
         draw_line(canvas, (self._width, self._height), (canvas.shape[1], self._height), colour=LINE)
         return canvas
+
+    def _draw_joints(self, picture: Canvas, t: int) -> None:
+        """Axis, arc or line of every joint that moves, with a dot at both ends of its range."""
+        u = self._unit
+        for joint, colour in zip(self._joints, self._colours, strict=True):
+            if joint is None:
+                continue
+            for arm in joint.arms:
+                a, b = self._pixels(arm, t)
+                if np.isfinite((a, b)).all():
+                    draw_line(picture, tuple(a), tuple(b), colour=colour, width=max(1, round(1.5 * u)), opacity=0.5)
+            if joint.axis is not None:
+                draw_cased_path(picture, self._pixels(joint.axis, t), colour=colour, width=max(2, round(2.5 * u)))
+            path = self._pixels(joint.path, t)
+            draw_cased_path(picture, path, colour=colour, width=max(2, round(2 * u)))
+            for end in path[[0, -1]]:
+                if np.isfinite(end).all():
+                    draw_disc(picture, tuple(end), 4.5 * u, colour=BACKGROUND)
+                    draw_disc(picture, tuple(end), 3.5 * u, colour=colour)
+
+    def _pixels(self, point_world: np.ndarray, t: int) -> np.ndarray:
+        """Pixels of the picture of world points in a frame; NaN behind the camera."""
+        pose = self._clip.cam_from_world[t]
+        at = (point_world @ pose[:3, :3].T + pose[:3, 3]) @ self._clip.camera.matrix.T
+        depth = np.where(at[:, 2:] > _NEAREST_M, at[:, 2:], np.nan)
+        return at[:, :2] / depth * self._scale
 
     def _draw_trails(self, picture: Canvas, t: int) -> None:
         stamp_s = self._clip.stamp_s
@@ -236,13 +277,18 @@ class OverlayPainter:
             bound = bool(np.isfinite(self._uv[t, k]).all())
             if bound:
                 self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
+            joint = "" if self._joints[k] is None else self._tracks.joints.describe(k, t)  # type: ignore[union-attr]
+            two_lines = bool(joint) and row > 38 * u
             draw_text(
                 side,
                 fit_text(self._name(k), size, name_width),
-                (40 * u, middle),
+                (40 * u, middle - 8 * u * two_lines),
                 size=size,
                 colour=TEXT if bound else MUTED,
             )
+            if two_lines:
+                small = round(12 * u)
+                draw_text(side, fit_text(joint, small, name_width), (40 * u, middle + 11 * u), size=small, colour=MUTED)
             value, colour = f"{self._tracks.confidence[t, k]:.2f}", TEXT
             if not bound:
                 value, colour = "none yet", MUTED

@@ -1,8 +1,9 @@
 """Tracks of a recording in Rerun: frames, depth as points, entities and their trails, joints.
 
-Below ``world`` are ``entities``, ``trails`` (of the last second), ``joints`` (their axes at the end) and ``camera``,
-whose ``image`` holds ``rgb``, ``depth`` and the ``entities`` in the picture. ``confidence`` has one curve per entity.
-Without depth there is nothing in space. Timelines are ``frame`` and ``time``.
+Below ``world`` are ``entities``, ``trails`` (of the last second), ``joints`` (as they are known at the end: the axis of
+turning with the arc that was seen, or the line of sliding) and ``camera``, whose ``image`` holds ``rgb``, ``depth`` and
+the ``entities`` in the picture. ``confidence`` has one curve per entity, ``joints`` its coordinate in degrees or metres
+where it moves. Without depth there is nothing in space. Timelines are ``frame`` and ``time``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import numpy as np
 from quest.data.take_format import DEPTH_SCALE_M, encode_depth
 from quest.extras import require
 from quest.types import Clip, Tracks
+from quest.viz.joint_lines import joint_lines
 from quest.viz.palette import MUTED, query_colour
 from quest.viz.rerun_log import TRAIL_S, check_screen, new_recording
 from quest.whole_file import whole_file
@@ -123,9 +125,10 @@ def _blueprint(clip: Clip) -> rrb.Blueprint:
         origin=f"/{_IMAGE}", contents=[f"/{_IMAGE}/rgb", f"/{_IMAGE}/entities/**"], name=clip.name
     )
     curves = rrb.TimeSeriesView(origin="/confidence", name="confidence")
-    flat = rrb.Vertical(picture, curves, row_shares=[3, 1])
     if clip.depth_m is None:
-        return rrb.Blueprint(flat, collapse_panels=True)
+        return rrb.Blueprint(rrb.Vertical(picture, curves, row_shares=[3, 1]), collapse_panels=True)
+    coordinates = rrb.TimeSeriesView(origin="/joints", name="coordinates on joints")
+    flat = rrb.Vertical(picture, rrb.Horizontal(curves, coordinates), row_shares=[3, 1])
     world = rrb.Spatial3DView(origin="/world", name="world")
     return rrb.Blueprint(rrb.Horizontal(world, flat), collapse_panels=True)
 
@@ -159,14 +162,31 @@ def _log_answers(rerun: ModuleType, recording: rr.RecordingStream, tracks: Track
 
 
 def _log_joints(rerun: ModuleType, recording: rr.RecordingStream, tracks: Tracks, size_m: float) -> None:
-    """The axes that explain the tracks at the end, where there are any."""
-    if tracks.joints is None:
+    """Axes and paths of the joints that move, and the coordinate in every frame."""
+    joints = tracks.joints
+    if joints is None:
         return
-    for k, (name, kind) in enumerate(zip(tracks.names, tracks.joints.kind, strict=True)):
-        axis, origin = tracks.joints.axis[k], tracks.joints.origin[k]
-        if np.isfinite(axis).all() and np.isfinite(origin).all():
+    times = [
+        rerun.TimeColumn("frame", sequence=np.arange(len(tracks))),
+        rerun.TimeColumn("time", duration=tracks.stamp_s.astype(np.float64)),
+    ]
+    for k, (name, lines) in enumerate(zip(tracks.names, joint_lines(tracks), strict=True)):
+        if lines is None:
+            continue
+        colour, label = query_colour(k), f"{name}: {joints.describe(k)}"
+        path = rerun.LineStrips3D(
+            [lines.path, *lines.arms], colors=colour, radii=[0.008 * size_m, *(0.002 * size_m for _ in lines.arms)],
+            labels=[label, *("" for _ in lines.arms)], show_labels=False,
+        )  # fmt: skip
+        recording.log(["world", "joints", name, "path"], path, static=True)
+        if lines.axis is not None:
             arrow = rerun.Arrows3D(
-                origins=origin[None], vectors=0.4 * size_m * axis[None], colors=query_colour(k), radii=0.008 * size_m,
-                labels=f"{name} ({kind})", show_labels=False,
+                origins=lines.axis[:1], vectors=lines.axis[1:] - lines.axis[:1], colors=colour, radii=0.008 * size_m,
+                labels=label, show_labels=False,
             )  # fmt: skip
-            recording.log(["world", "joints", name], arrow)
+            recording.log(["world", "joints", name, "axis"], arrow, static=True)
+        factor, unit = (180 / np.pi, "deg") if joints.kind[k] == "revolute" else (1.0, "m")
+        curve = rerun.new_entity_path(["joints", name])
+        recording.log(curve, rerun.SeriesLines(names=f"{name} ({unit})", colors=colour), static=True)
+        values = factor * joints.q[:, k].astype(np.float64)
+        recording.send_columns(curve, times, rerun.Scalars.columns(scalars=values))
