@@ -128,7 +128,7 @@ def prepare_renderer() -> VulkanDriver:
 
 @contextmanager
 def without_known_warnings() -> Iterator[None]:
-    """Keep SwiftShader's remarks on what it does not support off standard error; all else comes when it ends.
+    """Keep SwiftShader's remarks on unsupported properties off standard error; other lines come at the end.
 
     They are written by native code, which knows no ``sys.stderr``, when a renderer first looks at its devices.
     """

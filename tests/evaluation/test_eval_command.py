@@ -178,7 +178,7 @@ def test_torn_takes_are_left_out_and_named(tmp_path: Path, capsys: pytest.Captur
     store.write(_take(100000))
     (tmp_path / "torn.zarr").mkdir()
     assert Eval(takes=str(tmp_path), trackers=("hold-still",), resamples=5).run() == 0
-    assert "torn takes of the store were left out: torn" in capsys.readouterr().out
+    assert "corrupt takes of the store were omitted: torn" in capsys.readouterr().out
 
 
 class _Counting(HoldStill):
@@ -240,7 +240,7 @@ def test_shards_share_an_evaluation(store: TakeStore, tmp_path: Path, capsys: py
         )
 
     assert command("1/2", "shared.json").run() == 0
-    assert "2 takes are left to other shards" in capsys.readouterr().err
+    assert "left to other shards: 2 takes" in capsys.readouterr().err
     assert not (tmp_path / "shared.json").exists()
     assert command("0/2", "shared.json").run() == 0
     assert command("0/1", "alone.json").run() == 0

@@ -81,7 +81,7 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
         judged(folder)
 
     assert calibrated(folder, shard="1/2") == 0
-    assert "10 streams are left" in capsys.readouterr().out
+    assert "left to other shards: 10 streams" in capsys.readouterr().out
     assert load_network(folder / "w.safetensors").monitor is None
     assert calibrated(folder, shard="0/2") == 0
     assert "AUROC" in capsys.readouterr().out
@@ -94,7 +94,7 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
     assert tracker_id(load(folder / "w.safetensors")) == made_by
 
     assert judged(folder, shard="0/2") == 0
-    assert "2 streams are left" in capsys.readouterr().err
+    assert "left to other shards: 2 streams" in capsys.readouterr().err
     assert judged(folder) == 0
     printed = capsys.readouterr().out
     raw = json.loads((folder / "drift.json").read_text())

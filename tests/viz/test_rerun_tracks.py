@@ -10,7 +10,8 @@ import pytest
 
 from quest.errors import ConfigError, MissingExtraError
 from quest.extras import is_installed
-from quest.types import Clip, Joints, Tracks
+from quest.tracks import Joints, Tracks
+from quest.types import Clip
 from quest.viz import rerun_tracks
 from quest.viz.rerun_tracks import check_viewer, save_tracks
 from tests.synthetic import make_take
@@ -31,8 +32,9 @@ def tracks() -> Tracks:
     uv[0, 0] = np.nan
     point = np.tile(np.arange(4, dtype=np.float32)[:, None, None] / 10, (1, 2, 3))
     point[0, 0] = point[:, 1] = np.nan
-    nothing = np.full(3, np.nan, np.float32)
-    axis, origin = (np.stack([np.array(v, np.float32), nothing]) for v in ([0, 0, 1], [1, 2, 3]))
+    joints = Joints.unknown(4, 2)
+    joints.axis[0], joints.origin[0], joints.q[1:, 0] = (0, 0, 1), (1, 2, 3), (0, 0.1, 0.2)
+    joints.q_min_seen[0], joints.q_max_seen[0] = 0, 0.2
     return Tracks(
         names=("left/knob", "rim"),
         labels=("knob", "rim"),
@@ -42,7 +44,7 @@ def tracks() -> Tracks:
         visible=np.ones((4, 2), bool),
         state=np.full((4, 2), "tracking"),
         stamp_s=np.arange(4) / 30.0,
-        joints=Joints(("revolute", "unknown"), axis, origin),
+        joints=replace(joints, kind=("revolute", "unknown")),
     )
 
 
@@ -55,7 +57,7 @@ def test_tracks_are_there(clip: Clip, tracks: Tracks, tmp_path: Path):
     assert len(recording.blueprints) == 1
     found, name = recording.entities(), "left\\/knob"
     assert {"/world/camera/image/rgb", "/world/camera/image/depth", f"/world/joints/{name}"} <= found
-    assert not {"/world/joints/rim", "/world/entities/rim", "/world/trails/rim"} & found
+    assert not {"/world/joints/rim", "/joints/rim", "/world/entities/rim", "/world/trails/rim"} & found
     points = recording.values(f"/world/entities/{name}", "Points3D:positions")
     np.testing.assert_allclose(np.squeeze(points), tracks.point_world[1:, 0])
     trails = recording.values(f"/world/trails/{name}", "LineStrips3D:strips")
@@ -63,6 +65,8 @@ def test_tracks_are_there(clip: Clip, tracks: Tracks, tmp_path: Path):
     assert recording.values(f"/world/camera/image/entities/{name}", "frame") == [1, 2, 3]
     assert np.squeeze(recording.values("/confidence/rim", "Scalars:scalars")).tolist() == [0.25] * 4
     assert np.squeeze(recording.values(f"/world/joints/{name}", "Arrows3D:origins")).tolist() == [1, 2, 3]
+    coordinate = recording.values(f"/joints/{name}", "Scalars:scalars")
+    np.testing.assert_allclose(np.squeeze(coordinate), [np.nan, 0, 0.1, 0.2], atol=1e-6)
 
 
 @needs_rerun

@@ -38,9 +38,9 @@ class Finding:
     status: Status
     """``broken`` only if the base install cannot track without it."""
     found: str
-    """What there is, in words."""
+    """The finding, in words."""
     remedy: str = ""
-    """What to do about it, if anything."""
+    """Advice, if there is any."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""``quest eval``: score trackers on takes of a store or on labelled real recordings, and print what came of it."""
+"""``quest eval``: score trackers on takes of a store or on labelled real recordings, and print the tables."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import tyro
 from tyro.extras import literal_type_from_choices
 
 from quest.baselines import TRACKERS
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -88,7 +89,7 @@ class Eval:
         Raises:
             ConfigError: nothing to evaluate, or settings out of range.
             InputError: a set of recordings is missing or damaged.
-            TakeError: the store is missing or a take is torn.
+            TakeError: the store is missing or a take is corrupt.
             WeightsError: the weights cannot be loaded.
         """
         from quest.errors import ConfigError
@@ -113,7 +114,7 @@ class Eval:
 
         given = [f.name for f in fields(self) if f.name in _OF_TAKES and getattr(self, f.name) != f.default]
         if given:
-            raise ConfigError(f"eval: --{given[0].replace('_', '-')} is for --takes; leave it out with --real")
+            raise ConfigError(f"eval: --{given[0].replace('_', '-')} is for --takes; omit it with --real")
         if self.out is not None and self.out.suffix:
             raise ConfigError(f"eval: expected --out to be a folder, which gets a file for each set, got {self.out}")
         sets = [open_set(folder, part=self.pictures) for folder in self.real]
@@ -151,6 +152,7 @@ class Eval:
 
     def _run_takes(self, takes: str) -> int:
         from quest.baselines.flow_chain import units_of
+        from quest.cli.takes import open_store
         from quest.data.provenance import combined_hash
         from quest.errors import ConfigError
         from quest.evaluation.results import write_results
@@ -163,7 +165,8 @@ class Eval:
         if self.out is None and shard.count > 1:
             raise ConfigError(f"eval: --shard {self.shard} needs --out, beside which the processes share what is done")
         start_s = time.monotonic()
-        store, broken = self._open_store(takes)
+        store = open_store(takes)
+        broken = sorted(store.problems())
         chosen = select_takes(
             store.infos(), split=self.split, levels=self.level, objects=self.objects, same_objects=self.same_objects
         )
@@ -174,7 +177,7 @@ class Eval:
         finished = self._finished(trackers)
         found = self._evaluate(store, chosen, trackers, finished, shard, console)
         if found.missing:
-            console.print(f"{found.missing} takes are left to other shards; nothing is reported yet")
+            console.print(f"left to other shards: {counted(found.missing, 'take')}; nothing is reported yet")
             return 0
         data_hash = combined_hash((name, store.data_hash(name)) for name in chosen)
         results = self._results(found, broken, self._run(trackers, data_hash, start_s))
@@ -204,16 +207,6 @@ class Eval:
         from quest.data.provenance import file_hash
 
         return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(self.weights)
-
-    def _open_store(self, takes: str) -> tuple[TakeStore, list[str]]:
-        """The store, and the names of its torn takes."""
-        from quest.data.store import TakeStore
-        from quest.errors import TakeError
-
-        store = TakeStore(takes)
-        if not store.exists():
-            raise TakeError(f"take store {takes}: expected a store of takes, found none; make one with quest generate")
-        return store, sorted(store.problems())
 
     def _load_trackers(self, names: Sequence[str], *, unit_m: Callable[[Clip], float]) -> list[ClipTracker]:
         from quest.baselines import line_up
@@ -271,7 +264,7 @@ class Eval:
         rows = summarise(found.records, found.discoveries, resamples=self.resamples, seed=self.seed)
         notes = list(found.notes)
         if broken:
-            notes.append(f"torn takes of the store were left out: {', '.join(broken)}")
+            notes.append(f"corrupt takes of the store were omitted: {', '.join(broken)}")
         levels: dict[tuple[str, str], dict[int, set[str]]] = {}
         for record in found.records:
             s = record.subject

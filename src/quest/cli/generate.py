@@ -262,7 +262,7 @@ def _seed_range(text: str) -> tuple[int, int]:
 
 
 class _Made:
-    """Counts the takes of a production, and says once what is odd about them.
+    """Counts the takes of a production, and says each warning once.
 
     Args:
         console: where to say it.

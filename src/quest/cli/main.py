@@ -70,15 +70,15 @@ class Group:
 COMMANDS: dict[str, Entry | Group] = {
     "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
     "monitor": Entry("monitor", "Monitor", "Watch a recording or a take live: states, joints and alarms."),
-    "doctor": Entry("doctor", "Doctor", "Print what this machine can do, and what to install for the rest."),
+    "doctor": Entry("doctor", "Doctor", "Check this machine: devices, renderer, weights, extras."),
     "weights": Group(
         "List, show, share, tune and calibrate weights.",
         {
             "list": Entry("weights", "ListWeights", "List the weights that come with the package."),
-            "show": Entry("weights", "ShowWeights", "Print what a file of weights holds."),
+            "show": Entry("weights", "ShowWeights", "Print the content of a file of weights."),
             "save": Entry("weights", "SaveWeights", "Write weights into a folder in the form of the hub."),
             "push": Entry("weights", "PushWeights", "Push weights and a card to the Hugging Face hub."),
-            "merge": Entry("weights", "MergeWeights", "Put together what was trained apart."),
+            "merge": Entry("weights", "MergeWeights", "Merge parts that were trained apart."),
             "import-encoder": Entry("weights", "ImportEncoder", "Make the encoder's initial weights."),
             "pieces": Entry("weights", "PiecesWeights", "Teach discovery which pieces are handles and knobs."),
             "tune": Entry("weights", "TuneWeights", "Choose the tracker's settings."),
@@ -90,7 +90,7 @@ COMMANDS: dict[str, Entry | Group] = {
         {
             "ls": Entry("data", "DataLs", "List the takes of a store."),
             "show": Entry("data", "DataShow", "Draw a take or a store, or write a Rerun recording."),
-            "stats": Entry("data_stats", "DataStats", "Count what is in a store."),
+            "stats": Entry("data_stats", "DataStats", "Count the takes, entities and motions of a store."),
             "verify": Entry("data_verify", "DataVerify", "Check the ground truth of takes."),
             "export": Entry("data_export", "DataExport", "Write takes as TAPVid-3D, LeRobot or MCAP."),
         },

@@ -37,7 +37,7 @@ class Monitor(Source):
     jsonl: Path | None = None
     """Write one JSON object per frame to this file; - is standard output, and then the view goes to standard error."""
     realtime: bool = False
-    """Play at the recording's own pace; no frame is left out, so a slow machine falls behind."""
+    """Play at the recording's own pace; no frame is skipped, so a slow machine falls behind."""
 
     def run(self) -> int:
         """Step through the recording as it is read, show, write.

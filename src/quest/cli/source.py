@@ -71,7 +71,7 @@ class Source:
         )
 
     def read(self, console: Console) -> Clip:
-        """All frames in memory; degradations are said on standard error.
+        """All frames in memory; degradations are printed on standard error.
 
         Args:
             console: where to say how far it is.

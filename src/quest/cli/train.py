@@ -153,11 +153,10 @@ class Train:
         return _Start(network, TrackerConfig().to_json())
 
     def _dataset(self, network: QuestNetwork, device: torch.device, progress: Progress) -> Dataset:
-        from quest.cli.takes import say_corrupt
-        from quest.data.store import TakeStore
+        from quest.cli.takes import open_store, say_corrupt
         from quest.train.dataset import open_dataset
 
-        say_corrupt(TakeStore(store) for store in dict.fromkeys((*self.data, *self.validation, *self.mirrored)))
+        say_corrupt(open_store(store) for store in dict.fromkeys((*self.data, *self.validation, *self.mirrored)))
         return open_dataset(
             network,
             stores=self.data,

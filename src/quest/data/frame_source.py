@@ -110,7 +110,7 @@ class FrameSource:
     """Frames of one camera, read as they are asked for; every loop over them begins anew.
 
     Attributes:
-        name: what to call the recording.
+        name: of the recording.
         camera: intrinsics of every frame, without distortion.
         frames: begins to read.
         length: number of frames, or about that many where ``exact`` is False; None where only reading tells.

@@ -2,7 +2,7 @@
 
 A dataset is a folder of ``meta/info.json`` (features and where files lie), ``meta/episodes/`` (which file and which
 seconds of a video belong to an episode), ``data/`` (one row per frame) and ``videos/``. It has no place for
-intrinsics: give a camera file, or read what :mod:`quest.data.lerobot_export` wrote.
+intrinsics: give a camera file, or a dataset that :mod:`quest.data.lerobot_export` wrote.
 
 Reference: lerobot 0.6.2, ``lerobot/datasets`` (``dataset_metadata.py``, ``dataset_reader.py``, ``depth_utils.py``).
 """
@@ -63,7 +63,7 @@ class DepthRange:
             )
 
     def codes(self, depth_m: Float32[np.ndarray, "*S"]) -> UInt16[np.ndarray, "*S"]:
-        """Twelve-bit codes; missing depth, and what lies outside the range, is code 0."""
+        """Twelve-bit codes; missing depth, and depth outside the range, is code 0."""
         low, high = self._scaled(self.depth_min), self._scaled(self.depth_max)
         valid = (depth_m > 0) & (depth_m <= self.depth_max)
         share = (self._scaled(np.where(valid, depth_m, self.depth_min)) - low) / (high - low)

@@ -78,7 +78,7 @@ class McapMessages:
         return list(counted.values())
 
     def _check_encodings(self) -> None:
-        """Refuse a file none of whose topics can be decoded, naming what they are."""
+        """Refuse a file none of whose topics can be decoded, naming their types."""
         found = {
             (channel.message_encoding, schema.encoding if schema else "no schema")
             for schema, channel, _ in self._channels

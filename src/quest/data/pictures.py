@@ -10,7 +10,7 @@ from quest.errors import RecordingError
 
 TURNED = (
     "EXIF or the video's header says that the colours are to be turned, and their depth is not turned with them; "
-    "write colours and depth the same way up and leave the orientation out, or leave the depth out"
+    "write colours and depth the same way up and omit the orientation, or omit the depth"
 )
 
 
@@ -29,10 +29,10 @@ def colours_of(image: Image.Image, where: str) -> UInt8[np.ndarray, "H W 3"]:
 
     Args:
         image: the image.
-        where: what to call it in errors.
+        where: its name in errors.
 
     Raises:
-        RecordingError: the pixels are of 32 bits or floats, so that no one knows what is white.
+        RecordingError: the pixels are of 32 bits or floats, so that white is unknown.
     """
     if image.mode.startswith("I;16"):
         grey = (np.asarray(image) >> 8).astype(np.uint8)

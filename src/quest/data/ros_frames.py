@@ -33,19 +33,19 @@ BAG_OPTIONS = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_depth_info", "world_frame", "sync_s"),
     *("camera", "depth_scale_m"),
 )
-"""What readers of bags know of :class:`quest.data.frame_source.ReadOptions`."""
+"""Fields of :class:`quest.data.frame_source.ReadOptions` that readers of bags know."""
 
 NO_POSE = "no tf joins the camera to another frame: the world is the camera"
 NO_DEPTH = "no topic of depth: colours only"
 STALE = f"tf has nothing within {_STALE_S} s: the nearest pose is used"
-LATE = "colours out of order: left out"
+LATE = "colours out of order: omitted"
 NO_STAMP = "headers have no time: that of logging is used"
 CAMERA_CHANGED = "camera_info changes on the way: the first is used"
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """What holds for all frames of a bag."""
+    """Constants of all frames of a bag."""
 
     messages: Messages
     """The bag."""
@@ -54,13 +54,13 @@ class _Setting:
     rig: Rig
     """Cameras."""
     parts: Parts
-    """What was asked for."""
+    """The options of the user."""
     colour_frame: str
     """Tf frame of the colours."""
     world: str | None
     """Tf frame that is the world; None without tf."""
     scale_m: float | None
-    """Metres per unit of depth; None for what ROS has it in."""
+    """Metres per unit of depth; None for the usual unit of ROS."""
     pose: np.ndarray | None
     """Of every frame, where the camera file gives one."""
     by_log: bool
@@ -172,15 +172,15 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
     if chosen.depth_info is None:
         raise RecordingError(
             f"{where}: no camera_info for {chosen.depth}; name its topic with --topic-depth-info, give depth_camera in "
-            "--camera FILE, or leave the depth out with --topic-depth none"
+            "--camera FILE, or omit the depth with --topic-depth none"
         )
     depth_camera, depth_lens = _camera_of(chosen.first[chosen.depth_info], chosen.depth, depth_size, where)
     colour_from_depth = transforms.lookup(rgb_frame, depth_frame, now_ns)
     if colour_from_depth is None:
         raise RecordingError(
             f"{where}: no tf joins the depth's frame {depth_frame!r} to the colours' {rgb_frame!r}, so depth cannot be "
-            "registered; record /tf_static too, give depth_camera and colour_from_depth in --camera FILE, or leave the "
-            "depth out with --topic-depth none"
+            "registered; record /tf_static too, give depth_camera and colour_from_depth in --camera FILE, or omit the "
+            "depth with --topic-depth none"
         )
     return Rig(camera, lens, depth_camera, depth_lens, colour_from_depth)
 

@@ -28,7 +28,7 @@ _BAYER = {"rggb": "RGGB", "bggr": "BGGR", "gbrg": "GBRG", "grbg": "GRBG"}
 
 @dataclass(frozen=True)
 class _Layout:
-    """How pixels lie in a message: element type, channels, and what makes RGB of them."""
+    """How pixels lie in a message: element type, channels, and the conversion to RGB."""
 
     dtype: str
     channels: int
@@ -75,7 +75,7 @@ _COLOURS = {
 
 
 def encoding_of(message: Any) -> str:
-    """Encoding of an Image, or what a CompressedImage says of its format."""
+    """Encoding of an Image, or the format of a CompressedImage."""
     return str(message.encoding if hasattr(message, "encoding") else message.format)
 
 
@@ -108,7 +108,7 @@ def rgb_of(message: Any, where: str) -> UInt8[np.ndarray, "H W 3"]:
     """Colours of an Image or CompressedImage.
 
     Raises:
-        RecordingError: the picture is torn, or of an encoding that is not of colours.
+        RecordingError: the picture is corrupt, or of an encoding that is not of colours.
     """
     if not hasattr(message, "encoding"):
         image = _decode(message.data, where, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -127,11 +127,11 @@ def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float
 
     Args:
         message: the picture.
-        where: what to call it in errors.
-        scale_m: metres per unit; by default what :func:`unit_of` says.
+        where: its name in errors.
+        scale_m: metres per unit; by default that of :func:`unit_of`.
 
     Raises:
-        RecordingError: the picture is torn, or of an encoding that is not of depth.
+        RecordingError: the picture is corrupt, or of an encoding that is not of depth.
     """
     unit_m = np.float32(unit_of(message) if scale_m is None else scale_m)
     if not hasattr(message, "encoding"):
@@ -142,7 +142,7 @@ def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float
         return _pixels(message, "u2", 1, where).astype(np.float32) * unit_m
     raise RecordingError(
         f"{where}: encoding {message.encoding!r} is not one of depth; expected {', '.join(DEPTH_ENCODINGS)}; name "
-        "another topic, or leave the depth out"
+        "another topic, or omit the depth"
     )
 
 
@@ -155,7 +155,7 @@ def _pixels(message: Any, dtype: str, channels: int, where: str) -> np.ndarray:
     if height <= 0 or width <= 0 or step < row or data.size < step * (height - 1) + row:
         raise RecordingError(
             f"{where}: {data.size} bytes for {width} x {height} pixels of {message.encoding} in rows of {step} bytes; "
-            "the message is torn, record it again"
+            "the message is corrupt, record it again"
         )
     whole = np.pad(data, (0, max(0, step * height - data.size)))  # some drivers leave out the last row's padding
     rows = np.ascontiguousarray(whole[: step * height].reshape(height, step)[:, :row]).view(kind)
@@ -172,7 +172,7 @@ def _compressed_depth(message: Any, where: str, unit_m: np.float32) -> np.ndarra
             f"{where}: depth is compressed as RVL ({encoding!r}), which is not read; record it as png, or as raw Image"
         )
     if len(data) <= _HEADER.size:
-        raise RecordingError(f"{where}: {len(data)} bytes of compressed depth; the message is torn, record it again")
+        raise RecordingError(f"{where}: {len(data)} bytes of compressed depth; the message is corrupt, record it again")
     _, quant_a, quant_b = _HEADER.unpack_from(data)
     units = _grey16(data[_HEADER.size :], where)
     if kind != "32FC1":
@@ -199,5 +199,5 @@ def _decode(data: Any, where: str, flags: int) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise RecordingError(f"{where}: {raw.size} bytes that are no JPEG or PNG; the message is torn, record it again")
+        raise RecordingError(f"{where}: {raw.size} bytes are no JPEG or PNG; the message is corrupt, record it again")
     return np.asarray(image)

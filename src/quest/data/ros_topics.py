@@ -29,7 +29,7 @@ _ALIGNED = re.compile(r"aligned|registered|depth_to_(rgb|colou?r)", re.IGNORECAS
 
 @dataclass(frozen=True)
 class Topic:
-    """What a bag says of a topic."""
+    """A topic of a bag."""
 
     kind: str
     """Message type such as ``sensor_msgs/Image``."""
@@ -48,14 +48,14 @@ class Messages(Protocol):
 
     @property
     def topics(self) -> dict[str, Topic]:
-        """What is in it."""
+        """The topics in it."""
         ...
 
     def read(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time of logging in nanoseconds and message, of some topics, in the order of logging.
 
         Raises:
-            RecordingError: the bag is torn, or a message cannot be decoded.
+            RecordingError: the bag is corrupt, or a message cannot be decoded.
         """
         ...
 
@@ -133,7 +133,7 @@ class _Finder:
         return sorted(name for name, topic in self._messages.topics.items() if topic.kind in kinds)
 
     def listed(self) -> str:
-        """What is in the bag, for messages."""
+        """The topics of the bag, for messages."""
         topics = sorted(self._messages.topics.items())
         if not topics:
             return "it has no topics; record it again"

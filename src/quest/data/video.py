@@ -25,7 +25,7 @@ SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v")
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video's header says."""
+    """The header of a video."""
 
     width: int
     """Of the upright picture, pixels."""
@@ -64,8 +64,8 @@ def play_video(
     Args:
         path: the file.
         pixel_format: what FFmpeg calls the format to convert to: ``rgb24``, or ``gray12le`` for 12 bits in 16.
-        start_s: frames before are left out.
-        end_s: frames from there on are left out; None plays to the end, which must be where the file says.
+        start_s: frames before are omitted.
+        end_s: frames from there on are omitted; None plays to the end, which must be where the file says.
 
     Raises:
         RecordingError: there is no such file, it cannot be decoded, has no frames, changes its size, or ends early.
