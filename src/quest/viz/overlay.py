@@ -1,9 +1,9 @@
 """Overlay videos: what a tracker answered, drawn on the frames that it saw.
 
-A panel at the side has the world tracks in 3D and a row per query with its joint and its confidence over time. A filled
-mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost. A joint is drawn as it
-is known at the end, in all frames: the axis about which something turns with the arc that was seen, or the line on which
-it slides.
+A panel at the side has the world tracks in 3D and a row per query with its joint and its confidence over time. A
+filled mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost. A joint is
+drawn as it is known at the end, in all frames: the axis about which something turns with the arc that was seen, or
+the line on which it slides.
 """
 
 from __future__ import annotations
