@@ -66,16 +66,13 @@ DriverKind = Literal["chosen", "nvidia", "swiftshader", "lavapipe", "system"]
 
 @dataclass(frozen=True)
 class VulkanDriver:
-    """A Vulkan driver that can render.
-
-    Attributes:
-        kind: ``chosen`` by the user's environment, ``nvidia``, ``swiftshader``, ``lavapipe``, or ``system`` where the
-            platform brings its own (macOS, Windows).
-        icd: the driver's JSON file, or the list of files that the user chose; None where the loader finds it by itself.
-    """
+    """A Vulkan driver that can render."""
 
     kind: DriverKind
+    """``chosen`` by the user's environment, ``nvidia``, ``swiftshader``, ``lavapipe``, or ``system`` where the platform
+    brings its own (macOS, Windows)."""
     icd: str | None
+    """The driver's JSON file, or the list of files that the user chose; None where the loader finds it by itself."""
 
     @property
     def on_gpu(self) -> bool | None:

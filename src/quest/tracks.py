@@ -64,31 +64,29 @@ class Joints:
 
     The coordinate ``q`` of a joint is 0 about where its entity was seen first and grows the way it then went: radians
     about the axis (right-handed, within half a turn either way), or metres along it.
-
-    Attributes:
-        kind: ``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen.
-        axis: unit direction of sliding, or of the axis of turning; NaN where there is none.
-        origin: metres: the point of the axis of turning that is nearest to the path, a point of the path of sliding, or
-            the place of what is static; NaN where unknown.
-        q_min_seen: smallest coordinate that was seen; NaN without a joint that moves.
-        q_max_seen: largest one; NaN likewise.
-        q: coordinate per frame; NaN likewise, and where the tracker knew no world point. Of a query that was asked for
-            by a pixel, it is that of the network's own point beside it, which the same joint moves.
-        covariance: of small errors of ``axis`` (3, radians) and ``origin`` (3, metres) together, in world axes. Only
-            what is across the axis counts: its length is 1, and a shift along the axis of turning, or along the path of
-            sliding, changes nothing, so that a moving joint's matrix has rank 4. Of a static one the part of the axis
-            is NaN; all is NaN where the kind is unknown. It is the inverse of the normal equations at the end of the
-            fit, scaled by the noise of a point that the tracker assumes, or by the residuals where these are larger.
-            A wrong kind, or a point that is not of the entity, is not in it.
     """
 
     kind: tuple[str, ...]
+    """``static``, ``prismatic``, ``revolute``, or ``unknown`` where nothing was seen."""
     axis: Float32[np.ndarray, "K 3"]
+    """Unit direction of sliding, or of the axis of turning; NaN where there is none."""
     origin: Float32[np.ndarray, "K 3"]
+    """Metres: the point of the axis of turning that is nearest to the path, a point of the path of sliding, or the
+    place of what is static; NaN where unknown."""
     q_min_seen: Float32[np.ndarray, " K"]
+    """Smallest coordinate that was seen; NaN without a joint that moves."""
     q_max_seen: Float32[np.ndarray, " K"]
+    """Largest one; NaN likewise."""
     q: Float32[np.ndarray, "T K"]
+    """Coordinate per frame; NaN likewise, and where the tracker knew no world point. Of a query that was asked for by a
+    pixel, it is that of the network's own point beside it, which the same joint moves."""
     covariance: Float32[np.ndarray, "K 6 6"]
+    """Of small errors of ``axis`` (3, radians) and ``origin`` (3, metres) together, in world axes. Only what is across
+    the axis counts: its length is 1, and a shift along the axis of turning, or along the path of sliding, changes
+    nothing, so that a moving joint's matrix has rank 4. Of a static one the part of the axis is NaN; all is NaN where
+    the kind is unknown. It is the inverse of the normal equations at the end of the fit, scaled by the noise of a point
+    that the tracker assumes, or by the residuals where these are larger. A wrong kind, or a point that is not of the
+    entity, is not in it."""
 
     @classmethod
     def unknown(cls, frames: int, queries: int) -> Joints:
@@ -153,35 +151,32 @@ def describe_joint(kind: str, q_min_seen: float, q_max_seen: float, *, q: float 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Answers to K queries over T frames.
-
-    Attributes:
-        names: name per query.
-        labels: label per query, or None.
-        uv_px: pixel in the source image; NaN before a query is bound.
-        point_world: world point in metres; NaN before binding and where it cannot be lifted.
-        confidence: probability that the identity is still right, 0 before binding.
-        visible: whether the entity is seen.
-        state: :class:`State` value per frame and query.
-        stamp_s: times in seconds.
-        frame_flags: degradations of whole frames or of the whole clip, in words.
-        lost_p: calibrated probability that the identity is lost, NaN where unknown; None without a monitor.
-        alarm: whether an alarm is open; None likewise.
-        joints: what explains the tracks at the end; None without grounding.
-    """
+    """Answers to K queries over T frames."""
 
     names: tuple[str, ...]
+    """Name per query."""
     labels: tuple[str | None, ...]
+    """Label per query, or None."""
     uv_px: Float32[np.ndarray, "T K 2"]
+    """Pixel in the source image; NaN before a query is bound."""
     point_world: Float32[np.ndarray, "T K 3"]
+    """World point in metres; NaN before binding and where it cannot be lifted."""
     confidence: Float32[np.ndarray, "T K"]
+    """Probability that the identity is still right, 0 before binding."""
     visible: Bool[np.ndarray, "T K"]
+    """Whether the entity is seen."""
     state: np.ndarray
+    """:class:`State` value per frame and query."""
     stamp_s: Float[np.ndarray, " T"]
+    """Times in seconds."""
     frame_flags: tuple[str, ...] = ()
+    """Degradations of whole frames or of the whole clip, in words."""
     lost_p: Float32[np.ndarray, "T K"] | None = None
+    """Calibrated probability that the identity is lost, NaN where unknown; None without a monitor."""
     alarm: Bool[np.ndarray, "T K"] | None = None
+    """Whether an alarm is open; None likewise."""
     joints: Joints | None = None
+    """What explains the tracks at the end; None without grounding."""
 
     def __len__(self) -> int:
         return len(self.uv_px)

@@ -29,23 +29,20 @@ _FRAMES_PER_S = 30.0
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera without distortion.
-
-    Attributes:
-        fx: focal length along x, pixels.
-        fy: focal length along y, pixels.
-        cx: principal point x, pixels; centres at half-integers.
-        cy: principal point y, pixels; centres at half-integers.
-        width: image width, pixels.
-        height: image height, pixels.
-    """
+    """A pinhole camera without distortion."""
 
     fx: float
+    """Focal length along x, pixels."""
     fy: float
+    """Focal length along y, pixels."""
     cx: float
+    """Principal point x, pixels; centres at half-integers."""
     cy: float
+    """Principal point y, pixels; centres at half-integers."""
     width: int
+    """Image width, pixels."""
     height: int
+    """Image height, pixels."""
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
@@ -101,42 +98,36 @@ class Camera:
 
 @dataclass(frozen=True)
 class Frame:
-    """One RGB-D image.
-
-    Attributes:
-        rgb: colours.
-        depth_m: depth along +z in metres, 0 where missing; None without a depth sensor.
-        stamp_s: time in seconds.
-        cam_from_world: pose; the identity if unknown (the world is then the camera).
-    """
+    """One RGB-D image."""
 
     rgb: UInt8[np.ndarray, "H W 3"]
+    """Colours."""
     depth_m: Float32[np.ndarray, "H W"] | None
+    """Depth along +z in metres, 0 where missing; None without a depth sensor."""
     stamp_s: float
+    """Time in seconds."""
     cam_from_world: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """Pose; the identity if unknown (the world is then the camera)."""
 
 
 @dataclass(frozen=True)
 class Clip:
-    """RGB-D frames of one camera.
-
-    Attributes:
-        name: what to call the clip in files and tables.
-        camera: intrinsics of every frame.
-        rgb: colours.
-        depth_m: depth along +z in metres, 0 where missing; None without a depth sensor.
-        stamp_s: times in seconds, not decreasing.
-        cam_from_world: pose per frame; identities if unknown.
-        notes: what is less than it could be, in words, such as a camera that was guessed.
-    """
+    """RGB-D frames of one camera."""
 
     name: str
+    """What to call the clip in files and tables."""
     camera: Camera
+    """Intrinsics of every frame."""
     rgb: UInt8[np.ndarray, "T H W 3"]
+    """Colours."""
     depth_m: Float32[np.ndarray, "T H W"] | None
+    """Depth along +z in metres, 0 where missing; None without a depth sensor."""
     stamp_s: Float[np.ndarray, " T"]
+    """Times in seconds, not decreasing."""
     cam_from_world: Float[np.ndarray, "T 4 4"]
+    """Pose per frame; identities if unknown."""
     notes: tuple[str, ...] = ()
+    """What is less than it could be, in words, such as a camera that was guessed."""
 
     def __post_init__(self) -> None:
         if self.rgb.ndim != 4 or self.rgb.shape[3] != 3 or self.rgb.dtype != np.uint8:
@@ -280,23 +271,20 @@ def _camera(camera: Any, width: int, height: int, fov_deg: float | int | None, w
 
 @dataclass(frozen=True)
 class Query:
-    """What the user asks to follow. Use :meth:`slot`, :meth:`semantic` or :meth:`point`.
-
-    Attributes:
-        kind: ``slot`` (discover anything), ``semantic`` (a label), ``point`` (a pixel in a frame).
-        name: how to call the answer; made up from the kind where empty.
-        label: one of :data:`LABELS`, or None if unknown.
-        frame: frame index of a point query.
-        uv_px: pixel of a point query, in the source image.
-        intent: one of :data:`INTENTS`, or None for either.
-    """
+    """What the user asks to follow. Use :meth:`slot`, :meth:`semantic` or :meth:`point`."""
 
     kind: Literal["slot", "semantic", "point"]
+    """``slot`` (discover anything), ``semantic`` (a label), ``point`` (a pixel in a frame)."""
     name: str = ""
+    """How to call the answer; made up from the kind where empty."""
     label: str | None = None
+    """One of :data:`LABELS`, or None if unknown."""
     frame: int = 0
+    """Frame index of a point query."""
     uv_px: tuple[float, float] | None = None
+    """Pixel of a point query, in the source image."""
     intent: str | None = None
+    """One of :data:`INTENTS`, or None for either."""
 
     def __post_init__(self) -> None:
         for what, said, known in (("label", self.label, LABELS), ("intent", self.intent, INTENTS)):
@@ -334,36 +322,30 @@ class Query:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint of a simulated object.
-
-    Attributes:
-        name: name in the URDF.
-        kind: ``revolute`` or ``prismatic``.
-        lower: lower limit of the model, radians or metres.
-        upper: upper limit of the model, radians or metres; scripts open a hinge by at most 110 degrees.
-    """
+    """A joint of a simulated object."""
 
     name: str
+    """Name in the URDF."""
     kind: Literal["revolute", "prismatic"]
+    """``revolute`` or ``prismatic``."""
     lower: float
+    """Lower limit of the model, radians or metres."""
     upper: float
+    """Upper limit of the model, radians or metres; scripts open a hinge by at most 110 degrees."""
 
 
 @dataclass(frozen=True)
 class Entity:
-    """A physical point on one link that can be followed.
-
-    Attributes:
-        name: unique within the object, such as ``link_0/handle``.
-        label: one of :data:`LABELS`, or ``hinge`` (reported apart, never scored).
-        link: index of its link in the take's link arrays; 0 is the base, which never moves.
-        joint: index of its joint in the take's joint arrays; -1 if it is fixed in the base (see :attr:`fixed`).
-    """
+    """A physical point on one link that can be followed."""
 
     name: str
+    """Unique within the object, such as ``link_0/handle``."""
     label: str
+    """One of :data:`LABELS`, or ``hinge`` (reported apart, never scored)."""
     link: int
+    """Index of its link in the take's link arrays; 0 is the base, which never moves."""
     joint: int
+    """Index of its joint in the take's joint arrays; -1 if it is fixed in the base (see :attr:`fixed`)."""
 
     @property
     def fixed(self) -> bool:
@@ -378,83 +360,74 @@ class Entity:
 
 @dataclass(frozen=True)
 class TakeInfo:
-    """Where a take comes from and what is in it.
-
-    Attributes:
-        name: unique in its store.
-        source: ``partnet-mobility``, ``procedural``, or ``own`` for a user's own object.
-        object_id: folder name, or ``category-seed`` of a procedural object.
-        category: such as ``StorageFurniture``.
-        level: how many joints move one after the other.
-        seed: seed of everything random in the take.
-        half_diagonal_m: half the diagonal of the object's bounding box at rest, the unit of normalised distances.
-        frames_per_s: frame rate that the time stamps follow.
-        entities: what can be followed; hinges last.
-        joints: moving joints.
-        moved_joints: the joints that move in this take, in order, as indices into ``joints``.
-        provenance: commit, versions of the packages that made the data, renderer, command.
-        suite: which of the simulator's suites it belongs to; ``standard`` is none.
-    """
+    """Where a take comes from and what is in it."""
 
     name: str
+    """Unique in its store."""
     source: Literal["partnet-mobility", "procedural", "own"]
+    """``partnet-mobility``, ``procedural``, or ``own`` for a user's own object."""
     object_id: str
+    """Folder name, or ``category-seed`` of a procedural object."""
     category: str
+    """Such as ``StorageFurniture``."""
     level: int
+    """How many joints move one after the other."""
     seed: int
+    """Seed of everything random in the take."""
     half_diagonal_m: float
+    """Half the diagonal of the object's bounding box at rest, the unit of normalised distances."""
     frames_per_s: float
+    """Frame rate that the time stamps follow."""
     entities: tuple[Entity, ...]
+    """What can be followed; hinges last."""
     joints: tuple[Joint, ...]
+    """Moving joints."""
     moved_joints: tuple[int, ...]
+    """The joints that move in this take, in order, as indices into ``joints``."""
     provenance: dict[str, Any] = field(default_factory=dict)
+    """Commit, versions of the packages that made the data, renderer, command."""
     suite: str = "standard"
+    """Which of the simulator's suites it belongs to; ``standard`` is none."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One camera's frames of a take with their ground truth (a :class:`Clip` and what is true of it).
-
-    Attributes:
-        clip: the frames.
-        uv_px: true pixel per entity, also where occluded or outside the image; NaN behind the camera.
-        visible: whether the entity is seen.
-        link_id: 0 background, else 1 + link index.
-        entity_id: affordance mask: 0 nothing, else 1 + entity index.
-    """
+    """One camera's frames of a take with their ground truth (a :class:`Clip` and what is true of it)."""
 
     clip: Clip
+    """The frames."""
     uv_px: Float32[np.ndarray, "T E 2"]
+    """True pixel per entity, also where occluded or outside the image; NaN behind the camera."""
     visible: Bool[np.ndarray, "T E"]
+    """Whether the entity is seen."""
     link_id: UInt8[np.ndarray, "T H W"]
+    """0 background, else 1 + link index."""
     entity_id: UInt8[np.ndarray, "T H W"]
+    """Affordance mask: 0 nothing, else 1 + entity index."""
 
 
 @dataclass(frozen=True)
 class Take:
-    """One event seen by V views, with ground truth in the world frame.
-
-    Attributes:
-        info: description.
-        views: one per camera.
-        stamp_s: times, shared by all views.
-        point_world: true world point per entity.
-        flow_world: displacement of each entity to the next frame; 0 at the last.
-        link_pose: ``world_from_link`` per link.
-        joint_position: radians or metres.
-        joint_velocity: per second.
-        joint_axis: origin and unit direction of each joint's axis in the world.
-    """
+    """One event seen by V views, with ground truth in the world frame."""
 
     info: TakeInfo
+    """Description."""
     views: tuple[View, ...]
+    """One per camera."""
     stamp_s: Float[np.ndarray, " T"]
+    """Times, shared by all views."""
     point_world: Float32[np.ndarray, "T E 3"]
+    """True world point per entity."""
     flow_world: Float32[np.ndarray, "T E 3"]
+    """Displacement of each entity to the next frame; 0 at the last."""
     link_pose: Float32[np.ndarray, "T L 4 4"]
+    """``world_from_link`` per link."""
     joint_position: Float32[np.ndarray, "T J"]
+    """Radians or metres."""
     joint_velocity: Float32[np.ndarray, "T J"]
+    """Per second."""
     joint_axis: Float32[np.ndarray, "T J 6"]
+    """Origin and unit direction of each joint's axis in the world."""
 
     def __len__(self) -> int:
         return len(self.stamp_s)

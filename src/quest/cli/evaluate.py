@@ -48,40 +48,38 @@ class Eval:
 
     On takes the protocol point always has the tracker hold-still for comparison; trackers that only follow given
     points do not have the protocol semantic. Formats, measures and trackers: docs/metrics.md.
-
-    Attributes:
-        takes: folder of a take store.
-        real: instead of --takes, folders of labelled recordings: clips with labels.csv or truth.csv, or pictures with
-            labels.csv.
-        protocol: point (the true pixel is given) and semantic (nothing is given).
-        trackers: what to compare.
-        weights: name or file of the weights of the trackers that need some.
-        split: parts of the object split; training objects are reported only if train is named here.
-        level: levels to evaluate; all by default.
-        objects: object ids to evaluate; all by default.
-        same_objects: keep only objects that have takes of every level, so that levels compare.
-        pictures: of labelled pictures, the fifth that is for choosing, the rest, which may teach, or all.
-        resamples: of the bootstrap over objects, clips or pictures.
-        seed: of the bootstrap and of the noise of chained flow.
-        shard: part of the takes, such as 0/2 and 1/2 for two processes side by side; the last one reports. Needs --out.
-        out: of --takes a result file (.json); the per-frame records go beside it (.records.parquet). Of --real a
-            folder, with a file for each set.
     """
 
     takes: str | None = None
+    """Folder of a take store."""
     real: tuple[Path, ...] = ()
+    """Instead of --takes, folders of labelled recordings: clips with labels.csv or truth.csv, or pictures with
+    labels.csv."""
     protocol: tuple[Literal["point", "semantic"], ...] = ("point",)
+    """Point (the true pixel is given) and semantic (nothing is given)."""
     trackers: Annotated[tuple[TrackerName, ...], tyro.conf.arg(help=_TRACKERS_HELP)] = ()
+    """What to compare."""
     weights: str = "quest-s16"
+    """Name or file of the weights of the trackers that need some."""
     split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation", "test", "unlisted")
+    """Parts of the object split; training objects are reported only if train is named here."""
     level: tuple[int, ...] = ()
+    """Levels to evaluate; all by default."""
     objects: tuple[str, ...] = ()
+    """Object ids to evaluate; all by default."""
     same_objects: bool = False
+    """Keep only objects that have takes of every level, so that levels compare."""
     pictures: Literal["choosing", "teaching", "all"] = "choosing"
+    """Of labelled pictures, the fifth that is for choosing, the rest, which may teach, or all."""
     resamples: int = 1000
+    """Of the bootstrap over objects, clips or pictures."""
     seed: int = 0
+    """Of the bootstrap and of the noise of chained flow."""
     shard: str = "0/1"
+    """Part of the takes, such as 0/2 and 1/2 for two processes side by side; the last one reports. Needs --out."""
     out: Path | None = None
+    """Of --takes a result file (.json); the per-frame records go beside it (.records.parquet). Of --real a folder, with
+    a file for each set."""
 
     def run(self) -> int:
         """Evaluate, print the table, write the files.

@@ -30,34 +30,32 @@ class EvalMonitor:
     Page-Hinkley and a threshold on the network's confidence are then played on them, all calibrated on the same
     streams. A monitor that was calibrated with --unit take is judged by other takes of the same objects: every take
     then counts as an object.
-
-    Attributes:
-        takes: stores with takes of objects that took no part in the calibration.
-        records: folder for the recorded streams.
-        calibration: folder of the streams that the weights were calibrated on.
-        weights: name or file of the weights.
-        split: parts of the object split.
-        level: levels to evaluate; all by default.
-        alpha: shares of loss-free streams that may alarm.
-        alpha_frames: --alpha is for every so many frames of a stream instead; a multiple of the calibration's blocks.
-        shard: part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one judges.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap.
-        out: result file (.json).
     """
 
     takes: tuple[str, ...]
+    """Stores with takes of objects that took no part in the calibration."""
     records: Path
+    """Folder for the recorded streams."""
     calibration: Path
+    """Folder of the streams that the weights were calibrated on."""
     weights: str = "quest-s16"
+    """Name or file of the weights."""
     split: tuple[Literal["validation", "test", "unlisted"], ...] = ("test",)
+    """Parts of the object split."""
     level: tuple[int, ...] = ()
+    """Levels to evaluate; all by default."""
     alpha: tuple[float, ...] = (0.01, 0.05, 0.1)
+    """Shares of loss-free streams that may alarm."""
     alpha_frames: int | None = None
+    """--alpha is for every so many frames of a stream instead; a multiple of the calibration's blocks."""
     shard: str = "0/1"
+    """Part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one judges."""
     resamples: int = 200
+    """Of the bootstrap over objects."""
     seed: int = 0
+    """Of the bootstrap."""
     out: Path | None = None
+    """Result file (.json)."""
 
     def run(self) -> int:
         """Record, judge, print the table, write the file.

@@ -23,23 +23,20 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 @dataclass(frozen=True)
 class _Colours:
-    """Where the colours come from: images in order, or a video.
-
-    Attributes:
-        images: paths; empty for a video.
-        video: its path; None for images.
-        number: of frames; for a video by its header.
-        size: width and height, upright.
-        turned: whether the pixels of the video are not upright.
-        paired: whether depth images of the same pixels go with them.
-    """
+    """Where the colours come from: images in order, or a video."""
 
     images: tuple[Path, ...]
+    """Paths; empty for a video."""
     video: Path | None
+    """Its path; None for images."""
     number: int | None
+    """Of frames; for a video by its header."""
     size: tuple[int, int]
+    """Width and height, upright."""
     turned: bool = False
+    """Whether the pixels of the video are not upright."""
     paired: bool = False
+    """Whether depth images of the same pixels go with them."""
 
     def __iter__(self) -> Iterator[tuple[np.ndarray, float]]:
         """Upright pictures and their times; those of images follow a nominal rate of 30 a second."""

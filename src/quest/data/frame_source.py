@@ -107,25 +107,22 @@ class Notes:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Frames of one camera, read as they are asked for; every loop over them begins anew.
-
-    Attributes:
-        name: of the recording.
-        camera: intrinsics of every frame, without distortion.
-        frames: begins to read.
-        length: number of frames, or about that many where ``exact`` is False; None where only reading tells.
-        exact: whether ``length`` is the number of frames that come.
-        notes: degradations; complete when the last frame has come.
-        units: where the depth comes from and metres per unit of it, for the message about wrong units.
-    """
+    """Frames of one camera, read as they are asked for; every loop over them begins anew."""
 
     name: str
+    """Name of the recording."""
     camera: Camera
+    """Intrinsics of every frame, without distortion."""
     frames: Callable[[], Iterator[Frame]]
+    """Begins to read."""
     length: int | None = None
+    """Number of frames, or about that many where ``exact`` is False; None where only reading tells."""
     exact: bool = True
+    """Whether ``length`` is the number of frames that come."""
     notes: Notes = field(default_factory=Notes)
+    """Degradations; complete when the last frame has come."""
     units: tuple[str, float] = ("the recording", 1.0)
+    """Where the depth comes from and metres per unit of it, for the message about wrong units."""
 
     @property
     def flags(self) -> tuple[str, ...]:

@@ -30,33 +30,30 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class Run:
-    """What made the numbers.
-
-    Attributes:
-        command: the command line.
-        commit: commit of the checkout, with ``+dirty`` where files differ from it; the version where there is none.
-        data_hash: over the hashes of all takes that were evaluated.
-        weights: what was loaded for the tracker ``quest``; None if it did not take part.
-        weights_hash: SHA-256 of the weights file, where it is known.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap.
-        machine: operating system, processor and cores.
-        versions: of Python and the packages that compute.
-        stamp: date and time of the end, UTC.
-        seconds: duration.
-    """
+    """What made the numbers."""
 
     command: str
+    """The command line."""
     commit: str
+    """Commit of the checkout, with ``+dirty`` where files differ from it; the version where there is none."""
     data_hash: str
+    """Over the hashes of all takes that were evaluated."""
     weights: str | None
+    """What was loaded for the tracker ``quest``; None if it did not take part."""
     weights_hash: str | None
+    """SHA-256 of the weights file, where it is known."""
     resamples: int
+    """Of the bootstrap over objects."""
     seed: int
+    """Of the bootstrap."""
     machine: str
+    """Operating system, processor and cores."""
     versions: dict[str, str]
+    """Of Python and the packages that compute."""
     stamp: str
+    """Date and time of the end, UTC."""
     seconds: float
+    """Duration."""
 
     @classmethod
     def ended(
@@ -80,21 +77,18 @@ class Run:
 
 @dataclass(frozen=True)
 class Results:
-    """Rows and what they rest on.
-
-    Attributes:
-        run: what made them.
-        rows: the table.
-        discoveries: answers and matches per view, in the semantic protocol.
-        unscored: entities that were not scored.
-        notes: what a reader must know, in words.
-    """
+    """Rows and what they rest on."""
 
     run: Run
+    """What made them."""
     rows: tuple[Row, ...]
+    """The table."""
     discoveries: tuple[Discovery, ...] = ()
+    """Answers and matches per view, in the semantic protocol."""
     unscored: tuple[Unscored, ...] = ()
+    """Entities that were not scored."""
     notes: tuple[str, ...] = ()
+    """What a reader must know, in words."""
 
 
 def records_path(path: str | Path) -> Path:

@@ -24,21 +24,18 @@ from quest.types import Take
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Everything that an evaluation found out.
-
-    Attributes:
-        records: per tracker, take, view and scored entity.
-        discoveries: per tracker, take and view of the semantic protocol.
-        unscored: entities not scored, per take and view.
-        notes: what a reader must know, in words.
-        missing: takes that are left to other shards; what is known is not whole before there are none.
-    """
+    """Everything that an evaluation found out."""
 
     records: tuple[EntityRecord, ...]
+    """Per tracker, take, view and scored entity."""
     discoveries: tuple[Discovery, ...]
+    """Per tracker, take and view of the semantic protocol."""
     unscored: tuple[Unscored, ...]
+    """Entities not scored, per take and view."""
     notes: tuple[str, ...]
+    """What a reader must know, in words."""
     missing: int = 0
+    """Takes that are left to other shards; what is known is not whole before there are none."""
 
 
 def has_protocol(tracker: ClipTracker, protocol: ProtocolName) -> bool:

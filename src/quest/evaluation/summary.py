@@ -21,74 +21,68 @@ READINGS: tuple[Reading, ...] = ("all", "moved")
 
 @dataclass(frozen=True)
 class Metrics:
-    """The metrics of one row; None where nothing was counted. ``docs/metrics.md`` defines them.
-
-    Attributes:
-        ape: mean 3D distance, normalised units.
-        ape_vis: the same on visible frames.
-        ape_px: mean pixel distance, pixels of the letterboxed input.
-        ape_2d: mean distance in [0, 1]^2 coordinates of the letterboxed input.
-        median_px: median pixel distance.
-        median_px_vis: median pixel distance on visible frames.
-        d50: 3D distance at half of the take.
-        d100: 3D distance at its end.
-        acc: share of frames with the right identity.
-        switches: changes of identity per 1,000 frames.
-        slope: growth of the 3D distance per 100 frames.
-        precision: share of the tracker's own discoveries that are entities (semantic, reading ``all``).
-        recall: share of the entities that were discovered (semantic).
-        place_recall: the same if labels do not count (semantic, reading ``all``).
-    """
+    """The metrics of one row; None where nothing was counted. ``docs/metrics.md`` defines them."""
 
     ape: Value | None
+    """Mean 3D distance, normalised units."""
     ape_vis: Value | None
+    """The same on visible frames."""
     ape_px: Value | None
+    """Mean pixel distance, pixels of the letterboxed input."""
     ape_2d: Value | None
+    """Mean distance in [0, 1]^2 coordinates of the letterboxed input."""
     median_px: Value | None
+    """Median pixel distance."""
     median_px_vis: Value | None
+    """Median pixel distance on visible frames."""
     d50: Value | None
+    """3D distance at half of the take."""
     d100: Value | None
+    """3D distance at its end."""
     acc: Value | None
+    """Share of frames with the right identity."""
     switches: Value | None
+    """Changes of identity per 1,000 frames."""
     slope: Value | None
+    """Growth of the 3D distance per 100 frames."""
     precision: Value | None = None
+    """Share of the tracker's own discoveries that are entities (semantic, reading ``all``)."""
     recall: Value | None = None
+    """Share of the entities that were discovered (semantic)."""
     place_recall: Value | None = None
+    """The same if labels do not count (semantic, reading ``all``)."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a table.
-
-    Attributes:
-        tracker: its name.
-        protocol: ``point`` or ``semantic``.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        level: how many joints move one after the other.
-        reading: ``all`` entities or those that ``moved``.
-        objects: how many different objects.
-        takes: how many takes.
-        entities: how many entities of these takes; each counts once, however many views see it.
-        tracks: how many (take, view, entity).
-        frames: how many scored frames of these.
-        metrics: the numbers.
-        suite: of the simulator, with its variant, such as ``noise-5``; ``standard`` for ordinary takes.
-    """
+    """One row of a table."""
 
     tracker: str
+    """Its name."""
     protocol: str
+    """``point`` or ``semantic``."""
     part: str
+    """Part of the object split."""
     source: str
+    """``partnet-mobility`` or ``procedural``."""
     level: int
+    """How many joints move one after the other."""
     reading: Reading
+    """``all`` entities or those that ``moved``."""
     objects: int
+    """How many different objects."""
     takes: int
+    """How many takes."""
     entities: int
+    """How many entities of these takes; each counts once, however many views see it."""
     tracks: int
+    """How many (take, view, entity)."""
     frames: int
+    """How many scored frames of these."""
     metrics: Metrics
+    """The numbers."""
     suite: str = STANDARD
+    """Of the simulator, with its variant, such as ``noise-5``; ``standard`` for ordinary takes."""
 
 
 def summarise(

@@ -19,21 +19,18 @@ from quest.evaluation.take_suite import STANDARD
 
 @dataclass(frozen=True)
 class Column:
-    """A metric's column.
-
-    Attributes:
-        field: of :class:`quest.evaluation.summary.Metrics`.
-        heading: above it.
-        decimals: shown.
-        factor: 100 for shares that are shown in percent.
-        rank: columns of high rank go first where the terminal is narrow.
-    """
+    """A metric's column."""
 
     field: str
+    """Of :class:`quest.evaluation.summary.Metrics`."""
     heading: str
+    """Above it."""
     decimals: int
+    """Shown."""
     factor: float
+    """100 for shares that are shown in percent."""
     rank: int
+    """Columns of high rank go first where the terminal is narrow."""
 
 
 COLUMNS = (

@@ -32,43 +32,37 @@ _WEAK_RADIUS_SHARE = 5.0
 
 @dataclass(frozen=True)
 class Track:
-    """What a curve has to explain.
-
-    Attributes:
-        points: in the order of time.
-        sigma: standard deviation of each per coordinate.
-        extent: the track's size.
-        prior: what is believed already.
-        single: points that were seen once, so that they may be wrong; a mean of several is not.
-    """
+    """What a curve has to explain."""
 
     points: Float[np.ndarray, "N 3"]
+    """In the order of time."""
     sigma: Float[np.ndarray, " N"]
+    """Standard deviation of each per coordinate."""
     extent: float
+    """The track's size."""
     prior: JointPrior | None
+    """What is believed already."""
     single: Bool[np.ndarray, " N"]
+    """Points that were seen once, so that they may be wrong; a mean of several is not."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """A fitted line (P = 4) or circle (P = 6).
-
-    Attributes:
-        axis: unit direction of the line, or of the circle's axis.
-        place: a point of the line, or the circle's centre.
-        radius: of the circle; 0 for a line.
-        covariance: of tilt about ``place`` (2) and shift (2) in the basis of ``perpendicular(axis)``; of a circle also
-            radius and height.
-        used: points that are near and not stray.
-        stray: points that are near by chance, far along the curve from all others.
-    """
+    """A fitted line (P = 4) or circle (P = 6)."""
 
     axis: Float[np.ndarray, "3"]
+    """Unit direction of the line, or of the circle's axis."""
     place: Float[np.ndarray, "3"]
+    """A point of the line, or the circle's centre."""
     radius: float
+    """Of the circle; 0 for a line."""
     covariance: Float[np.ndarray, "P P"]
+    """Of tilt about ``place`` (2) and shift (2) in the basis of ``perpendicular(axis)``; of a circle also radius and
+    height."""
     used: Bool[np.ndarray, " N"]
+    """Points that are near and not stray."""
     stray: Bool[np.ndarray, " N"]
+    """Points that are near by chance, far along the curve from all others."""
 
 
 @dataclass(frozen=True)

@@ -44,17 +44,14 @@ _MOST_CONDITION = 1e12
 
 @dataclass(frozen=True)
 class Plane:
-    """What is seen of a link around a place.
-
-    Attributes:
-        normal: unit normal.
-        middle: a point of the plane.
-        behind: whether it is seen from the side that the normal points away from, so that it is the link's back.
-    """
+    """What is seen of a link around a place."""
 
     normal: Float[np.ndarray, "3"]
+    """Unit normal."""
     middle: Float[np.ndarray, "3"]
+    """A point of the plane."""
     behind: bool
+    """Whether it is seen from the side that the normal points away from, so that it is the link's back."""
 
 
 @dataclass(frozen=True)
@@ -68,21 +65,18 @@ class _Sights:
 
 @dataclass(frozen=True)
 class _Turning:
-    """What was found.
-
-    Attributes:
-        joint: with q = 0 at rest.
-        belief: the same for one who has more to go by.
-        gap: distance of the axis before the front.
-        bias: what is to be added to turns that the normals show, because that at rest is not exact either.
-        shift: standard deviation of the axis' place.
-    """
+    """What was found."""
 
     joint: Joint
+    """With q = 0 at rest."""
     belief: JointPrior
+    """The same for one who has more to go by."""
     gap: float
+    """Distance of the axis before the front."""
     bias: float
+    """What is to be added to turns that the normals show, because that at rest is not exact either."""
     shift: float
+    """Standard deviation of the axis' place."""
 
 
 @dataclass(eq=False)

@@ -26,31 +26,28 @@ class JointKind(StrEnum):
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint fitted to the track of one point, in the track's frame and unit of length.
-
-    Attributes:
-        kind: how it moves.
-        axis: unit direction of sliding, or of the axis of turning (right-handed); positive away from the first points.
-        origin: point of the axis of turning nearest to ``rest``; equal to ``rest`` for other kinds.
-        rest: the curve at q = 0.
-        lower: smallest q seen, units of length or radians; turns are told within half a turn either way from ``rest``.
-        upper: largest q seen.
-        covariance: of small changes, in the basis of :func:`perpendicular`. Prismatic: tilt of the axis (2, radians)
-            and shift across it (2). Revolute: tilt about ``origin`` (2), shift of the axis across itself (2), radius,
-            height along the axis. Static: shift (3).
-        sigma: standard deviation of a point per coordinate that was used.
-        n: points fitted.
-    """
+    """A joint fitted to the track of one point, in the track's frame and unit of length."""
 
     kind: JointKind
+    """How it moves."""
     axis: Float[np.ndarray, "3"]
+    """Unit direction of sliding, or of the axis of turning (right-handed); positive away from the first points."""
     origin: Float[np.ndarray, "3"]
+    """Point of the axis of turning nearest to ``rest``; equal to ``rest`` for other kinds."""
     rest: Float[np.ndarray, "3"]
+    """The curve at q = 0."""
     lower: float
+    """Smallest q seen, units of length or radians; turns are told within half a turn either way from ``rest``."""
     upper: float
+    """Largest q seen."""
     covariance: Float[np.ndarray, "P P"]
+    """Of small changes, in the basis of :func:`perpendicular`. Prismatic: tilt of the axis (2, radians) and shift
+    across it (2). Revolute: tilt about ``origin`` (2), shift of the axis across itself (2), radius, height along the
+    axis. Static: shift (3)."""
     sigma: float
+    """Standard deviation of a point per coordinate that was used."""
     n: int
+    """Points fitted."""
 
     @property
     def radius(self) -> float:

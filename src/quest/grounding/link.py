@@ -27,17 +27,14 @@ _LEAST_FRAMES = 4
 
 @dataclass(frozen=True)
 class Tracks:
-    """Simultaneous points of several queries and each one's own joint.
-
-    Attributes:
-        points: NaN where not seen.
-        joints: one each, none static.
-        sigma: standard deviation of a point per coordinate.
-    """
+    """Simultaneous points of several queries and each one's own joint."""
 
     points: Float[np.ndarray, "M K 3"]
+    """NaN where not seen."""
     joints: Sequence[Joint]
+    """One each, none static."""
     sigma: float
+    """Standard deviation of a point per coordinate."""
 
     def on_joint(self) -> tuple[Float[np.ndarray, "M K"], Float[np.ndarray, "M K"], Bool[np.ndarray, "M K"]]:
         """Position on the own joint, squared distance from it in sigmas, and whether the point is seen and near it."""

@@ -34,14 +34,12 @@ class JointEstimator:
     Args:
         sigma: standard deviation of a point per coordinate.
         capacity: most points that are kept; of more, the two nearest become one, or the oldest of many outliers goes.
-
-    Attributes:
-        prior: what is believed besides the track; takes effect at the next fit.
     """
 
     sigma: float
     capacity: int = field(default=64, kw_only=True)
     prior: JointPrior | None = field(default=None, init=False)
+    """What is believed besides the track; takes effect at the next fit."""
     _points: Float[np.ndarray, "N 3"] = field(default_factory=lambda: np.zeros((0, 3)), init=False)
     _counts: Float[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0), init=False)
     _waiting: int = field(default=0, init=False)

@@ -17,27 +17,25 @@ _UNIT = 1e-3
 class JointPrior:
     """Independent beliefs on a joint's kind, its axis as either kind, and where the axis of turning is.
 
-    Attributes:
-        revolute_probability: that it turns rather than slides.
-        prismatic_axis: unit direction of sliding, of either sign.
-        prismatic_axis_sigma_rad: standard deviation of that direction about each of two perpendicular axes.
-        revolute_axis: unit direction of the axis of turning, of either sign.
-        revolute_axis_sigma_rad: the same of this direction.
-        origin: point of the axis of turning.
-        origin_sigma: its standard deviation per coordinate.
-
     Raises:
         InputError: a probability outside (0, 1), a spread that is not positive, a number that is not finite, or an axis
             that has not length 1.
     """
 
     revolute_probability: float
+    """That it turns rather than slides."""
     prismatic_axis: Float[np.ndarray, "3"]
+    """Unit direction of sliding, of either sign."""
     prismatic_axis_sigma_rad: float
+    """Standard deviation of that direction about each of two perpendicular axes."""
     revolute_axis: Float[np.ndarray, "3"]
+    """Unit direction of the axis of turning, of either sign."""
     revolute_axis_sigma_rad: float
+    """The same of this direction."""
     origin: Float[np.ndarray, "3"]
+    """Point of the axis of turning."""
     origin_sigma: float
+    """Its standard deviation per coordinate."""
 
     def __post_init__(self) -> None:
         spreads = (self.prismatic_axis_sigma_rad, self.revolute_axis_sigma_rad, self.origin_sigma)

@@ -28,17 +28,14 @@ _PLACES = (np.arange(3) + np.mod(0.5 + np.arange(1, _TRIPLES + 1)[:, None] / _GO
 
 @dataclass(frozen=True)
 class Starts:
-    """Lines and circles to begin with.
-
-    Attributes:
-        axis: unit directions of the lines, or of the circles' axes.
-        place: a point of each line, or the circles' centres.
-        radius: of the circles; 0 for lines.
-    """
+    """Lines and circles to begin with."""
 
     axis: Float[np.ndarray, "S 3"]
+    """Unit directions of the lines, or of the circles' axes."""
     place: Float[np.ndarray, "S 3"]
+    """A point of each line, or the circles' centres."""
     radius: Float[np.ndarray, " S"]
+    """Of the circles; 0 for lines."""
 
     def __len__(self) -> int:
         return len(self.axis)

@@ -18,17 +18,14 @@ from quest.types import INTENTS, LABELS
 
 @dataclass(frozen=True)
 class Anchor:
-    """What queries are bound to; it never changes after binding.
-
-    Attributes:
-        content: embedding of the entity at the frame where it was bound.
-        template: what the close cells around it looked like there (none for learned queries).
-        valid: False for padding queries, which nothing attends to.
-    """
+    """What queries are bound to; it never changes after binding."""
 
     content: Float[Tensor, "B K D"]
+    """Embedding of the entity at the frame where it was bound."""
     template: Float[Tensor, "B K M F"]
+    """What the close cells around it looked like there (none for learned queries)."""
     valid: Bool[Tensor, "B K"]
+    """False for padding queries, which nothing attends to."""
 
     def join(self, other: Anchor) -> Anchor:
         """These queries and more."""
@@ -45,25 +42,22 @@ class Anchor:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Answers for every frame of a window.
-
-    Attributes:
-        embedding: the queries after the decoder.
-        logits: score of every cell (empty for direct regression).
-        peak: best cell (0 for direct regression).
-        uv: coordinates in [0, 1]^2 of the input; raw for direct regression, so they may leave it.
-        point: position in the reference frame; NaN where it cannot be lifted.
-        visible_logit: is the entity seen?
-        right_logit: is the identity right?
-    """
+    """Answers for every frame of a window."""
 
     embedding: Float[Tensor, "B T K D"]
+    """The queries after the decoder."""
     logits: Float[Tensor, "B T K C"]
+    """Score of every cell (empty for direct regression)."""
     peak: Int[Tensor, "B T K"]
+    """Best cell (0 for direct regression)."""
     uv: Float[Tensor, "B T K 2"]
+    """Coordinates in [0, 1]^2 of the input; raw for direct regression, so they may leave it."""
     point: Float[Tensor, "B T K 3"]
+    """Position in the reference frame; NaN where it cannot be lifted."""
     visible_logit: Float[Tensor, "B T K"]
+    """Is the entity seen?"""
     right_logit: Float[Tensor, "B T K"]
+    """Is the identity right?"""
 
 
 class Binder(nn.Module):

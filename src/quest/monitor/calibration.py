@@ -35,25 +35,22 @@ _MANY_BLOCKS = 100_000
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrator, a statistic, and how large the statistic gets where nothing is lost.
-
-    Attributes:
-        calibrator: from signals to log odds of a loss.
-        statistic: collects these over frames.
-        maxima: of the statistic in each loss-free calibration stream, over queries and frames; ascending.
-        block_frames: length of the calibration streams, frames.
-        about: what it was calibrated on, a line for people.
-        revision: of the tracker whose signals these are (``quest.track.settings.REVISION``).
-        unit: what each of the maxima is of, and so what the promise is about.
-    """
+    """A calibrator, a statistic, and how large the statistic gets where nothing is lost."""
 
     calibrator: Calibrator
+    """From signals to log odds of a loss."""
     statistic: Cusum
+    """Collects these over frames."""
     maxima: Float64[np.ndarray, " n"]
+    """Of the statistic in each loss-free calibration stream, over queries and frames; ascending."""
     block_frames: int
+    """Length of the calibration streams, frames."""
     about: str
+    """What it was calibrated on, a line for people."""
     revision: int
+    """Of the tracker whose signals these are (``quest.track.settings.REVISION``)."""
     unit: Unit = "object"
+    """What each of the maxima is of, and so what the promise is about."""
 
     def __post_init__(self) -> None:
         if not len(self.maxima) or not np.isfinite(self.maxima).all() or (np.diff(self.maxima) < 0).any():

@@ -22,24 +22,22 @@ class Calibrator:
     Signals are squashed, ``arcsinh((x - center) / scale)``: linear about the middle, logarithmic far out. The log odds
     of a member are ``f . direct + tanh(f . inner + inner_bias) . outer + bias`` of the features f of
     :mod:`quest.monitor.memory`; without hidden units (H = 0) that is a logistic regression.
-
-    Attributes:
-        center: median of each signal.
-        scale: spread of each signal.
-        direct: weights from features to log odds, per member.
-        inner: weights from features to hidden units.
-        inner_bias: of the hidden units.
-        outer: weights from hidden units to log odds.
-        bias: of the log odds.
     """
 
     center: Float64[np.ndarray, " S"]
+    """Median of each signal."""
     scale: Float64[np.ndarray, " S"]
+    """Spread of each signal."""
     direct: Float64[np.ndarray, "M F"]
+    """Weights from features to log odds, per member."""
     inner: Float64[np.ndarray, "M F H"]
+    """Weights from features to hidden units."""
     inner_bias: Float64[np.ndarray, "M H"]
+    """Of the hidden units."""
     outer: Float64[np.ndarray, "M H"]
+    """Weights from hidden units to log odds."""
     bias: Float64[np.ndarray, " M"]
+    """Of the log odds."""
 
     def __post_init__(self) -> None:
         members, _, hidden = self.inner.shape

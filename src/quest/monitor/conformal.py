@@ -30,17 +30,14 @@ _MOST_HALVINGS = 900
 
 @dataclass(frozen=True)
 class Threshold:
-    """What the statistic has to exceed.
-
-    Attributes:
-        value: infinite where too few streams were calibrated on to say anything.
-        alpha: share of loss-free streams that may exceed it.
-        extrapolated: whether it lies beyond the resolution of the calibration streams, 1 / (n + 1).
-    """
+    """What the statistic has to exceed."""
 
     value: float
+    """Infinite where too few streams were calibrated on to say anything."""
     alpha: float
+    """Share of loss-free streams that may exceed it."""
     extrapolated: bool
+    """Whether it lies beyond the resolution of the calibration streams, 1 / (n + 1)."""
 
 
 def threshold(maxima: Float64[np.ndarray, " n"], alpha: float) -> Threshold:
@@ -70,16 +67,14 @@ def threshold(maxima: Float64[np.ndarray, " n"], alpha: float) -> Threshold:
 class Budget:
     """How often alarms may be false: with a probability of at most alpha, in a whole stream or in every so many frames.
 
-    Attributes:
-        alpha: in (0, 1).
-        frames: that alpha is for, again and again without an end; None for the whole stream, however long it becomes.
-
     Raises:
         ConfigError: alpha is no probability, or there are no frames.
     """
 
     alpha: float
+    """In (0, 1)."""
     frames: int | None = None
+    """That alpha is for, again and again without an end; None for the whole stream, however long it becomes."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.alpha < 1.0:

@@ -22,27 +22,24 @@ _KNOWN_THRESHOLDS = 1000
 
 @dataclass
 class MonitorState:
-    """What the next verdict depends on; rows are queries, in the order of ``name``.
-
-    Attributes:
-        statistic: of each query.
-        name: by key, of the queries that are being watched.
-        open: alarms by key.
-        memory: of each query's signals.
-        restart: number, over the stream, of each query's last alarm that was cleared; 0 without any.
-        origin: the frame from which each query's blocks count.
-        frames: that were seen.
-        restarts: alarms that were cleared.
-    """
+    """What the next verdict depends on; rows are queries, in the order of ``name``."""
 
     statistic: Float64[np.ndarray, "N Z"]
+    """Of each query."""
     name: dict[int, str] = field(default_factory=dict)
+    """By key, of the queries that are being watched."""
     open: dict[int, Alarm] = field(default_factory=dict)
+    """Alarms by key."""
     memory: Float64[np.ndarray, "N R S"] = field(default_factory=lambda: memories.start(0))
+    """Of each query's signals."""
     restart: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """Number, over the stream, of each query's last alarm that was cleared; 0 without any."""
     origin: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
+    """The frame from which each query's blocks count."""
     frames: int = 0
+    """That were seen."""
     restarts: int = 0
+    """Alarms that were cleared."""
 
 
 class Monitor:

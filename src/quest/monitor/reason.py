@@ -22,15 +22,12 @@ _LEAST: Final = 0.2
 
 @dataclass(frozen=True)
 class _Wording:
-    """How a signal is called when it is off its normal level.
-
-    Attributes:
-        low: where it is below; None where that is no sign of a loss.
-        high: where it is above.
-    """
+    """How a signal is called when it is off its normal level."""
 
     low: str | None
+    """Where it is below; None where that is no sign of a loss."""
     high: str | None
+    """Where it is above."""
 
 
 _WORDINGS: Final = {

@@ -31,13 +31,10 @@ SIGNALS: tuple[str, ...] = (
 
 @dataclass(frozen=True)
 class Signals:
-    """Signals of one frame.
-
-    Attributes:
-        values: one row per query, one column per name of :data:`SIGNALS`; NaN where unknown (no depth, just bound).
-    """
+    """Signals of one frame."""
 
     values: Float32[np.ndarray, "K S"]
+    """One row per query, one column per name of :data:`SIGNALS`; NaN where unknown (no depth, just bound)."""
 
     def __post_init__(self) -> None:
         if self.values.ndim != 2 or self.values.shape[1] != len(SIGNALS):

@@ -46,14 +46,12 @@ class Cusum:
 
     Reference: Page, Continuous inspection schemes, Biometrika 41, 1954. ``keep`` below 1 forgets, which bounds what a
     long and faint suspicion can add up to.
-
-    Attributes:
-        drift: evidence that a frame without a loss may have.
-        keep: share of the sum that the next frame keeps, in [0, 1].
     """
 
     drift: float
+    """Evidence that a frame without a loss may have."""
     keep: float = 1.0
+    """Share of the sum that the next frame keeps, in [0, 1]."""
     size: ClassVar[int] = 1
 
     def __post_init__(self) -> None:
@@ -79,12 +77,10 @@ class PageHinkley:
 
     Reference: Hinkley, Inference about the change-point from cumulative sum tests, Biometrika 58, 1971; in the form
     that is usual for streams (Gama et al., A survey on concept drift adaptation, 2014, section 3.3.1).
-
-    Attributes:
-        delta: rise above the mean that is tolerated in a frame.
     """
 
     delta: float
+    """Rise above the mean that is tolerated in a frame."""
     size: ClassVar[int] = 4
 
     def update(

@@ -21,15 +21,12 @@ from quest.track.settings import TrackerConfig
 
 @dataclass(frozen=True)
 class Belief:
-    """Belief of K queries over the cells of one frame.
-
-    Attributes:
-        probability: sums to one over the cells.
-        cell_point: the cells' points in the reference frame, NaN where depth is missing.
-    """
+    """Belief of K queries over the cells of one frame."""
 
     probability: Float[Tensor, "K C"]
+    """Sums to one over the cells."""
     cell_point: Float[Tensor, "C 3"]
+    """The cells' points in the reference frame, NaN where depth is missing."""
 
 
 def moved(

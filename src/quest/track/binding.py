@@ -28,34 +28,28 @@ PATIENCE = 8
 
 @dataclass(frozen=True)
 class Waiting:
-    """A query that has not found its entity.
-
-    Attributes:
-        number: its number.
-        query: what was asked.
-        since: the frame from which it looks.
-    """
+    """A query that has not found its entity."""
 
     number: int
+    """Its number."""
     query: Query
+    """What was asked."""
     since: int
+    """The frame from which it looks."""
 
 
 @dataclass
 class BindingState:
-    """What queries of a stream are bound to, and which are not.
-
-    Attributes:
-        anchor: what the bound queries are bound to, in the order of binding; None before the first.
-        waiting: queries that have not found their entity.
-        discover: whether everything in the next frame is to be discovered.
-        numbered: how many numbers have been given.
-    """
+    """What queries of a stream are bound to, and which are not."""
 
     anchor: Anchor | None = None
+    """What the bound queries are bound to, in the order of binding; None before the first."""
     waiting: list[Waiting] = field(default_factory=list)
+    """Queries that have not found their entity."""
     discover: bool = False
+    """Whether everything in the next frame is to be discovered."""
     numbered: int = 0
+    """How many numbers have been given."""
 
 
 class Binding:

@@ -16,22 +16,19 @@ Happening = Literal["bound", "alarm", "cleared", "lost", "found", "degraded"]
 
 @dataclass(frozen=True)
 class Event:
-    """Something that happened in a frame.
-
-    Attributes:
-        frame: index of the frame.
-        stamp_s: its time, seconds.
-        kind: ``bound`` queries are followed from here on; an ``alarm`` was raised or ``cleared``; without an alarm, a
-            query was ``lost`` or ``found`` again; the frame is ``degraded``.
-        name: of the query; empty where it is about the frame.
-        text: a few words for people.
-    """
+    """Something that happened in a frame."""
 
     frame: int
+    """Index of the frame."""
     stamp_s: float
+    """Its time, seconds."""
     kind: Happening
+    """``bound`` queries are followed from here on; an ``alarm`` was raised or ``cleared``; without an alarm, a query
+    was ``lost`` or ``found`` again; the frame is ``degraded``."""
     name: str
+    """Of the query; empty where it is about the frame."""
     text: str
+    """A few words for people."""
 
 
 class Events:

@@ -13,21 +13,18 @@ from quest.model.joint_head import JointBelief
 
 @dataclass(frozen=True)
 class BeliefRow:
-    """What the network believes of one query's joint in one frame (see :class:`~quest.model.joint_head.JointBelief`).
-
-    Attributes:
-        revolute_logit: above zero where the joint turns rather than slides.
-        slide_axis: unit direction of sliding.
-        turn_axis: unit direction of the axis of turning.
-        foot: from the entity to the nearest point of the axis of turning.
-        spread: scales of the Laplace-like errors of the two directions and of ``foot``.
-    """
+    """The network's belief about one query's joint in one frame (see :class:`~quest.model.joint_head.JointBelief`)."""
 
     revolute_logit: float
+    """Above zero where the joint turns rather than slides."""
     slide_axis: Float[np.ndarray, "3"]
+    """Unit direction of sliding."""
     turn_axis: Float[np.ndarray, "3"]
+    """Unit direction of the axis of turning."""
     foot: Float[np.ndarray, "3"]
+    """From the entity to the nearest point of the axis of turning."""
     spread: Float[np.ndarray, "3"]
+    """Scales of the Laplace-like errors of the two directions and of ``foot``."""
 
 
 def joint_rows(belief: JointBelief) -> list[BeliefRow]:

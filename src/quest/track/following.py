@@ -21,15 +21,12 @@ _SAFE_EVERY = 10
 
 @dataclass(frozen=True)
 class Safe:
-    """What was known of a query while nothing spoke against it.
-
-    Attributes:
-        ground: a copy of its joint.
-        place: where it was, reference frame.
-    """
+    """What was known of a query while nothing spoke against it."""
 
     ground: Ground
+    """A copy of its joint."""
     place: Float[np.ndarray, "3"]
+    """Where it was, reference frame."""
 
 
 @dataclass(frozen=True)
@@ -47,55 +44,52 @@ class Answer:
 
 @dataclass
 class Following:
-    """One query that has found its entity; everything in the reference frame of the stream.
-
-    Attributes:
-        query: its number.
-        name: what to call it.
-        label: its label, if known.
-        intent: what it is taken hold of for, if known.
-        slot: index of its learned query, for networks that have them.
-        ground: its joint.
-        belief: over the cells of the newest frame (K = 1).
-        place: where it was at the newest frame.
-        home: where it was first.
-        held: whether that is where its joint holds it, unseen.
-        buried: whether it was hidden behind something that came before it, and has not been seen since.
-        refused: frames in a row in which it was said to be seen off its joint, and was held instead.
-        born: the query's embedding in its first frame.
-        safe: copies from before, the older one first.
-        since_safe: frames since the last copy.
-        doubted: whether it was seen in a wrong place when an alarm was raised, so that it is held and searched.
-        good: frames in a row, with an alarm open, in which what is seen matches the anchor.
-        answer: what was said of it in the newest frame.
-        bound_px: the pixel of the network's input at which it was bound, until it is matched for the first time.
-        asked_px: the user's pixel in the network's input, until the first answer.
-        mark: from where it was first to the point under the user's pixel, reference frame; None if there was none.
-        mark_px: the same in pixels of the network's input, for what has no place; None if there was none.
-    """
+    """One query that has found its entity; everything in the reference frame of the stream."""
 
     query: int
+    """Its number."""
     name: str
+    """What to call it."""
     label: str | None
+    """Its label, if known."""
     slot: int | None
+    """Index of its learned query, for networks that have them."""
     ground: Ground
+    """Its joint."""
     intent: str | None = None
+    """What it is taken hold of for, if known."""
     belief: Belief | None = None
+    """Over the cells of the newest frame (K = 1)."""
     place: Float[np.ndarray, "3"] | None = None
+    """Where it was at the newest frame."""
     home: Float[np.ndarray, "3"] | None = None
+    """Where it was first."""
     held: bool = False
+    """Whether that is where its joint holds it, unseen."""
     buried: bool = False
+    """Whether it was hidden behind something that came before it, and has not been seen since."""
     refused: int = 0
+    """Frames in a row in which it was said to be seen off its joint, and was held instead."""
     born: Float[Tensor, " D"] | None = None
+    """The query's embedding in its first frame."""
     safe: deque[Safe] = field(default_factory=lambda: deque(maxlen=2))
+    """Copies from before, the older one first."""
     since_safe: int = 0
+    """Frames since the last copy."""
     doubted: bool = False
+    """Whether it was seen in a wrong place when an alarm was raised, so that it is held and searched."""
     good: int = 0
+    """Frames in a row, with an alarm open, in which what is seen matches the anchor."""
     answer: Answer | None = None
+    """What was said of it in the newest frame."""
     bound_px: Float[Tensor, "2"] | None = None
+    """The pixel of the network's input at which it was bound, until it is matched for the first time."""
     asked_px: Float[Tensor, "2"] | None = None
+    """The user's pixel in the network's input, until the first answer."""
     mark: Float[np.ndarray, "3"] | None = None
+    """From where it was first to the point under the user's pixel, reference frame; None if there was none."""
     mark_px: Float[np.ndarray, "2"] | None = None
+    """The same in pixels of the network's input, for what has no place; None if there was none."""
 
     def forget_places(self, config: TrackerConfig) -> None:
         """Begin anew in another reference frame."""

@@ -40,21 +40,18 @@ _SAME_AXIS = 0.1
 
 @dataclass(frozen=True)
 class Curve:
-    """Where a joint can bring a query.
-
-    Attributes:
-        log_weight: logarithm of the probability of this joint.
-        joint: the joint.
-        q: samples of its coordinate.
-        point: the curve there.
-        spread: standard deviation of the curve there.
-    """
+    """Where a joint can bring a query."""
 
     log_weight: float
+    """Logarithm of the probability of this joint."""
     joint: Joint
+    """The joint."""
     q: Float[np.ndarray, " M"]
+    """Samples of its coordinate."""
     point: Float[np.ndarray, "M 3"]
+    """The curve there."""
     spread: Float[np.ndarray, " M"]
+    """Standard deviation of the curve there."""
 
 
 @dataclass(eq=False)

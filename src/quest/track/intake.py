@@ -39,26 +39,23 @@ class Arrival(Enum):
 
 @dataclass
 class IntakeState:
-    """What the next frame of a stream depends on.
-
-    Attributes:
-        reference: the reference frame; None before the first frame.
-        elapsed: time since the frame before in frames of 30 per second, within 1 to 10.
-        now: time of the newest frame in frames of 30 per second: the sum of what passed between frames, at least 1
-            each, however long it was.
-        flags: degradations of the newest frame, in words.
-        stamp_s: of the newest frame; None before the first.
-        pose: ``cam_from_world`` of the newest frame that had one.
-        digest: of the colours of the newest frame.
-    """
+    """What the next frame of a stream depends on."""
 
     reference: Reference | None = None
+    """The reference frame; None before the first frame."""
     elapsed: float = 1.0
+    """Time since the frame before in frames of 30 per second, within 1 to 10."""
     now: float = 0.0
+    """Time of the newest frame in frames of 30 per second: the sum of what passed between frames, at least 1 each,
+    however long it was."""
     flags: tuple[str, ...] = ()
+    """Degradations of the newest frame, in words."""
     stamp_s: float | None = None
+    """Of the newest frame; None before the first."""
     pose: Float[np.ndarray, "4 4"] | None = None
+    """``cam_from_world`` of the newest frame that had one."""
     digest: str = ""
+    """Of the colours of the newest frame."""
 
 
 class Intake:

@@ -36,25 +36,22 @@ _RATHER_SURE = 0.5
 
 @dataclass(frozen=True)
 class Placed:
-    """Where K queries are in a frame, reference frame.
-
-    Attributes:
-        point: the answers; NaN where nothing is known.
-        judged: the places that are to be judged: the answers, but what the search sees where an identity is in doubt.
-        seen: probability that each is seen.
-        held: whether the answer is held without being seen.
-        trusted: whether the answer was seen and taken for right.
-        residual: distance of the candidate to the joint's curve in standard deviations, NaN where unknown.
-        room: how far what is seen at the judged place lies behind it; NaN until queries of a link have shared.
-    """
+    """Where K queries are in a frame, reference frame."""
 
     point: Float[np.ndarray, "K 3"]
+    """The answers; NaN where nothing is known."""
     judged: Float[np.ndarray, "K 3"]
+    """The places that are to be judged: the answers, but what the search sees where an identity is in doubt."""
     seen: Float[np.ndarray, " K"]
+    """Probability that each is seen."""
     held: Bool[np.ndarray, " K"]
+    """Whether the answer is held without being seen."""
     trusted: Bool[np.ndarray, " K"]
+    """Whether the answer was seen and taken for right."""
     residual: Float[np.ndarray, " K"]
+    """Distance of the candidate to the joint's curve in standard deviations, NaN where unknown."""
     room: Float[np.ndarray, " K"]
+    """How far what is seen at the judged place lies behind it; NaN until queries of a link have shared."""
 
 
 class Placer:

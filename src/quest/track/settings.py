@@ -14,49 +14,45 @@ REVISION = 9
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Settings of tracking.
-
-    Attributes:
-        move_sigma: how far an entity may move between frames, reference units (half the width of the view).
-        jump: probability that it is anywhere else, which lets a wrong belief recover.
-        temperature: divides the scores of the heatmap; above 1 trusts a single frame less.
-        lift_tolerance: largest distance between the lifted pixel and the predicted point for the pixel's depth to
-            be taken, reference units; beyond it the pixel lies on something before or behind the entity.
-        hold_below: probability of being seen below which an entity is taken to be hidden.
-        ground: whether queries are grounded in the motion of their joint.
-        point_sigma: standard deviation of a seen point per coordinate, reference units.
-        joint_sigma: how far from its joint's curve a cell of the entity may lie, reference units.
-        off_joint: log weight of cells that the joint does not reach, which lets a wrong joint recover.
-        along_sigma: how far a hidden entity moves along its joint between frames, reference units (twice that in
-            radians).
-        hidden_trust: how much the heatmap says of a hidden entity's place along its joint.
-        found_below: probability of a lost identity below which a search has found its entity.
-        found_frames: how many frames in a row it must be that low.
-        slot_bias: added to the affordance logit, so that slots worth keeping have a confidence above one half.
-        slot_gain: multiplies the affordance logit.
-        slot_threshold: probability above which discovery takes a slot.
-        prompt_threshold: probability above which a prompt takes a slot; lower, because the user says it is there.
-        slot_radius_cells: peaks of one label closer than this are one slot.
-    """
+    """Settings of tracking."""
 
     move_sigma: float = 0.1
+    """How far an entity may move between frames, reference units (half the width of the view)."""
     jump: float = 0.0003
+    """Probability that it is anywhere else, which lets a wrong belief recover."""
     temperature: float = 2.0
+    """Divides the scores of the heatmap; above 1 trusts a single frame less."""
     lift_tolerance: float = 0.08
+    """Largest distance between the lifted pixel and the predicted point for the pixel's depth to be taken, reference
+    units; beyond it the pixel lies on something before or behind the entity."""
     hold_below: float = 0.3
+    """Probability of being seen below which an entity is taken to be hidden."""
     ground: bool = True
+    """Whether queries are grounded in the motion of their joint."""
     point_sigma: float = 0.04
+    """Standard deviation of a seen point per coordinate, reference units."""
     joint_sigma: float = 0.06
+    """How far from its joint's curve a cell of the entity may lie, reference units."""
     off_joint: float = -2.0
+    """Log weight of cells that the joint does not reach, which lets a wrong joint recover."""
     along_sigma: float = 0.03
+    """How far a hidden entity moves along its joint between frames, reference units (twice that in radians)."""
     hidden_trust: float = 0.5
+    """How much the heatmap says of a hidden entity's place along its joint."""
     found_below: float = 0.2
+    """Probability of a lost identity below which a search has found its entity."""
     found_frames: int = 3
+    """How many frames in a row it must be that low."""
     slot_bias: float = 0.0
+    """Added to the affordance logit, so that slots worth keeping have a confidence above one half."""
     slot_gain: float = 1.0
+    """Multiplies the affordance logit."""
     slot_threshold: float = 0.5
+    """Probability above which discovery takes a slot."""
     prompt_threshold: float = 0.2
+    """Probability above which a prompt takes a slot; lower, because the user says it is there."""
     slot_radius_cells: float = RADIUS_CELLS
+    """Peaks of one label closer than this are one slot."""
 
     def __post_init__(self) -> None:
         widths = (self.move_sigma, self.point_sigma, self.joint_sigma, self.along_sigma, self.temperature)

@@ -26,15 +26,12 @@ from quest.types import LABELS
 
 @dataclass(frozen=True)
 class Slots:
-    """What all slots say of the newest frame.
-
-    Attributes:
-        prediction: their answers (B = T = 1).
-        label_p: probability of every label.
-    """
+    """What all slots say of the newest frame."""
 
     prediction: Prediction
+    """Their answers (B = T = 1)."""
     label_p: Float[Tensor, "Q L"]
+    """Probability of every label."""
 
     def existence(self, config: TrackerConfig) -> list[float]:
         """Probability that each holds an entity."""

@@ -43,29 +43,26 @@ nearer in the mean, wrong as it may be: what is lost has often only drifted, and
 
 @dataclass
 class Memory:
-    """Everything that the next answers depend on, in bounded size; callbacks are left out.
-
-    Attributes:
-        intake: of the frames that came.
-        binding: of the queries' anchors, and of queries without one.
-        ring: the newest T frames as observed.
-        monitor: None where nothing is watched.
-        following: queries that have found their entity.
-        links: which of them share a joint.
-        frame: index of the next frame.
-        stamp_s: time of the newest frame.
-        has_depth: whether the newest frame brought any depth.
-    """
+    """Everything that the next answers depend on, in bounded size; callbacks are left out."""
 
     intake: IntakeState
+    """Of the frames that came."""
     binding: BindingState
+    """Of the queries' anchors, and of queries without one."""
     ring: deque[Observation]
+    """The newest T frames as observed."""
     monitor: MonitorState | None
+    """None where nothing is watched."""
     following: list[Following] = field(default_factory=list)
+    """Queries that have found their entity."""
     links: LinkGroups = field(default_factory=lambda: LinkGroups(SIGMA))
+    """Which of them share a joint."""
     frame: int = 0
+    """Index of the next frame."""
     stamp_s: float = 0.0
+    """Time of the newest frame."""
     has_depth: bool = False
+    """Whether the newest frame brought any depth."""
 
 
 class Stream:

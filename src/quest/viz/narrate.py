@@ -44,21 +44,18 @@ def narrate(tracks: Tracks) -> list[str]:
 
 @dataclass(frozen=True)
 class _Way:
-    """How far something is from its first place, frame by frame, and how to say so.
-
-    Attributes:
-        verb: what it did, such as ``turned``.
-        gone: signed, in ``unit``; NaN where unknown.
-        unit: written behind a number.
-        digits: behind the point.
-        least: what is less counts as rest.
-    """
+    """How far something is from its first place, frame by frame, and how to say so."""
 
     verb: str
+    """What it did, such as ``turned``."""
     gone: Float[np.ndarray, " T"]
+    """Signed, in ``unit``; NaN where unknown."""
     unit: str
+    """Written behind a number."""
     digits: int
+    """Behind the point."""
     least: float
+    """What is less counts as rest."""
 
     def words(self, value: float) -> str:
         return f"{abs(value):.{self.digits}f}{self.unit}"
