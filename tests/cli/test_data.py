@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from quest.cli import main as program
-from quest.cli.data_stats import finite
+from quest.cli.data import finite
 from quest.cli.takes import write_picture
 from quest.data.store import TakeStore
 from quest.data.verify import Check

@@ -1,19 +1,279 @@
-"""``quest data``: look at takes, check them, and hand them to others."""
+"""``quest data``: look at takes, check them, say what is in a store, and hand takes to others in their formats."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import itertools
+import math
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
+from quest.cli.progress import counting
 from quest.wording import counted
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from quest.data.stats import Spread, StoreStats
     from quest.data.store import TakeStore
+    from quest.data.verify import StoreReport
+    from quest.types import Take
+
+
+@dataclass(frozen=True)
+class DataExport:
+    """Write takes as TAPVid-3D examples, a LeRobot dataset, or MCAP recordings.
+
+    Exit code 1 if takes of the store cannot be read and were omitted.
+    """
+
+    takes: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of a store, or of one take (STORE/NAME.zarr)."""
+
+    out: Path
+    """Folder to write into: one .npz per view (tapvid3d), one dataset (lerobot), one .mcap per view (mcap)."""
+
+    format: Literal["tapvid3d", "lerobot", "mcap"] = "tapvid3d"
+    """Format of the files."""
+
+    def run(self) -> int:
+        """Write, and print the files."""
+        from quest.cli.takes import open_takes, say_corrupt, say_omitted
+        from quest.errors import TakeError
+
+        store, names = open_takes(self.takes)
+        chosen = store.names() if names is None else names
+        if not chosen:
+            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+        corrupt = 0 if names is not None else say_corrupt([store])
+        if self.format == "lerobot":
+            self._write_dataset(store, chosen)
+            return 1 if corrupt else 0
+        write = _write_tapvid3d if self.format == "tapvid3d" else _write_mcap
+        for name in chosen:
+            try:
+                take = store.read(name)
+            except TakeError as error:
+                if names is not None:
+                    raise
+                corrupt += say_omitted(str(error))
+                continue
+            for path in write(take, self.out):
+                print(path)
+        return 1 if corrupt else 0
+
+    def _write_dataset(self, store: TakeStore, names: list[str]) -> None:
+        """One episode per take, with as many places for joints and entities as the take with the most has."""
+        from quest.data.lerobot_export import Episode, export_lerobot
+        from quest.types import LABELS
+
+        infos = [store.header(name).info for name in names]
+        episodes = export_lerobot(
+            (Episode.of_take(store.read(name)) for name in names),
+            self.out,
+            joints=max(len(info.joints) for info in infos),
+            entities=max(sum(entity.label in LABELS for entity in info.entities) for info in infos),
+        )
+        print(f"{self.out}: {counted(episodes, 'episode')}")
+
+
+def _write_tapvid3d(take: Take, folder: Path) -> list[Path]:
+    from quest.data.export_tapvid3d import export_tapvid3d
+
+    return export_tapvid3d(take, folder)
+
+
+def _write_mcap(take: Take, folder: Path) -> list[Path]:
+    """One file per view, with the true tracks beside the images."""
+    from quest.data.lerobot_export import Episode
+    from quest.data.mcap_export import export_mcap
+
+    tracks, written = Episode.of_take(take).tracks, []
+    for v, view in enumerate(take.views):
+        written.append(folder / f"{take.info.name}-v{v}.mcap")
+        export_mcap(view.clip, written[-1], tracks=tracks[f"view_{v}"])
+    return written
+
+
+@dataclass(frozen=True)
+class DataStats:
+    """Count the takes of a store, the share that is visible, the motion, and the missing depth."""
+
+    store: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of takes."""
+
+    json: Path | None = None
+    """Also write the numbers to this file."""
+
+    def run(self) -> int:
+        """Print a table; returns 0."""
+        from rich.console import Console
+        from rich.table import Table
+
+        from quest.cli.takes import open_store, wide_console
+        from quest.data.stats import store_stats
+        from quest.evaluation.report import write_report
+
+        store = open_store(self.store)
+        with counting(Console(stderr=True), "reading", None, "takes") as report:
+            found = store_stats(store, report=report)
+        if self.json is not None:
+            write_report(finite(asdict(found)), self.json)
+        table = Table(box=None, show_header=False)
+        table.add_column(no_wrap=True, style="dim")
+        table.add_column(overflow="fold")
+        for name, value in _rows(found):
+            table.add_row(name, value)
+        wide_console().print(table)
+        return 0
+
+
+def _rows(found: StoreStats) -> Iterator[tuple[str, str]]:
+    unreadable = f"; {found.unreadable} cannot be read" if found.unreadable else ""
+    yield "takes", f"{found.takes} of {counted(found.objects, 'object')}{unreadable}"
+    yield (
+        "frames",
+        f"{found.frames} in {counted(found.views, 'view')}, {found.hours:.2f} hours, pixels: {_counts(found.image_px)}",
+    )
+    yield "on disk", f"{found.stored_bytes / 1e9:.3f} GB"
+    for name in ("sources", "categories", "levels", "suites"):
+        yield name, _counts(getattr(found, name))
+    yield "entities", _counts(found.labels)
+    yield "moving cameras", f"{found.moving_cameras} of {found.views} views"
+    yield (
+        "depth",
+        (
+            f"{found.with_depth_sensor} of {found.takes} takes through a sensor model; missing in "
+            f"{_percent(found.depth_missing_share)} of all pixels and "
+            f"{_percent(found.depth_missing_share_on_object)} of the objects'"
+        ),
+    )
+    labels = ", ".join(f"{label} {_percent(share)}" for label, share in found.visible_share_by_label.items())
+    yield (
+        "visible",
+        f"{_percent(found.visible_share)} of frames, entities and views" + (f" ({labels})" if labels else ""),
+    )
+    yield "never seen", f"{_percent(found.never_seen)} of entities and views"
+    yield "moved", f"{_percent(found.moved_share)} of entities, by more than 0.1 normalised units"
+    yield "motion", f"{_spread(found.motion)} normalised units; {_spread(found.motion_m)} m"
+    yield "object diagonal", f"{_spread(found.diagonal_m)} m"
+    yield "camera to entity", f"{_spread(found.distance_m)} m"
+    yield "", "ranges: median (10 % to 90 %; least to most)"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} ({count})" for name, count in counts.items()) or "none"
+
+
+def _percent(share: float) -> str:
+    return "?" if math.isnan(share) else f"{100 * share:.1f} %"
+
+
+def _spread(s: Spread) -> str:
+    return f"{s.median:.2f} ({s.low:.2f} to {s.high:.2f}; {s.least:.2f} to {s.most:.2f})" if s.n else "?"
+
+
+def finite(value: Any) -> Any:
+    """The same for JSON, which has neither NaN nor infinity: null instead."""
+    if isinstance(value, Mapping):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+@dataclass(frozen=True)
+class DataVerify:
+    """Check takes: hashes, re-projection, rigid links, joints, flow, velocities, visibility, masks."""
+
+    takes: Annotated[str, tyro.conf.Positional]
+    """Folder or URL of a store, or of one take (STORE/NAME.zarr)."""
+
+    json: Path | None = None
+    """Also write to this file which takes pass, why the others fail, and the worst of each check."""
+
+    def run(self) -> int:
+        """Print a table of the worst of each check; returns 1 if a take fails."""
+        from rich.console import Console
+
+        from quest.cli.takes import open_takes
+        from quest.data.verify import TakeReport, verify_store
+        from quest.errors import TakeError
+
+        store, names = open_takes(self.takes)
+        chosen = names if names is not None else sorted({*store.names(), *store.problems()})
+        if not chosen:
+            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+        errors = Console(stderr=True, highlight=False, markup=False)
+        with counting(errors, "verifying", len(chosen), "takes") as report:
+            done = itertools.count(1)
+
+            def checked(take: TakeReport) -> None:
+                if not take.passed:
+                    errors.print(take.message(), style="red", soft_wrap=True)
+                report(next(done))
+
+            found = verify_store(store, chosen, report=checked)
+        if self.json is not None:
+            _write(found, store, self.json)
+        _print(found)
+        return 0 if found.passed else 1
+
+
+def _print(found: StoreReport) -> None:
+    from rich.table import Table
+
+    from quest.cli.takes import wide_console
+
+    table = Table(box=None)
+    for title in ("check", "worst", "at most", "failed takes", "where the worst is"):
+        table.add_column(title, overflow="fold", no_wrap=title == "check")
+    for name in found.check_names():
+        worst = found.worst(name)
+        assert worst is not None
+        take, check = worst
+        failed = sum(not c.passed for report in found.takes for c in [report.worst(name)] if c is not None)
+        where = f"{take}: {check.where}" if check.worst > 0 else ""
+        unit = f" {check.unit}" if check.unit else ""
+        style = "red" if failed else None
+        table.add_row(name, f"{check.worst:.3g}{unit}", f"{check.limit:.3g}{unit}", str(failed), where, style=style)
+    console = wide_console()
+    if table.row_count:
+        console.print(table)
+    frames = sum(report.frames * report.views for report in found.takes)
+    console.print(
+        f"{len(found.takes) - len(found.failed)} of {counted(len(found.takes), 'take')} pass, "
+        f"{counted(frames, 'frame')}",
+        style="green" if found.passed else "bold red",
+    )
+
+
+def _write(found: StoreReport, store: TakeStore, path: Path) -> None:
+    from quest.data.provenance import code_commit, combined_hash, command_line, machine
+    from quest.evaluation.report import write_report
+
+    headers = store.headers()
+    known = {report.name: headers[report.name] for report in found.takes if report.name in headers}
+    worst = {name: pair for name in found.check_names() if (pair := found.worst(name)) is not None}
+    result = {
+        "passed": found.passed,
+        "n_takes": len(found.takes),
+        "n_frames": sum(report.frames * report.views for report in found.takes),
+        "suites": dict(Counter(header.info.suite for header in known.values()).most_common()),
+        "failed": {report.name: report.message() for report in found.failed},
+        "worst": {name: {"take": take, **asdict(check)} for name, (take, check) in worst.items()},
+        "takes": {report.name: report.passed for report in found.takes},
+        "data_hash": combined_hash((name, header.data_hash) for name, header in known.items()),
+        "commit": code_commit(),
+        "machine": machine(),
+        "command": command_line(),
+    }
+    write_report(finite(result), path)
+
 
 MOST_FRAMES_SHOWN = 600
 

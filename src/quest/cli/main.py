@@ -90,9 +90,9 @@ COMMANDS: dict[str, Entry | Group] = {
         {
             "ls": Entry("data", "DataLs", "List the takes of a store."),
             "show": Entry("data", "DataShow", "Draw a take or a store, or write a Rerun recording."),
-            "stats": Entry("data_stats", "DataStats", "Count the takes, entities and motions of a store."),
-            "verify": Entry("data_verify", "DataVerify", "Check the ground truth of takes."),
-            "export": Entry("data_export", "DataExport", "Write takes as TAPVid-3D, LeRobot or MCAP."),
+            "stats": Entry("data", "DataStats", "Count the takes, entities and motions of a store."),
+            "verify": Entry("data", "DataVerify", "Check the ground truth of takes."),
+            "export": Entry("data", "DataExport", "Write takes as TAPVid-3D, LeRobot or MCAP."),
         },
     ),
     "objects": Group(
