@@ -38,6 +38,7 @@ class Track(Source):
         self.check_alpha()
         console = Console(highlight=False, soft_wrap=True)
         console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
+        from quest.viz.narrate import narrate
         from quest.viz.overlay import write_overlay
         from quest.viz.rerun_tracks import check_viewer, open_tracks, save_tracks
 
