@@ -12,6 +12,8 @@ BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 CHECK_RENDERER := $(BIN)/python -c "from quest.render_device import prepare_renderer; prepare_renderer()"
 
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
 .PHONY: demo test lint format types pytest render-deps clean help
@@ -35,13 +37,13 @@ format: $(ALL)
 	$(BIN)/ruff format
 
 types: $(ALL)
-	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/pyright --threads $(WORKERS) --pythonpath $(BIN)/python
 
-# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do. What kills
-# processes, starts clusters or trains runs in the second only.
+# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do. What is
+# dear runs once: slow tests and those of commands and documents (plain) without the checks, pictures with them.
 pytest: $(ALL) render-deps
-	$(BIN)/python -m pytest -n $(WORKERS) --jaxtyping-packages=quest,beartype.beartype -m "not slow"
-	$(BIN)/python -m pytest -n $(WORKERS)
+	$(PYTEST) --jaxtyping-packages=quest,beartype.beartype -m "not slow and not plain"
+	$(PYTEST) -m "not render or slow or plain"
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \

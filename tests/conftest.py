@@ -23,11 +23,22 @@ settings.register_profile("quest", deadline=None, derandomize=True, database=Non
 settings.load_profile("quest")
 
 
+PLAIN = ("cli", "test_api_surface.py", "test_cli.py", "test_documented_names.py", "test_examples.py", "test_readme.py")
+"""Tests of commands and documents: they pass no arrays themselves, so the shape checks have nothing to say to them."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``partnet`` and ``render`` where the objects or the renderer are missing."""
+    """Mark what runs once; keep on one worker what is dear to set up; skip what this machine cannot do.
+
+    The first picture of a process compiles shaders for half a minute of processor time.
+    """
     no_objects = None if _partnet_root() else "no PartNet-Mobility objects: set QUEST_OBJECTS"
     no_renderer = _why_no_renderer() if any(item.get_closest_marker("render") for item in items) else None
     for item in items:
+        if item.path.relative_to(Path(__file__).parent).parts[0] in PLAIN:
+            item.add_marker("plain")
+        if item.get_closest_marker("render") or "cluster" in getattr(item, "fixturenames", ()):
+            item.add_marker(pytest.mark.xdist_group("render"))
         if no_objects and item.get_closest_marker("partnet"):
             item.add_marker(pytest.mark.skip(reason=no_objects))
         if no_renderer and item.get_closest_marker("render"):

@@ -40,6 +40,7 @@ def unit_m(clip: Clip) -> float:
     return 1.0
 
 
+@pytest.mark.slow
 def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, take: Take) -> None:
     monkeypatch.setattr(quest, "load", lambda weights: make_tracker(flow=True), raising=False)
     names = (*TRACKERS, "quest")

@@ -258,6 +258,7 @@ for i in range(10_000):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_a_killed_writer_leaves_whole_takes_or_nothing(tmp_path: Path, take: Take):
     root = Path(__file__).resolve().parents[2]

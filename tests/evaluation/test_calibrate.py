@@ -30,6 +30,7 @@ def fitted(streams: list[StreamRecord]) -> Fitted:
     return fit_calibration(streams, config=QUICK)
 
 
+@pytest.mark.slow
 def test_what_is_fitted_holds_on_other_objects(fitted: Fitted):
     """Cross-validated numbers are near those on new objects, and far better than the network's own confidence."""
     test = make_streams(150, first=1000, part="test")

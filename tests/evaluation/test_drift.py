@@ -239,6 +239,7 @@ def test_false_alarms_keep_the_promise():
         assert row.alarms[0].missed is row.auroc is None
 
 
+@pytest.mark.slow
 def test_false_alarms_in_so_many_frames_keep_the_promise():
     """Alpha is for 40 frames, streams have 120: any part of a stream alarms as rarely as the first."""
     streams = make_streams(1500, losses=0.0, queries=2, frames=120)

@@ -73,6 +73,7 @@ def judged(folder: Path, **changes: object) -> int:
     return replace(command, **changes).run()  # type: ignore[arg-type]
 
 
+@pytest.mark.slow
 def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
     before = load_network(folder / "w.safetensors")
     assert before.monitor is None
@@ -126,6 +127,7 @@ def test_objects_of_the_calibration_are_not_judged(folder: Path):
         calibrated(folder, block_frames=0)
 
 
+@pytest.mark.slow
 def test_a_monitor_of_takes_is_judged_by_other_takes(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):

@@ -46,6 +46,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> TakeStore:
     return store
 
 
+@pytest.mark.slow
 def test_handles_that_stand_out_are_learned(store: TakeStore):
     tracker, told = make_tracker(), []
     takes: dict[str, SplitPart] = dict.fromkeys(store.names(), "train")

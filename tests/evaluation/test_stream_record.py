@@ -173,6 +173,7 @@ def test_damaged_files(tmp_path: Path):
         read_records(tmp_path, made_by="me")
 
 
+@pytest.mark.slow
 def test_takes_that_were_made_again_are_recorded_again(
     store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):

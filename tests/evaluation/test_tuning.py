@@ -47,6 +47,7 @@ def test_the_best_value_of_every_setting_is_kept(store: TakeStore, monkeypatch: 
     assert np.isfinite([t.ape for t in told]).all()
 
 
+@pytest.mark.slow
 def test_takes_of_a_suite_count_as_much_as_ordinary_ones(store: TakeStore, tmp_path: Path, monkeypatch):
     """However many there are: the mean is over sources and suites, and over every frame within them."""
     monkeypatch.setattr(tuning, "GRID", {"jump": (0.001,)})

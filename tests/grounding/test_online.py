@@ -63,6 +63,7 @@ def test_another_belief_counts_at_once():
     JointEstimator(0.01).believe(turns)  # nothing to fit yet
 
 
+@pytest.mark.slow
 def test_outliers_do_not_crowd_out_the_motion():
     """Every fifth point is wrong by decimetres, for far more frames than are kept."""
     points, axis, _ = make_track(JointKind.REVOLUTE, amount=1.2, sigma=0.002, seed=2, n=400)

@@ -73,6 +73,7 @@ def test_a_hidden_point_is_where_its_partner_says():
     assert watcher.links.predict(7, {0: tracks[-1, 0]}) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_what_is_opened_one_after_the_other_is_not_joined(seed: int):
     one, other, late = opened(0.3, 10, 50), opened(0.3, 60, 110), opened(0.3, 35, 110)
@@ -96,6 +97,7 @@ def test_drawers_that_move_at_the_same_time_are_joined_until_one_moves_alone():
     assert partners[-1] == ()
 
 
+@pytest.mark.slow
 def test_three_on_a_drawer_one_still_and_one_elsewhere():
     one, other = opened(0.3, 10, 60), opened(0.3, 55, 110)
     watcher, _ = watch(noisy(drawers(3, one, one, one, other, np.zeros(FRAMES)), 3))

@@ -116,6 +116,7 @@ def test_the_network_displaces(config: NetworkConfig):
         make_network(config).displace(prediction)
 
 
+@pytest.mark.slow
 def test_it_learns_to_go_on():
     """Steady motion of any size and direction goes on, rest stays rest; embeddings tell nothing here."""
     torch.manual_seed(0)

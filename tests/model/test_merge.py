@@ -28,6 +28,7 @@ def write(path: Path, config: NetworkConfig = DEFAULT, *, add: float = 0.0, to: 
     return load_network(path)
 
 
+@pytest.mark.slow
 def test_the_map_is_the_mean_and_the_rest_stays(tmp_path: Path):
     base, low, high = (write(tmp_path / f"{add}.safetensors", add=add) for add in (0.0, 1.0, 4.0))
     merged = merge(base, maps=[low, low, high])

@@ -1,6 +1,8 @@
 """A program that trains a tiny network on prepared views: the tests of many processes run it as it is or by torchrun.
 
-python tests/train/processes.py CACHE OUT DEVICES ACCUMULATE
+python tests/train/processes.py CACHE OUT DEVICES ACCUMULATE...
+
+One run for every ACCUMULATE, in ``OUT/ACCUMULATE``.
 """
 
 from __future__ import annotations
@@ -50,4 +52,5 @@ def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[floa
 
 
 if __name__ == "__main__":
-    train(Path(sys.argv[1]), Path(sys.argv[2]), devices=int(sys.argv[3]), accumulate=int(sys.argv[4]))
+    for accumulate in sys.argv[4:]:
+        train(Path(sys.argv[1]), Path(sys.argv[2]) / accumulate, devices=int(sys.argv[3]), accumulate=int(accumulate))

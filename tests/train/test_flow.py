@@ -65,6 +65,7 @@ def test_heads_come_and_go(config: NetworkConfig):
         assert torch.equal(back.state_dict()[name], tensor), name
 
 
+@pytest.mark.slow
 def test_stage_two_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A file with a flow head that otherwise is the one it came from, calibration included; stage 1 drops the head."""
     save_network(tmp_path / "one.safetensors", make_network(), settings="{}", about="one", monitor="{}")

@@ -59,6 +59,7 @@ def test_what_is_known_of_enlarged_images_is_what_the_network_would_find():
     assert not torch.allclose(other.logits, expected.logits)
 
 
+@pytest.mark.slow
 def test_only_the_map_learns_and_it_does(tmp_path: Path):
     network = with_own_map(make_network(OLD))
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
@@ -110,6 +111,7 @@ def test_an_own_map_begins_with_what_the_network_knows():
         with_own_map(make_network(PAPER))
 
 
+@pytest.mark.slow
 def test_stage_map_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """A file that discovers otherwise and tracks the same, calibration included."""
     save_network(tmp_path / "one.safetensors", make_network(OLD), settings="{}", about="one", monitor="{}")

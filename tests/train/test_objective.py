@@ -127,6 +127,7 @@ def test_is_right_against_a_plain_loop(samplers):
     assert not right[0, :, 0].any()
 
 
+@pytest.mark.slow
 @BOTH
 def test_a_tiny_set_can_be_learned_by_heart(samplers, config: NetworkConfig):
     network, frames, truth = draw(samplers, config)

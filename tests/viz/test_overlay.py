@@ -113,6 +113,7 @@ def test_odd_tracks_are_drawn(take: Take, tracks: Tracks, what: str):
     assert painter.frame(9).shape == (painter.size[1], painter.size[0], 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(333, 251), (60, 90), (1300, 902)])
 def test_any_size_becomes_even(tracks: Tracks, size: tuple[int, int]):
     take = make_take(frames=1, views=1, size=size)
