@@ -1,0 +1,214 @@
+"""Clips whose answers are known: what the tracker says of them with the weights that ship, and how good it is.
+
+A clip is one line of :data:`CLIPS`. A simulated one has its truth beside it; of every clip the answers and signals that
+were recorded lie in ``NAME/answers.npz``, how far off they were in ``NAME/figures.json``. ``python -m tests.golden``
+makes all of these files.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+import quest
+from quest import Clip, Query, Tracker, Tracks
+from quest.data.recording import read_recording
+from quest.data.sample import sample_folder
+from quest.track.tracker import collect
+
+HERE = Path(__file__).parent
+WEIGHTS = ("quest-s16-research", "quest-s16-apache")
+
+
+@dataclass(frozen=True)
+class GoldenClip:
+    """A clip and how it is followed."""
+
+    name: str
+    length: int | None = None
+    """How many of its frames; None for all."""
+    strides: tuple[int, ...] = (1, 2, 3)
+    """Every so many of them: answers must not hang on the frame rate."""
+    take: tuple[str, int] | None = None
+    """Simulated object and seed, of suite occlusion; None for the clip that is packaged."""
+    entities: tuple[str, ...] = ()
+    """What is asked for by its pixel in the first frame; the first one is hidden meanwhile. If none, what is found."""
+
+    @property
+    def folder(self) -> Path:
+        """Where its golden files lie."""
+        return HERE / self.name
+
+    def read(self) -> Clip:
+        """All its frames."""
+        if self.take is None:
+            clip = read_recording(sample_folder())
+        else:
+            clip = replace(read_recording(self.folder), depth_m=read_depth(self.folder))
+        return cut(clip, slice(self.length))
+
+    def truth(self) -> Truth | None:
+        """What is true of it; None of a packaged clip."""
+        return Truth.read(self.folder) if self.take is not None else None
+
+    def queries(self, truth: Truth | None) -> list[Query] | None:
+        """The entities by their pixels in the first frame; None to follow what is found."""
+        if truth is None:
+            return None
+        at = {name: truth.uv_px[0, truth.index(name)].tolist() for name in self.entities}
+        return [Query.point(0, x, y, name=name) for name, (x, y) in at.items()]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of some entities of a clip."""
+
+    name: np.ndarray
+    """[E] of text."""
+    uv_px: np.ndarray
+    """[T, E, 2], also where hidden."""
+    visible: np.ndarray
+    """[T, E]"""
+    point_world: np.ndarray
+    """[T, E, 3], metres."""
+    joint: np.ndarray
+    """[E]: ``prismatic``, ``revolute``, or ``static`` where nothing moved it."""
+    axis: np.ndarray
+    """[E, 3]: direction of the joint in the world."""
+    half_diagonal_m: np.ndarray
+    """[]: the unit of normalised distances."""
+
+    @classmethod
+    def read(cls, folder: Path) -> Truth:
+        """The truth beside a clip."""
+        with np.load(folder / "truth.npz") as arrays:
+            return cls(**arrays)
+
+    def write(self, folder: Path) -> None:
+        """Put it beside a clip."""
+        np.savez_compressed(folder / "truth.npz", **asdict(self))
+
+    def index(self, name: str) -> int:
+        """Which of the entities has a name."""
+        return list(self.name).index(name)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How good the answer to one query is."""
+
+    median_px: float
+    """Over frames in which the entity is seen."""
+    median_mm: float
+    """Over all frames, seen or hidden."""
+    end_mm: float
+    """In the last frame."""
+    identity: bool
+    """Whether, in the last frame, no other entity is nearer to the answer."""
+    joint: str
+    """Kind of the joint at the end."""
+    axis_deg: float | None
+    """Angle to the true axis; None where there is none, or where the kind is another."""
+
+
+CLIPS = (
+    GoldenClip("sample", length=60, strides=(3,)),
+    GoldenClip("drawer", take=("night_stand-104010", 1), entities=("link_1/knob", "link_0/knob")),
+    GoldenClip("door", take=("sideboard-104012", 1), entities=("link_0/knob", "link_1/knob")),
+)
+
+
+def cut(clip: Clip, frames: slice) -> Clip:
+    """Some frames of a clip."""
+    return replace(
+        clip,
+        rgb=clip.rgb[frames],
+        depth_m=None if clip.depth_m is None else clip.depth_m[frames],
+        stamp_s=clip.stamp_s[frames],
+        cam_from_world=clip.cam_from_world[frames],
+    )
+
+
+def write_depth(folder: Path, depth_m: np.ndarray) -> None:
+    """Millimetres as differences from frame to frame, which are few where the camera stands still."""
+    mm = np.rint(depth_m * 1e3).astype(np.uint16)
+    np.savez_compressed(folder / "depth.npz", change_mm=np.diff(mm, axis=0, prepend=np.zeros_like(mm[:1])))
+
+
+def read_depth(folder: Path) -> np.ndarray:
+    """Depth in metres, [T, H, W]."""
+    with np.load(folder / "depth.npz") as arrays:
+        return np.cumsum(arrays["change_mm"], axis=0, dtype=np.uint16) * np.float32(1e-3)
+
+
+def follow(tracker: Tracker, clip: Clip, queries: list[Query] | None, stride: int) -> tuple[Tracks, np.ndarray]:
+    """Answers to every query of a clip, and the signals [T, K, S] behind them."""
+    clip = cut(clip, slice(None, None, stride))
+    stream, states = tracker.stream(clip.camera, queries), []
+    for t in range(len(clip)):
+        frame = clip.frame(t)
+        states.append(stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world))
+    return collect(states, queries), np.stack([state.signals.values for state in states])
+
+
+def judge(tracks: Tracks, truth: Truth, stride: int) -> dict[str, Figures]:
+    """How good the answers to all queries are."""
+    assert tracks.joints is not None
+    figures = {}
+    for k, name in enumerate(tracks.names):
+        e, kind, axis = truth.index(name), tracks.joints.kind[k], None
+        off_px = np.linalg.norm(tracks.uv_px[:, k] - truth.uv_px[::stride, e], axis=-1)
+        off_m = np.linalg.norm(tracks.point_world[:, k, None] - truth.point_world[::stride], axis=-1)
+        if kind == truth.joint[e] and kind != "static":
+            cosine = abs(float(tracks.joints.axis[k] @ truth.axis[e]))
+            axis = round(float(np.degrees(np.arccos(min(cosine, 1.0)))), 2)
+        figures[name] = Figures(
+            median_px=round(float(np.median(off_px[truth.visible[::stride, e]])), 3),
+            median_mm=round(1e3 * float(np.median(off_m[:, e])), 2),
+            end_mm=round(1e3 * float(off_m[-1, e]), 2),
+            identity=bool(off_m[-1].argmin() == e),
+            joint=kind,
+            axis_deg=axis,
+        )
+    return figures
+
+
+def key(weights: str, stride: int) -> str:
+    """What a run of a clip is called in the golden files."""
+    return f"{weights}/{stride}"
+
+
+RECORDED = ("uv_px", "point_world", "confidence", "visible", "lost_p", "alarm")
+
+
+def arrays_of(tracks: Tracks, signals: np.ndarray) -> dict[str, np.ndarray]:
+    """What is recorded of a run."""
+    assert tracks.joints is not None
+    return {
+        "name": np.array(tracks.names, dtype=np.str_),
+        **{name: np.asarray(getattr(tracks, name)) for name in RECORDED},
+        "joint": np.array(tracks.joints.kind, dtype=np.str_),
+        "axis": tracks.joints.axis,
+        "signals": signals.astype(np.float32),
+    }
+
+
+def read_answers(clip: GoldenClip, weights: str, stride: int) -> dict[str, np.ndarray]:
+    """What was recorded of a run."""
+    prefix = f"{key(weights, stride)}/"
+    with np.load(clip.folder / "answers.npz") as arrays:
+        return {name.removeprefix(prefix): arrays[name] for name in arrays.files if name.startswith(prefix)}
+
+
+def read_figures(clip: GoldenClip, weights: str, stride: int) -> dict[str, Figures]:
+    """How good a run was when the figures were last written."""
+    rows = json.loads((clip.folder / "figures.json").read_text(encoding="utf-8"))[key(weights, stride)]
+    return {name: Figures(**row) for name, row in rows.items()}
+
+
+def load(weights: str) -> Tracker:
+    """The tracker of shipped weights on the CPU."""
+    return quest.load(weights, device="cpu")
