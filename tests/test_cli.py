@@ -107,7 +107,7 @@ def test_help_imports_nothing_heavy():
     assert done.stdout == "[]\n", done.stderr
 
 
-@pytest.mark.parametrize("arguments", [["follow"], ["doctor", "--colour", "red"], ["eval"]])
+@pytest.mark.parametrize("arguments", [["follow"], ["doctor", "--colour", "red"], ["train"]])
 def test_bad_arguments(arguments, capsys):
     with pytest.raises(SystemExit) as stop:
         program.main(arguments)

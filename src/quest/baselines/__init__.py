@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 Inputs = Literal["depth and poses", "depth", "colours"]
 """What of a real recording a tracker is shown."""
 
+EVERYTHING: tuple[Inputs, ...] = ("depth and poses", "depth", "colours")
+
 _REMEMBERED_FRAMES = 1000
 
 
@@ -82,14 +84,14 @@ class Entry:
         return make(name, shared, **self.settings) if self.of_weights else make(**self.settings)
 
 
-def _of_weights(about: str, maker: str, *inputs: Inputs, **settings: Any) -> Entry:
-    return Entry(about, f"of_weights:{maker}", settings, of_weights=True, inputs=inputs or ("depth and poses",))
+def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHING, **settings: Any) -> Entry:
+    return Entry(about, f"of_weights:{maker}", settings, of_weights=True, inputs=inputs)
 
 
 TRACKERS: dict[str, Entry] = {
-    "quest": _of_weights("this tracker", "whole", "depth and poses", "depth", "colours"),
+    "quest": _of_weights("this tracker", "whole"),
     "quest-ungrounded": _of_weights("quest without joints", "ungrounded"),
-    "quest-pixels": _of_weights("quest without depth and joints", "pixels_only"),
+    "quest-pixels": _of_weights("quest without depth and joints", "pixels_only", inputs=("colours",)),
     "redetect": _of_weights("its network without queries, every 4th frame", "redetect", every=4),
     "redetect-1": _of_weights("the same in every frame", "redetect", every=1),
     "flow-chain": _of_weights("its flow head, chained", "flow_chain", noise=0.0),

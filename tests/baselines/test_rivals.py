@@ -1,0 +1,108 @@
+"""The plain rivals on pictures whose motion is known: grids, dense flow, a world that stands still."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+import pytest
+
+from quest.baselines.dense_flow import DenseFlow
+from quest.baselines.hold_still import HoldStill
+from quest.baselines.lucas_kanade import LucasKanade, LucasKanadeGrid, checked_flow, flow
+from quest.baselines.still_world import StillWorld, camera_poses
+from quest.types import Camera, Clip, Query, State
+
+STEP_PX = np.array([1.5, -0.75])
+FRAMES = 10
+
+
+@pytest.fixture
+def shift_clip() -> Clip:
+    """A textured wall at 2 m that a camera passes: all moves by (1.5, -0.75) pixels a frame."""
+    rng = np.random.default_rng(0)
+    image = cv2.GaussianBlur(rng.uniform(0, 255, size=(260, 260, 3)).astype(np.float32), (0, 0), 3)
+    image = np.clip((image - image.mean()) * 6 + 128, 0, 255)
+    shift = STEP_PX * np.arange(FRAMES)[:, None]
+    rgb = [
+        cv2.warpAffine(image, np.array([[1, 0, x - 40], [0, 1, y - 40]], np.float32), (128, 128)).astype(np.uint8)
+        for x, y in shift
+    ]
+    pose = np.tile(np.eye(4), (FRAMES, 1, 1))
+    pose[:, :2, 3] = shift / 100.0 * 2.0
+    depth_m = np.full((FRAMES, 128, 128), 2.0, dtype=np.float32)
+    return Clip(
+        "shift", Camera(100.0, 100.0, 64.0, 64.0, 128, 128), np.stack(rgb), depth_m, np.arange(FRAMES) / 30, pose
+    )
+
+
+QUERIES = [Query.point(0, 50.5, 60.25), Query.point(4, 70.0, 80.0)]
+
+
+def expected(query: Query) -> np.ndarray:
+    assert query.uv_px is not None
+    return query.uv_px + STEP_PX * np.arange(FRAMES - query.frame)[:, None]
+
+
+@pytest.mark.parametrize("tracker", [LucasKanade(), LucasKanadeGrid(), DenseFlow()], ids=lambda t: t.name)
+def test_chained_flow_follows_a_known_shift(shift_clip: Clip, tracker: LucasKanade) -> None:
+    tracks = tracker.track(dataclasses.replace(shift_clip, depth_m=None), QUERIES)
+    for k, query in enumerate(QUERIES):
+        np.testing.assert_allclose(tracks.uv_px[query.frame :, k], expected(query), atol=0.7)
+        assert np.isnan(tracks.uv_px[: query.frame, k]).all()
+        assert tracks.visible[query.frame :, k].all()
+        assert not tracks.visible[: query.frame, k].any()
+
+
+def test_checked_flow_refuses_what_does_not_come_back(shift_clip: Clip) -> None:
+    grey = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in shift_clip.rgb[:2]]
+    covered = grey[1].copy()
+    covered[40:100, 40:100] = np.random.default_rng(1).integers(0, 255, (60, 60))
+    uv_px = np.array([[70.0, 70.0], [20.0, 20.0]], np.float32)
+    end, good = checked_flow(grey[0], covered, uv_px)
+    assert good.tolist() == [False, True]
+    np.testing.assert_array_equal(end[1], flow(grey[0], covered, uv_px)[0][1])
+
+
+def test_a_grid_that_is_covered_waits_and_goes_on(shift_clip: Clip) -> None:
+    rgb = shift_clip.rgb.copy()
+    rgb[3, 40:90, 40:90] = np.random.default_rng(2).integers(0, 255, (50, 50, 3))
+    tracks = LucasKanadeGrid().track(dataclasses.replace(shift_clip, rgb=rgb), [Query.point(0, 60.0, 60.0)])
+    assert tracks.state[3, 0] == State.LOST
+    np.testing.assert_array_equal(tracks.uv_px[3, 0], tracks.uv_px[2, 0])
+    np.testing.assert_array_equal(tracks.point_world[3, 0], tracks.point_world[2, 0])
+    assert tracks.visible[6:, 0].all()
+
+
+def test_a_still_world_needs_no_poses(shift_clip: Clip) -> None:
+    unknown = dataclasses.replace(shift_clip, cam_from_world=np.tile(np.eye(4), (FRAMES, 1, 1)))
+    np.testing.assert_allclose(camera_poses(unknown)[:, :3, 3], shift_clip.cam_from_world[:, :3, 3], atol=0.03)
+    tracks = StillWorld().track(unknown, QUERIES)
+    given = HoldStill("world-given").track(shift_clip, QUERIES)
+    for k, query in enumerate(QUERIES):
+        np.testing.assert_allclose(tracks.uv_px[query.frame :, k], expected(query), atol=1.5)
+        np.testing.assert_allclose(given.uv_px[query.frame :, k], expected(query), atol=1e-3)
+    assert np.ptp(tracks.point_world[:, 0], axis=0).max() == 0
+    # Without depth nothing is known of the camera.
+    blind = StillWorld().track(dataclasses.replace(shift_clip, depth_m=None), QUERIES)
+    np.testing.assert_array_equal(blind.uv_px[:, 0], np.tile([50.5, 60.25], (FRAMES, 1)))
+
+
+def test_a_camera_that_sees_nothing_keeps_its_pose(shift_clip: Clip) -> None:
+    grey = dataclasses.replace(shift_clip, rgb=np.full_like(shift_clip.rgb, 128))
+    poses = camera_poses(grey)
+    np.testing.assert_array_equal(poses, np.tile(shift_clip.cam_from_world[0], (FRAMES, 1, 1)))
+
+
+def test_what_is_still_is_hidden_by_nearer_depth_and_out_of_view(shift_clip: Clip) -> None:
+    assert shift_clip.depth_m is not None
+    depth_m = shift_clip.depth_m.copy()
+    depth_m[5, 50:70, 50:80] = 1.0
+    depth_m[6, 50:70, 50:80] = 0.0
+    clip = dataclasses.replace(shift_clip, depth_m=depth_m)
+    tracks = HoldStill().track(clip, [Query.point(0, 60.0, 64.0), Query.point(0, 120.0, 64.0)])
+    assert tracks.visible[:, 0].tolist() == [t != 5 for t in range(FRAMES)]
+    assert tracks.state[5, 0] == State.HELD
+    inside = 120.0 + 1.5 * np.arange(FRAMES) < 128
+    np.testing.assert_array_equal(tracks.visible[:, 1], inside)
