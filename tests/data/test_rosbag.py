@@ -287,7 +287,7 @@ BAD: dict[str, tuple[Callable[[], list[Sent]], dict[str, Any], str]] = {
             (COLOUR + "/compressed", "sensor_msgs/msg/CompressedImage", compressed(b"no", "jpeg", BEGIN), BEGIN),
         ],
         {},
-        "2 bytes that are no JPEG or PNG",
+        "2 bytes are no JPEG or PNG",
     ),
     "time goes back": (
         lambda: [info(), colours(0), (COLOUR, IMAGE, image(RGB[1], "rgb8", BEGIN - 9 * SECOND), BEGIN + STEP)],

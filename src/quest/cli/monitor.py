@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.markup import escape
 
 from quest.cli.source import Source
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
@@ -57,7 +58,7 @@ class Monitor(Source):
         queries = self.queries(source)
         tracker = self.tracker()
         stream = tracker.stream(source.camera, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
-        frames = "" if length is None else f"{length} frames, "
+        frames = "" if length is None else f"{counted(length, 'frame')}, "
         console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
         if stream.budget is None:
             console.print(

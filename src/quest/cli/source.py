@@ -12,6 +12,7 @@ from rich.markup import escape
 
 from quest.cli.progress import counting
 from quest.data.frame_source import Parts
+from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
@@ -171,7 +172,7 @@ def _check_memory(source: FrameSource) -> None:
     need_bytes = 2 * 3 * source.length * camera.width * camera.height  # each picture alone, and then all together
     if need_bytes > free_bytes:
         raise RecordingError(
-            f"recording {source.name}: {source.length} frames of {camera.width} x {camera.height} need "
+            f"recording {source.name}: {counted(source.length, 'frame')} of {camera.width} x {camera.height} need "
             f"{need_bytes / 1e9:.1f} GB of memory, {free_bytes / 1e9:.1f} GB are free; make it shorter or smaller "
             f"(ffmpeg -i IN -vf scale=640:-2 OUT.mp4), or use `quest monitor`, which keeps no frames"
         )

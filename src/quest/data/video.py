@@ -18,6 +18,7 @@ from jaxtyping import Float, Shaped, UInt8, UInt16
 
 from quest.errors import InputError, RecordingError
 from quest.whole_file import whole_file
+from quest.wording import counted
 
 SUFFIXES = (".mp4", ".mkv", ".mov", ".avi", ".webm", ".m4v")
 """Suffixes by which a video is recognised in a folder; any other that FFmpeg knows can be named explicitly."""
@@ -170,7 +171,7 @@ def _open(path: Path) -> Iterator[InputContainer]:
 
 
 def _undecodable(path: Path, number: int, error: av.error.FFmpegError) -> RecordingError:
-    where = f"after {number} frames" if number else "at all"
+    where = f"after {counted(number, 'frame')}" if number else "at all"
     return RecordingError(
         f"video {path}: cannot be decoded {where} ({error.strerror}); "
         "the file is corrupt or not a video, copy or record it again"

@@ -16,6 +16,7 @@ from quest.sim.portrait import Portrait
 from quest.types import LABELS
 from quest.viz.ink import Canvas, draw_disc, draw_outlined, draw_ring, draw_text, fit_text, grid, text_size
 from quest.viz.palette import BACKGROUND, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
+from quest.wording import counted
 
 _GAP, _PAD, _HEAD, _ROW = 4, 10, 46, 20
 _MARGIN = 16
@@ -52,9 +53,9 @@ def object_sheet(cards: Sequence[Card], *, columns: int = 1) -> UInt8[np.ndarray
 
 
 def entity_words(sim_object: SimObject) -> str:
-    """Entities by label, such as ``3 handle, 1 rim``; hinges are left out."""
+    """Entities by label, such as ``3 handles, 1 rim``; hinges are omitted."""
     count = Counter(e.label for e in sim_object.entities if e.label in LABELS)
-    return ", ".join(f"{count[label]} {label}" for label in LABELS if count[label])
+    return ", ".join(counted(count[label], label) for label in LABELS if count[label])
 
 
 def size_words(sim_object: SimObject) -> str:
