@@ -196,6 +196,17 @@ def test_commands_name_the_extra_that_they_miss(module, extra, arguments, tmp_pa
     assert "Traceback" not in done.stderr
 
 
+def test_help_of_generate_needs_no_extra():
+    """Though the motions of cameras in it come from the simulator."""
+    code = (
+        f"import sys; sys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\n"
+        "from quest.cli.main import main; main(['generate', '--help'])"
+    )
+    done = python("-c", code)
+    assert done.returncode == 0, done.stderr
+    assert "static,orbit,handheld,pan,mixed" in done.stdout
+
+
 def test_doctor(capsys):
     code = program.main(["doctor"])
     out = capsys.readouterr().out

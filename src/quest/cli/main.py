@@ -185,9 +185,8 @@ def _run(arguments: Sequence[str]) -> int:
 
         print(f"quest {__version__}")
         return 0
-    command = parse(arguments)
     try:
-        return command.run()
+        return parse(arguments).run()
     except QuestError as error:
         return _fail(error)
     except ModuleNotFoundError as error:

@@ -23,11 +23,9 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim import surfaces
+from quest.sim.cameras import CAMERA_AZIMUTH_DEG
 from quest.sim.entities import NAMED
 from quest.sim.surfaces import TILE_M, Colour, Surface, TextureKind, make_material, sample_surface, triple
-
-CAMERA_AZIMUTH_DEG = 70.0
-"""Cameras up to this far to either side of the front see past every distractor."""
 
 _FLOORS: tuple[TextureKind, ...] = ("noise", "checker", "planks", "tiles", "speckle", "stripes")
 _WALLS: tuple[TextureKind, ...] = ("noise", "stripes", "tiles", "planks", "speckle")

@@ -9,12 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from quest.types import Joint
+
+if TYPE_CHECKING:
+    import trimesh
 
 MAX_TURN_RAD = np.deg2rad(110)
 """How far a revolute joint is turned from rest at most."""

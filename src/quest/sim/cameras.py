@@ -19,7 +19,6 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
-from quest.sim.appearance import CAMERA_AZIMUTH_DEG
 from quest.sim.motion import FRAMES_PER_S, minimum_jerk
 from quest.types import Camera
 
@@ -136,6 +135,8 @@ def displaced(
     return new_from_cam @ cam_from_world
 
 
+CAMERA_AZIMUTH_DEG = 70.0
+"""Cameras up to this far to either side of the front see past every distractor."""
 AZIMUTH_DEG = (-60.0, 60.0)
 ELEVATION_DEG = (5.0, 50.0)
 FLAT_ELEVATION_DEG = (20.0, 65.0)
