@@ -11,7 +11,7 @@ import pytest
 
 from quest.data.video import read_video
 from quest.errors import InputError
-from quest.types import State, Take, Tracks
+from quest.types import Joints, State, Take, Tracks
 from quest.viz.overlay import OverlayPainter, write_overlay
 from quest.viz.palette import LOST, query_colour
 from tests.synthetic import make_take
@@ -87,6 +87,35 @@ def test_frames_do_not_depend_on_the_future(take: Take, tracks: Tracks):
     a, b = OverlayPainter(take.views[0].clip, tracks), OverlayPainter(take.views[0].clip, replace(tracks, uv_px=later))
     for t in range(6):
         np.testing.assert_array_equal(a.frame(t), b.frame(t))
+
+
+@pytest.mark.parametrize("camera", ["still", "behind the joint"])
+def test_joints_are_drawn_in_picture_inset_and_rows(take: Take, tracks: Tracks, camera: str):
+    clip, frames = take.views[0].clip, len(tracks)
+    if camera != "still":
+        pose = clip.cam_from_world.copy()
+        pose[:, 2, 3] -= 1.3
+        clip = replace(clip, cam_from_world=pose)
+    joint = take.info.entities[1].joint
+    axis = take.joint_axis[0, joint].astype(np.float32)
+    unknown = Joints.unknown(frames, 3)
+    axes, origin, q = unknown.axis.copy(), unknown.origin.copy(), unknown.q.copy()
+    origin[1], axes[1] = axis[:3], axis[3:]
+    q[:, 1] = take.joint_position[:, joint]
+    seen = np.array([np.nan, q[:, 1].max(), np.nan], np.float32)
+    joints = replace(
+        unknown, kind=("static", "revolute", "unknown"), axis=axes, origin=origin, q=q, q_min_seen=0 * seen,
+        q_max_seen=seen,
+    )  # fmt: skip
+    painter = OverlayPainter(clip, replace(tracks, joints=joints))
+    plain, drawn = OverlayPainter(clip, tracks).frame(9), painter.frame(9)
+    width, height = painter.size[0] - 360, 720
+    changed = (plain != drawn).any(axis=-1)
+    assert changed[:310, width:].any()
+    if camera == "still":
+        assert changed[:height, :width].any()
+        middle = painter._pixels(axis[None, :3] + [0, 0, 0.55 * 0.5], 9)[0].astype(int)
+        np.testing.assert_allclose(drawn[middle[1], middle[0]], query_colour(1), atol=40)
 
 
 @pytest.mark.parametrize("what", ["unbound", "no queries", "many", "outside", "one point", "odd names", "no depth"])

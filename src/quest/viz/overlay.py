@@ -1,9 +1,8 @@
 """Overlay videos: what a tracker answered, drawn on the frames that it saw.
 
-A panel at the side has the world tracks in 3D and a row per query with its joint and its confidence over time. A
-filled mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost. A joint is
-drawn as it is known at the end, in all frames: the axis about which something turns with the arc that was seen, or
-the line on which it slides.
+A panel at the side has the world tracks in 3D and a row per query with its joint and its confidence over time. A filled
+mark is visible, a hollow one is not; a dashed grey one is held on its joint; a red cross is lost. Joints are drawn as
+they are known at the end, in all frames: the axis of turning with the arc that was seen, or the line of sliding.
 """
 
 from __future__ import annotations
@@ -227,6 +226,10 @@ class OverlayPainter:
         u = self._unit
         size, height = round(15 * u), 22 * u
         taken = [(*(self._uv[t, k] - 9 * u), *(self._uv[t, k] + 9 * u)) for k in known]
+        for joint in filter(None, self._joints):
+            taken += [
+                (*(xy - 6 * u), *(xy + 6 * u)) for xy in self._pixels(joint.path[::6], t) if np.isfinite(xy).all()
+            ]
         for k in known:
             text = self._tag_text(t, k)
             # Digits differ in width: rounding up keeps the box from trembling.
@@ -277,7 +280,7 @@ class OverlayPainter:
             bound = bool(np.isfinite(self._uv[t, k]).all())
             if bound:
                 self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
-            joint = "" if self._joints[k] is None else self._tracks.joints.describe(k, t)  # type: ignore[union-attr]
+            joint = self._coordinate(t, k)
             two_lines = bool(joint) and row > 38 * u
             draw_text(
                 side,
@@ -298,6 +301,12 @@ class OverlayPainter:
                 value, colour = "held", HELD
             self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
             draw_text(side, value, (self._panel - 18 * u, middle), size=size, colour=colour, align="right")
+
+    def _coordinate(self, t: int, k: int) -> str:
+        """Where on its joint a query is, and the range; empty where it has none that moves."""
+        if self._tracks.joints is None or self._joints[k] is None:
+            return ""
+        return self._tracks.joints.describe(k, t).partition(" ")[2]  # the unit tells the kind
 
     def _draw_curve(self, side: Canvas, k: int, t: int, at: tuple[float, float], size: tuple[float, float]) -> None:
         """Confidence from the first frame to ``t``, on an axis that is as long as the clip."""
