@@ -56,17 +56,25 @@ def test_tracks_are_there(clip: Clip, tracks: Tracks, tmp_path: Path):
     recording = Recording(path)
     assert len(recording.blueprints) == 1
     found, name = recording.entities(), "left\\/knob"
-    assert {"/world/camera/image/rgb", "/world/camera/image/depth", f"/world/joints/{name}"} <= found
-    assert not {"/world/joints/rim", "/joints/rim", "/world/entities/rim", "/world/trails/rim"} & found
+    assert {"/world/camera/image/rgb", "/world/camera/image/depth"} <= found
+    assert {f"/world/joints/{name}/{part}" for part in ("axis", "path")} <= found
+    nowhere = ("/world/joints/rim", "/joints/rim", "/world/entities/rim", "/world/trails/rim")
+    assert not [entity for entity in found if entity.startswith(nowhere)]
     points = recording.values(f"/world/entities/{name}", "Points3D:positions")
     np.testing.assert_allclose(np.squeeze(points), tracks.point_world[1:, 0])
     trails = recording.values(f"/world/trails/{name}", "LineStrips3D:strips")
     assert [len(trail[0]) for trail in trails] == [1, 2, 3]
     assert recording.values(f"/world/camera/image/entities/{name}", "frame") == [1, 2, 3]
     assert np.squeeze(recording.values("/confidence/rim", "Scalars:scalars")).tolist() == [0.25] * 4
-    assert np.squeeze(recording.values(f"/world/joints/{name}", "Arrows3D:origins")).tolist() == [1, 2, 3]
+    arrow = [recording.values(f"/world/joints/{name}/axis", f"Arrows3D:{end}") for end in ("origins", "vectors")]
+    start, along = (np.squeeze(end) for end in arrow)
+    np.testing.assert_allclose(start[:2], [1, 2], atol=1e-6)
+    np.testing.assert_allclose(along[:2], 0, atol=1e-6)
+    np.testing.assert_allclose(start[2] + along[2] / 2, 0.2, atol=1e-6)  # level with the entity
+    arc = recording.values(f"/world/joints/{name}/path", "LineStrips3D:strips")[0]
+    assert len(arc) == 3  # and the arms to both of its ends
     coordinate = recording.values(f"/joints/{name}", "Scalars:scalars")
-    np.testing.assert_allclose(np.squeeze(coordinate), [np.nan, 0, 0.1, 0.2], atol=1e-6)
+    np.testing.assert_allclose(np.squeeze(coordinate), np.degrees([np.nan, 0, 0.1, 0.2]), atol=1e-5)
 
 
 @needs_rerun
