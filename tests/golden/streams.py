@@ -15,8 +15,6 @@ import numpy as np
 
 import quest
 from quest import Clip, Query, Tracker, Tracks
-from quest.data.recording import read_recording
-from quest.data.sample import sample_folder
 from quest.track.tracker import collect
 
 HERE = Path(__file__).parent
@@ -33,7 +31,7 @@ class GoldenClip:
     strides: tuple[int, ...] = (1, 2, 3)
     """Every so many of them: answers must not hang on the frame rate."""
     take: tuple[str, int] | None = None
-    """Simulated object and seed, of suite occlusion; None for the clip that is packaged."""
+    """Simulated object and seed, of suite occlusion; None for a packaged clip, by its name."""
     entities: tuple[str, ...] = ()
     """What is asked for by its pixel in the first frame; the first one is hidden meanwhile. If none, what is found."""
 
@@ -45,9 +43,9 @@ class GoldenClip:
     def read(self) -> Clip:
         """All its frames."""
         if self.take is None:
-            clip = read_recording(sample_folder())
+            clip = quest.read(self.name)
         else:
-            clip = replace(read_recording(self.folder), depth_m=read_depth(self.folder))
+            clip = replace(quest.read(self.folder), depth_m=read_depth(self.folder))
         return cut(clip, slice(self.length))
 
     def truth(self) -> Truth | None:

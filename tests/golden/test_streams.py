@@ -77,8 +77,8 @@ def distance(got: np.ndarray, was: np.ndarray) -> np.ndarray:
 def differences(got: dict[str, np.ndarray], was: dict[str, np.ndarray]) -> list[str]:
     """In which ways answers are others than those on file."""
     for name in ("name", "joint"):
-        if list(got[name]) != list(was[name]):
-            return [f"{name}: {list(got[name])}, recorded {list(was[name])}"]
+        if got[name].tolist() != was[name].tolist():
+            return [f"{name}: {got[name].tolist()}, recorded {was[name].tolist()}"]
     found = []
     for name, limit in (("uv_px", SAME_PX), ("point_world", SAME_M), ("confidence", SAME_P), ("lost_p", SAME_P)):
         off = np.median(distance(got[name], was[name]), axis=0)
