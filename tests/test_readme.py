@@ -1,16 +1,38 @@
-"""The README is run as written: its Python block, its commands as far as their arguments."""
+"""README and docs are run as written: Python blocks, commands (all are parsed, most are run).
+
+They run in a folder that has what the pages speak of, tiny; the packaged clip has its first frames only.
+"""
 
 from __future__ import annotations
 
 import re
 import shlex
+import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests.synthetic import make_take
+from tests.tiny import make_network
+from tests.track.clips import make_calibration
+
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
 PAGES = [README, *sorted(ROOT.glob("C*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
+
+RUN = ("track", "monitor", "doctor", "weights list", "weights show", "data")
+"""Commands that are run, beside being parsed; the others render, train or evaluate, and have tests of their own."""
+
+NOT_RUN = {
+    "owner/name": "asks the hub; tests/model/test_hub.py has one",
+    "--rerun": "opens a window",
+    "s3://": "asks an object store; tests/data/test_object_store.py has one",
+    "Renderer()": "renders for a minute; tests/sim/test_generate.py",
+}
+"""What stands in a command or a block that is not run, and why."""
+
+FRAMES = 8
 
 
 def blocks(path: Path, language: str) -> list[str]:
@@ -56,10 +78,99 @@ def test_links_lead_somewhere():
     assert not dead
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what the pages speak of."""
+    import quest
+    from quest.data.mcap_export import export_mcap
+    from quest.data.recording import write_recording
+    from quest.data.store import TakeStore
+    from quest.model.weights import save_network
+
+    folder = tmp_path_factory.mktemp("pages")
+    whole = quest.read("sample")
+    assert whole.depth_m is not None
+    rows = slice(FRAMES)
+    clip = replace(
+        whole,
+        rgb=whole.rgb[rows],
+        depth_m=whole.depth_m[rows],
+        stamp_s=whole.stamp_s[rows],
+        cam_from_world=whole.cam_from_world[rows],
+    )
+    for name in ("sample", "path/to/recording"):
+        write_recording(clip, folder / name)
+    for name in ("drawer.mcap", "drive.mcap"):
+        export_mcap(clip, folder / name)
+    for store in ("takes/try", "takes/mine"):
+        take = make_take(frames=FRAMES, views=1, entities=2, name="44817-L1-s000000")
+        TakeStore(folder / store).write(take)
+    for run in ("runs/found", "runs/mine"):
+        (folder / run).mkdir(parents=True)
+        save_network(folder / run / "weights.safetensors", make_network(), settings="{}", about="tiny")
+    shutil.copy(folder / "sample" / "rgb.mp4", folder / "my.mp4")
+    quest.load().track(clip, [quest.Query.semantic("handle")]).save(folder / "outputs" / "demo")
+    return folder
+
+
+@pytest.fixture
+def there(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """That folder, as the one where one is, and with the clip that is packaged."""
+    monkeypatch.chdir(made)
+    monkeypatch.setattr("quest.data.sample.sample_folder", lambda *name: made / "sample")
+    return made
+
+
+def why_not(text: str) -> str | None:
+    """Why a command or a block is not run."""
+    return next((reason for words, reason in NOT_RUN.items() if words in text), None)
+
+
+def runnable() -> list[str]:
+    """Commands of all pages that are run, each once."""
+    found = {shlex.join(shlex.split(command, comments=True)) for _, command in commands()}
+    return sorted(c for c in found if c.removeprefix("quest ").startswith(RUN) and not why_not(c))
+
+
 @pytest.mark.slow
-def test_python_example_runs(monkeypatch, capsys):
-    monkeypatch.chdir(ROOT)
-    shared: dict = {}
-    for block in blocks(README, "python"):
-        exec(compile(block, "<example of the README>", "exec"), shared)
-    assert "knob" in capsys.readouterr().out
+@pytest.mark.parametrize("command", runnable())
+def test_commands_run(command: str, there: Path):
+    from quest.cli.main import main
+
+    assert main(shlex.split(command)[1:]) == 0
+
+
+def namespace(folder: Path) -> dict[str, object]:
+    """What the pages take for granted in their Python blocks."""
+    import quest
+
+    clip = quest.read(folder / "sample")
+    tracker, queries = quest.load(), [quest.Query.semantic("handle")]
+    frame = clip.frame(0)
+    return {
+        "quest": quest,
+        "clip": clip,
+        "camera": clip.camera,
+        "frames": [clip.frame(t) for t in range(len(clip))],
+        "rgb": frame.rgb,
+        "depth_m": frame.depth_m,
+        "stamp_s": frame.stamp_s,
+        "tracker": tracker,
+        "queries": queries,
+        "text": make_calibration(alarming=False).to_json(),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.name)
+def test_python_blocks_run(page: Path, there: Path):
+    """One after the other, as a reader would paste them."""
+    shared = namespace(there)
+    for block in blocks(page, "python"):
+        if not why_not(block):
+            exec(compile(block, f"<{page.name}>", "exec"), shared)
+
+
+def test_every_reason_not_to_run_something_is_needed():
+    shown = [command for _, command in commands()] + [block for page in PAGES for block in blocks(page, "python")]
+    assert not [words for words in NOT_RUN if not any(words in text for text in shown)]
