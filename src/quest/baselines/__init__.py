@@ -41,37 +41,31 @@ class ClipTracker(Protocol):
 
 @dataclass(frozen=True)
 class Shared:
-    """What trackers that are made of one network share.
-
-    Attributes:
-        tracker: the tracker whose network and settings they use.
-        unit_m: metres per normalised unit of a clip, for the noise of chained flow.
-        seed: of that noise.
-    """
+    """What trackers that are made of one network share."""
 
     tracker: Tracker
+    """The tracker whose network and settings they use."""
     unit_m: Callable[[Clip], float]
+    """Metres per normalised unit of a clip, for the noise of chained flow."""
     seed: int = 0
+    """Of that noise."""
 
 
 @dataclass(frozen=True)
 class Entry:
-    """How a tracker is made, and what is said of it.
-
-    Attributes:
-        about: what it does, in a few words.
-        maker: ``module:function`` in this package. It is called with the settings; before them, for trackers
-            of weights, with the name and a :class:`Shared`.
-        settings: keyword arguments of the maker.
-        of_weights: whether it needs weights of QueST.
-        inputs: what it is shown of real recordings, one row of the table each; what a recording lacks is left out.
-    """
+    """How a tracker is made, and what is said of it."""
 
     about: str
+    """What it does, in a few words."""
     maker: str
+    """``module:function`` in this package. It is called with the settings; before them, for trackers of weights,
+    with the name and a :class:`Shared`."""
     settings: Mapping[str, Any] = field(default_factory=dict)
+    """Keyword arguments of the maker."""
     of_weights: bool = False
+    """Whether it needs weights of QueST."""
     inputs: tuple[Inputs, ...] = ("colours",)
+    """What it is shown of real recordings, one row of the table each; what a recording lacks is left out."""
 
     def build(self, name: str, shared: Shared | None = None) -> ClipTracker:
         """The tracker.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value, statistic_value
 from quest.evaluation.drift import ranked_auroc
@@ -24,13 +24,7 @@ SIZES_PX = (0, 16, 32, 64, np.inf)
 
 @dataclass(frozen=True)
 class Answers:
-    """What a tracker says at the scored labels of one clip.
-
-    Attributes:
-        uv_px: pixels; NaN without an answer.
-        visible: whether it says that the entity is seen.
-        lost_p: its P(lost); NaN where it says nothing.
-    """
+    """What a tracker says at the scored labels of one clip; NaN where it says nothing."""
 
     uv_px: Float[np.ndarray, "S 2"]
     visible: Bool[np.ndarray, " S"]
@@ -39,70 +33,38 @@ class Answers:
 
 @dataclass(frozen=True)
 class ScoredClip:
-    """One tracker's answers in one clip, compared with the scored labels.
+    """One tracker's answers in one clip, compared with the scored labels."""
 
-    Attributes:
-        track: index of the label's track.
-        state: what is true of the label.
-        moves: whether its part is moved.
-        error_px: distance from the label where it is visible, the image's diagonal without an answer; else NaN.
-        mixed: whether the answer is not near, and nearer to another labelled entity than to its own.
-        called_visible: what the tracker says.
-        lost_p: its P(lost).
-    """
-
-    track: Int[np.ndarray, " S"]
-    state: np.ndarray
-    moves: Bool[np.ndarray, " S"]
+    labels: Labels
+    answers: Answers
     error_px: Float[np.ndarray, " S"]
+    """Distance from the label where it is visible, the image's diagonal without an answer; else NaN."""
     mixed: Bool[np.ndarray, " S"]
-    called_visible: Bool[np.ndarray, " S"]
-    lost_p: Float[np.ndarray, " S"]
+    """Whether the answer is not near, and nearer to another labelled entity than to its own."""
 
 
 def score_clip(labels: Labels, answers: Answers, *, diagonal_px: float) -> ScoredClip:
-    """Compare answers with labels.
-
-    Args:
-        labels: of the clip.
-        answers: at its scored labels.
-        diagonal_px: what a missing answer counts.
-    """
+    """Compare answers at the scored labels of a clip with these; a missing answer is off by the image's diagonal."""
     scored, seen = labels.scored, labels.state == "visible"
     error_px, mixed = np.full(len(scored), np.nan), np.zeros(len(scored), bool)
     for row, i in enumerate(scored):
         if seen[i]:
-            present = seen & (labels.frame == labels.frame[i])
             gap = np.nan_to_num(np.linalg.norm(labels.uv_px - answers.uv_px[row], axis=-1), nan=diagonal_px)
-            others = present & (labels.track != labels.track[i])
+            others = seen & (labels.frame == labels.frame[i]) & (labels.track != labels.track[i])
             error_px[row] = gap[i]
             mixed[row] = gap[i] > NEAR_PX and gap[others].min(initial=np.inf) < gap[i]
-    return ScoredClip(
-        labels.track[scored],
-        labels.state[scored],
-        labels.moves[labels.track[scored]],
-        error_px,
-        mixed,
-        answers.visible,
-        answers.lost_p,
-    )
+    return ScoredClip(labels, answers, error_px, mixed)
 
 
 def track_measures(clips: Sequence[ScoredClip], *, far_px: float, resamples: int, seed: int) -> Measures:
-    """Measures of one tracker over clips, with intervals over these.
-
-    Args:
-        clips: the tracker's answers.
-        far_px: beyond this an answer is far off.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
-    """
+    """Measures of one tracker over clips, with intervals over these; beyond ``far_px`` an answer is far off."""
     draws = draw_objects(len(clips), resamples=resamples, generator=np.random.default_rng(seed))
-    clip = np.repeat(np.arange(len(clips)), [len(c.track) for c in clips])
-    track, state, moves, error_px, mixed, called, lost_p = (
-        np.concatenate([getattr(c, name) for c in clips])
-        for name in ("track", "state", "moves", "error_px", "mixed", "called_visible", "lost_p")
-    )
+    clip = np.repeat(np.arange(len(clips)), [len(c.error_px) for c in clips])
+    error_px, mixed = (np.concatenate([getattr(c, name) for c in clips]) for name in ("error_px", "mixed"))
+    called, lost_p = (np.concatenate([getattr(c.answers, name) for c in clips]) for name in ("visible", "lost_p"))
+    track = np.concatenate([c.labels.track[c.labels.scored] for c in clips])
+    state = np.concatenate([c.labels.state[c.labels.scored] for c in clips])
+    moves = np.concatenate([c.labels.moves[c.labels.track[c.labels.scored]] for c in clips])
     seen = state == "visible"
     near, far = seen & (error_px <= NEAR_PX), seen & (error_px > far_px)
 
@@ -138,23 +100,20 @@ def track_measures(clips: Sequence[ScoredClip], *, far_px: float, resamples: int
 
 @dataclass(frozen=True)
 class Found:
-    """What a tracker found unasked in one picture.
-
-    Attributes:
-        right: which of its answers are right.
-        again: which of these are at a handle that a better answer has already.
-        found: which handles have an answer.
-        size_px: of each handle, see :data:`SIZES_PX`.
-        score: of each candidate that answers are chosen from.
-        first: which candidates are right, and the best one of their handle.
-    """
+    """What a tracker found unasked in one picture."""
 
     right: Bool[np.ndarray, " A"]
+    """Which of its answers are right."""
     again: Bool[np.ndarray, " A"]
+    """Which of these are at a handle that a better answer has already."""
     found: Bool[np.ndarray, " H"]
+    """Which handles have an answer."""
     size_px: Float[np.ndarray, " H"]
+    """Of each handle, see :data:`SIZES_PX`."""
     score: Float[np.ndarray, " C"]
+    """Of each candidate that answers are chosen from."""
     first: Bool[np.ndarray, " C"]
+    """Which candidates are right, and the best one of their handle."""
 
 
 def score_picture(
@@ -202,13 +161,7 @@ def _assign(picture: Picture, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def discovery_measures(pictures: Sequence[Found], *, resamples: int, seed: int) -> Measures:
-    """Measures of what was found, over pictures, with intervals over these.
-
-    Args:
-        pictures: what was found in each.
-        resamples: of the bootstrap.
-        seed: of the bootstrap.
-    """
+    """Measures of what was found in pictures, with intervals over these."""
     draws = draw_objects(len(pictures), resamples=resamples, generator=np.random.default_rng(seed))
 
     def pooled(name: str) -> tuple[np.ndarray, np.ndarray]:

@@ -47,25 +47,22 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class RealRow:
-    """One tracker on a set, or on one clip or picture of it.
-
-    Attributes:
-        of: ``tracks``, ``tracks, wide steps``, ``pictures``, or the name of the clip or picture.
-        tracker: its name.
-        inputs: what it was shown.
-        units: clips or pictures.
-        targets: tracks, or handles.
-        terms: scored labels, or answers given.
-        measures: the numbers.
-    """
+    """One tracker on a set, or on one clip or picture of it."""
 
     of: str
+    """``tracks``, ``tracks, wide steps``, ``pictures``, or the name of the clip or picture."""
     tracker: str
+    """Its name."""
     inputs: Inputs
+    """What it was shown."""
     units: int
+    """Clips or pictures."""
     targets: int
+    """Tracks, or handles."""
     terms: int
+    """Scored labels, or answers given."""
     measures: Measures
+    """The numbers."""
 
 
 class KeptAnswers:
@@ -134,8 +131,8 @@ def evaluate_set(
 
     def track_row(of: str, tracker: str, inputs: Inputs, clips: Sequence[ScoredClip], resamples: int) -> RealRow:
         measures = track_measures(clips, far_px=real.far_px, resamples=resamples, seed=seed)
-        tracks = sum(len(np.unique(c.track)) for c in clips)
-        return RealRow(of, tracker, inputs, len(clips), tracks, sum(len(c.track) for c in clips), measures)
+        tracks = sum(len(np.unique(c.labels.track[c.labels.scored])) for c in clips)
+        return RealRow(of, tracker, inputs, len(clips), tracks, sum(len(c.error_px) for c in clips), measures)
 
     for (of, tracker, inputs), clips in tracked.items():
         rows.append(track_row(of, tracker, inputs, list(clips.values()), resamples))

@@ -5,17 +5,18 @@ A set is a folder of labelled clips, or of labelled pictures; which one is told 
 
 from __future__ import annotations
 
-import csv
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 from PIL import Image, UnidentifiedImageError
+from pyarrow import csv
 
 from quest.data.camera_file import read_camera
 from quest.data.pictures import colours_of, upright
@@ -38,23 +39,20 @@ _BAR_PX = 12.0
 
 @dataclass(frozen=True)
 class Labels:
-    """Labels of K tracks of one clip, one row a label, N in all.
-
-    Attributes:
-        names: of the tracks.
-        moves: whether the part that a track is on is moved against its surroundings.
-        track: index of the label's track.
-        frame: index of its frame.
-        uv_px: pixels, centres at half-integers; NaN where nothing is known.
-        state: one of :data:`STATES`.
-    """
+    """Labels of K tracks of one clip, one row a label, N in all."""
 
     names: tuple[str, ...]
+    """Of the tracks."""
     moves: Bool[np.ndarray, " K"]
+    """Whether the part that a track is on is moved against its surroundings."""
     track: Int[np.ndarray, " N"]
+    """Index of the label's track."""
     frame: Int[np.ndarray, " N"]
+    """Index of its frame."""
     uv_px: Float[np.ndarray, "N 2"]
+    """Pixels, centres at half-integers; NaN where nothing is known."""
     state: np.ndarray
+    """One of :data:`STATES`."""
 
     @cached_property
     def asked(self) -> Int[np.ndarray, " K"]:
@@ -87,15 +85,12 @@ class Labels:
 
 @dataclass(frozen=True)
 class LabelledClip:
-    """A recording with labelled tracks.
-
-    Attributes:
-        folder: a recording folder (``docs/recordings.md``); without a camera file the camera is guessed.
-        file: its labels.
-    """
+    """A recording with labelled tracks."""
 
     folder: Path
+    """A recording folder (``docs/recordings.md``); without a camera file the camera is guessed."""
     file: Path
+    """Its labels."""
 
     @property
     def name(self) -> str:
@@ -128,23 +123,20 @@ class LabelledClip:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with H labelled handles: boxes, or bars between two ends.
-
-    Attributes:
-        path: the picture.
-        boxes: x0, y0, x1, y1 of each handle's box, or the two ends of its bar, pixels.
-        wanted: which handles count; answers at the others are neither right nor wrong.
-        bars: whether handles are bars.
-        depth: its depth image, aligned.
-        camera: its camera file; without one the camera is guessed.
-    """
+    """A picture with H labelled handles: boxes, or bars between two ends."""
 
     path: Path
+    """The picture."""
     boxes: Float[np.ndarray, "H 4"]
+    """X0, y0, x1, y1 of each handle's box, or the two ends of its bar, pixels."""
     wanted: Bool[np.ndarray, " H"]
+    """Which handles count; answers at the others are neither right nor wrong."""
     bars: bool = False
+    """Whether handles are bars."""
     depth: Path | None = None
+    """Its depth image, aligned."""
     camera: Path | None = None
+    """Its camera file; without one the camera is guessed."""
 
     @property
     def name(self) -> str:
@@ -190,19 +182,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class RealSet:
-    """A set of labelled recordings: clips with tracks, pictures with handles, or both.
-
-    Attributes:
-        folder: where it is.
-        clips: by name.
-        pictures: by name.
-        far_px: beyond this a tracker's answer is far off, where its P(lost) should be high.
-    """
+    """A set of labelled recordings: clips with tracks, pictures with handles, or both."""
 
     folder: Path
+    """Where it is."""
     clips: tuple[LabelledClip, ...]
+    """By name."""
     pictures: tuple[Picture, ...]
+    """By name."""
     far_px: float = 16.0
+    """Beyond this a tracker's answer is far off, where its P(lost) should be high."""
 
     @property
     def name(self) -> str:
@@ -261,85 +250,73 @@ def read_labels(path: Path) -> Labels:
     Raises:
         InputError: a column is missing, a value makes no sense, or a track is nowhere visible.
     """
-    shift = 0.5 if path.name == "truth.csv" else 0.0
-    rows = []
-    for line, row in _rows(path, ("track", "frame", "x", "y", "state")):
-        if row["state"] not in STATES:
-            raise InputError(f"{path}, line {line}: expected state {', '.join(STATES)}, got {row['state']!r}")
-        uv_px = [_number(path, line, row, key) + shift for key in ("x", "y")]
-        frame = _number(path, line, row, "frame")
-        if not (frame >= 0 and frame % 1 == 0) or (row["state"] == "visible" and not np.isfinite(uv_px).all()):
-            raise InputError(f"{path}, line {line}: expected a frame from 0 on, and x and y of what is visible")
-        rows.append((row["track"], int(frame), uv_px, row["state"], row.get("moves") == "yes"))
-    rows.sort(key=lambda r: (r[0], r[1]))
-    names = tuple(dict.fromkeys(r[0] for r in rows))
-    unseen = sorted(set(names) - {r[0] for r in rows if r[3] == "visible"})
-    if unseen or not rows:
-        raise InputError(f"{path}: expected a visible label of every track, got none of {', '.join(unseen) or 'any'}")
-    moving = {r[0] for r in rows if r[4]}
-    return Labels(
-        names,
-        np.array([name in moving for name in names]),
-        np.array([names.index(r[0]) for r in rows]),
-        np.array([r[1] for r in rows]),
-        np.array([r[2] for r in rows], dtype=np.float64),
-        np.array([r[3] for r in rows]),
-    )
+    rows = _columns(path, {"track": str, "frame": int, "x": float, "y": float, "state": str}, moves=str)
+    order = np.lexsort((rows["frame"], rows["track"]))
+    name, frame, x, y, state, moves = (rows[key][order] for key in ("track", "frame", "x", "y", "state", "moves"))
+    uv_px = np.stack([x, y], axis=-1) + (0.5 if path.name == "truth.csv" else 0.0)
+    seen = state == "visible"
+    for wrong, what in (
+        (~np.isin(state, STATES), f"state {', '.join(STATES)}"),
+        (frame < 0, "a frame from 0 on"),
+        (seen & ~np.isfinite(uv_px).all(axis=-1), "x and y of what is visible"),
+        (~np.isin(name, name[seen]), "a visible label of every track"),
+    ):
+        if wrong.any():
+            i = int(wrong.argmax())
+            raise InputError(
+                f"{path}: expected {what}, got track {name[i]}, frame {frame[i]}, state {state[i] or None}"
+            )
+    if not len(name):
+        raise InputError(f"{path}: expected labels, got none")
+    names, track = np.unique(name, return_inverse=True)
+    return Labels(tuple(names.tolist()), np.isin(names, name[moves == "yes"]), track, frame, uv_px, state)
+
+
+def _columns(path: Path, kinds: Mapping[str, type], **optional: type) -> dict[str, np.ndarray]:
+    """Columns of a CSV file; empty numbers are NaN, empty words and what is optional and missing are empty."""
+    if not path.is_file():
+        raise InputError(f"labels {path}: no such file; {EXPECTED}")
+    types = {str: pa.string(), int: pa.int64(), float: pa.float64()}
+    wanted = {key: types[kind] for key, kind in {**kinds, **optional}.items()}
+    convert = csv.ConvertOptions(column_types=wanted, include_columns=list(wanted), include_missing_columns=True)
+    try:
+        missing = sorted(set(kinds) - set(csv.open_csv(path).schema.names))
+        if missing:
+            raise InputError(f"{path}: expected columns {', '.join(kinds)}, got none named {', '.join(missing)}")
+        table = csv.read_csv(path, csv.ReadOptions(use_threads=False), convert_options=convert)
+    except pa.ArrowInvalid as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+    fill = {pa.string(): "", pa.int64(): -1, pa.float64(): np.nan}
+    columns = {key: table[key].fill_null(fill[kind]).to_numpy() for key, kind in wanted.items()}
+    return {key: c.astype(str) if wanted[key] == pa.string() else c for key, c in columns.items()}
 
 
 def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
-    file = folder / "labels.csv"
-    boxes: dict[str, list[list[float]]] = {}
-    for line, row in _rows(file, ("file", "class", "x0", "y0", "x1", "y1")):
-        own = boxes.setdefault(row["file"], [])
-        if row["class"] == "handle":
-            own.append([_number(file, line, row, key) for key in ("x0", "y0", "x1", "y1")])
-    for name, found in sorted(boxes.items()):
+    edges = ("x0", "y0", "x1", "y1")
+    rows = _columns(folder / "labels.csv", {"file": str, "class": str, **dict.fromkeys(edges, float)})
+    for name in np.unique(rows["file"]).tolist():
+        path = folder / "pictures" / name
         if part == "all" or may_choose(name) == (part == "choosing"):
-            path = folder / "pictures" / name
             if not path.is_file():
-                raise InputError(f"{file}: expected a picture {path}, found none")
-            yield Picture(path, np.reshape(found, (-1, 4)).astype(float), np.ones(len(found), bool))
+                raise InputError(f"{folder / 'labels.csv'}: expected a picture {path}, found none")
+            own = (rows["file"] == name) & (rows["class"] == "handle")
+            yield Picture(path, np.stack([rows[key][own] for key in edges], axis=-1), np.ones(own.sum(), bool))
 
 
 def _stills(folder: Path) -> Iterator[Picture]:
     """Pictures whose handles are bars, pixel centres at integers, with depth images of the same name."""
-    file, camera = folder / "handles.csv", folder / "camera.json"
-    bars: dict[str, list[list[float]]] = {}
-    for line, row in _rows(file, ("frame", "x1", "y1", "x2", "y2", "use")):
-        values = [_number(file, line, row, key) for key in ("frame", "x1", "y1", "x2", "y2", "use")]
-        bars.setdefault(f"{int(values[0]):04d}", []).append(values[1:])
-    for stem, found in sorted(bars.items()):
-        ends = np.array(found, dtype=float)
-        depth = folder / f"{stem}.png"
+    ends = ("x1", "y1", "x2", "y2")
+    rows = _columns(folder / "handles.csv", {"frame": int, "use": int, **dict.fromkeys(ends, float)})
+    for frame in np.unique(rows["frame"]):
+        own = rows["frame"] == frame
+        beside = {"depth": folder / f"{frame:04d}.png", "camera": folder / "camera.json"}
         yield Picture(
-            folder / f"{stem}.jpg",
-            ends[:, :4] + 0.5,
-            ends[:, 4] > 0,
+            folder / f"{frame:04d}.jpg",
+            np.stack([rows[key][own] for key in ends], axis=-1) + 0.5,
+            rows["use"][own] > 0,
             bars=True,
-            depth=depth if depth.is_file() else None,
-            camera=camera if camera.is_file() else None,
+            **{key: path for key, path in beside.items() if path.is_file()},
         )
-
-
-def _rows(path: Path, columns: Sequence[str]) -> Iterator[tuple[int, dict[str, str]]]:
-    """Lines of a CSV file with their numbers."""
-    if not path.is_file():
-        raise InputError(f"labels {path}: no such file; {EXPECTED}")
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file)
-        missing = [name for name in columns if name not in (reader.fieldnames or ())]
-        if missing:
-            raise InputError(f"{path}: expected columns {', '.join(columns)}, got none named {', '.join(missing)}")
-        for row in reader:
-            yield reader.line_num, {key: value or "" for key, value in row.items() if isinstance(value, str | None)}
-
-
-def _number(path: Path, line: int, row: dict[str, str], key: str) -> float:
-    try:
-        return float(row[key] or "nan")
-    except ValueError:
-        raise InputError(f"{path}, line {line}: expected a number for {key}, got {row[key]!r}") from None
 
 
 def _open(path: Path) -> Image.Image:
