@@ -66,6 +66,12 @@ def test_the_tool_chest_has_three_handles():
     assert text.count('type="revolute"') == 1
 
 
+def test_arrays_of_ones_own_are_tracked():
+    tracks = example("own_arrays").follow(make_tracker(), make_clip())
+    assert tracks.names == ("mine",)
+    assert tracks.uv_px.shape == (6, 1, 2)
+
+
 def test_both_rims_of_a_laptop_are_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     module, commands = example("open_and_lift"), []
     tracks = module.follow(make_tracker(), make_clip())
