@@ -28,16 +28,18 @@ PUBLIC = [
 ]
 
 MEMBERS = {
-    "Camera": "cx cy from_opencv fx fy height matrix width",
-    "Clip": "cam_from_world camera depth_m frame name rgb stamp_s",
+    "Camera": "cx cy from_fov from_opencv fx fy height matrix width",
+    "Clip": "cam_from_world camera depth_m frame from_arrays name notes rgb stamp_s",
     "Frame": "cam_from_world depth_m rgb stamp_s",
+    "Joints": "axis covariance describe kind origin q q_max_seen q_min_seen select unknown",
     "Query": "frame intent kind label name point semantic slot uv_px",
     "State": "HELD LOST TRACKING",
-    "Stream": "add budget camera frame looking on_alarm rename restore retire state step unbound",
+    "Stream": "add budget camera frame looking memory on_alarm rename retire step unbound",
     "StreamState": "alarm confidence flags has_depth joint labels lost_p names point_world q query signals stamp_s "
     "state uv_px visible",
     "Tracker": "calibration candidates config device name network restore save stream track weights_hash with_config",
-    "Tracks": "alarm confidence frame_flags joints labels lost_p names point_world select stamp_s state uv_px visible",
+    "Tracks": "alarm confidence describe frame_flags joints labels lost_p names point_world save select stamp_s state "
+    "to_pandas uv_px visible",
 }
 """Fields, methods and properties of the public classes."""
 
