@@ -1,4 +1,4 @@
-# make demo   track the packaged clip with the shipped weights      make test   everything CI runs
+# make demo   track the packaged clips with the shipped weights     make test   everything CI runs
 # Sets itself up in $(VENV) with pip; a second run does not touch the network.
 
 PYTHON ?= python3
@@ -24,7 +24,8 @@ help:
 
 demo: $(BASE)
 	$(BIN)/quest track sample --out $(DEMO_OUT)
-	@echo "Watch $(DEMO_OUT)/overlay.mp4; $(DEMO_OUT)/tracks.parquet has one row per frame and entity."
+	$(BIN)/quest track sample-alarm --out $(DEMO_OUT)-alarm
+	@echo "Watch $(DEMO_OUT)/overlay.mp4 and $(DEMO_OUT)-alarm/overlay.mp4; tracks.parquet beside them has one row per frame and entity."
 
 test: lint types pytest
 

@@ -13,6 +13,7 @@ time stands beside it. The result file is written anew at every reading.
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -178,9 +179,6 @@ def time_change(readings: Sequence[Reading], *, clock: str, seed: int = 0) -> Ch
     return Change(before, after, 100.0 * (after / before - 1.0), float(low), float(high), len(late))
 
 
-HANDLES = {"drawer below": (59.0, 155.5), "drawer above": (167.0, 42.5)}
-"""Pixels of the two handles of the sample clip that move, in its first frame."""
-
 FRAMES_PER_S = 30.0
 MEMORY_PERCENT, TIME_PERCENT = 2.0, 5.0
 """Changes up to these are accepted."""
@@ -210,7 +208,9 @@ class Endurance:
         clip = read_recording(sample_folder())
         tracker = quest.load(self.weights, device="cpu")
         ring = FeatureRing(tracker.network)
-        queries = [Query.point(0, x, y, name=name) for name, (x, y) in HANDLES.items()]
+        truth = json.loads((sample_folder() / "truth.json").read_text())
+        handles = {entity["name"]: entity["uv_px"][0] for entity in truth["entities"] if entity["moves"]}
+        queries = [Query.point(0, x, y, name=name) for name, (x, y) in handles.items()]
         stream = tracker.stream(clip.camera, queries)
         every, encoded = self.frames // 100, min(self.encoded, self.frames // 10)
         about = provenance() | {
@@ -231,7 +231,7 @@ class Endurance:
             frame = clip.frame(i)
             state = stream.step(frame.rgb, frame.depth_m, t / FRAMES_PER_S, frame.cam_from_world)
             if i == 0:
-                off_px = np.linalg.norm(state.uv_px - list(HANDLES.values()), axis=1).round(2).tolist()
+                off_px = np.linalg.norm(state.uv_px - list(handles.values()), axis=1).round(2).tolist()
             if (t + 1) % every:
                 continue
             cpu_s, wall_s = time.process_time() - start_cpu_s, time.perf_counter() - start_s
@@ -239,7 +239,7 @@ class Endurance:
             seen = {
                 "alarms": len(alarms),
                 "first_alarms": alarms[:10],
-                "off_px": dict(zip(HANDLES, off_px, strict=True)),
+                "off_px": dict(zip(handles, off_px, strict=True)),
             }
             report = about | self._found(readings) | seen | {"encoder_runs": ring.computed, "pictures": len(ring)}
             console.print(_line(readings))

@@ -26,7 +26,7 @@ class Source:
 
     clip: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """A video, a folder of images, a recording folder, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take
-    (STORE/NAME.zarr), or the word sample for the clip that ships."""
+    (STORE/NAME.zarr), or the word sample or sample-alarm for a clip that ships."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
     point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()

@@ -63,7 +63,7 @@ def open_recording(
     Args:
         path: a recording folder, a folder of images, a video, a LeRobot v3 dataset, an MCAP file, a ROS bag (the
             folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``), a take (``STORE/NAME.zarr``, also as a URL), or
-            the word ``sample`` for the packaged clip.
+            the word ``sample`` or ``sample-alarm`` for a packaged clip.
         depth: folder of 16-bit depth images, one per frame, of folders and videos alone; by default ``depth`` in the
             recording folder (or beside a video), where there is one. Without it there are colours only.
         camera: camera file, or the intrinsics themselves; by default those that the recording has, such as

@@ -1,4 +1,4 @@
-"""The sample clip that comes with the package."""
+"""The sample clips that come with the package."""
 
 from __future__ import annotations
 
@@ -8,16 +8,23 @@ from pathlib import Path
 from quest.data.frame_source import FrameSource, Reader, ReadOptions
 from quest.errors import RecordingError
 
-SAMPLE = "sample"
+SAMPLES = ("sample", "sample-alarm")
+"""In both a door and a drawer open. In the first their handles are occluded for a while; in the second the door's is
+lost while it is occluded, which an alarm says, and found again."""
 
 
-def sample_folder() -> Path:
-    """Recording folder of the sample: a procedural cabinet whose doors and drawers open one after the other.
+def sample_folder(name: str = "sample") -> Path:
+    """Recording folder of a sample clip: a procedural cabinet, in colours and depth.
+
+    Args:
+        name: one of :data:`SAMPLES`.
 
     Raises:
-        RecordingError: the installed package lacks it.
+        RecordingError: there is no such clip, or the installed package lacks it.
     """
-    folder = Path(str(resources.files("quest") / "assets" / SAMPLE))
+    if name not in SAMPLES:
+        raise RecordingError(f"sample clip {name!r}: expected one of {', '.join(SAMPLES)}")
+    folder = Path(str(resources.files("quest") / "assets" / name))
     if not (folder / "camera.json").is_file():
         raise RecordingError(f"{folder}: the sample clip is missing from the installed package; install it again")
     return folder
@@ -26,7 +33,7 @@ def sample_folder() -> Path:
 def _open(where: str, options: ReadOptions) -> FrameSource:
     from quest.data.folder import READER as FOLDER
 
-    return FOLDER.open(str(sample_folder()), options)
+    return FOLDER.open(str(sample_folder(where)), options)
 
 
-READER = Reader("the packaged clip", SAMPLE, lambda where: where == SAMPLE and not Path(where).exists(), _open)
+READER = Reader("a packaged clip", SAMPLES[0], lambda where: where in SAMPLES and not Path(where).exists(), _open)
