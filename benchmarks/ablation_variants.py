@@ -8,8 +8,11 @@ from typing import Literal
 
 from quest.baselines import TRACKERS
 from quest.errors import ConfigError
-from quest.model.config import PRESETS, NetworkConfig
-from quest.train.settings import LOSSES, LossWeights, WindowConfig
+from quest.model.config import DEFAULT, DecoderConfig, NetworkConfig
+from quest.paper.network import PaperConfig
+from quest.paper.objective import LOSSES as PAPER_LOSSES
+from quest.train.objective import LOSSES
+from quest.train.settings import WindowConfig
 
 TableName = Literal["parts", "window", "slots", "losses", "design", "data"]
 PresetName = Literal["default", "paper"]
@@ -19,8 +22,8 @@ LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 """Losses that know of 3D; the others are of pixels, features and confidences."""
 
 LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
-    "default": ("aff", "heat", "point", "vel", "acc", "conf", "feat", "geo", "map", "joint"),
-    "paper": ("aff", "vel", "acc", "conf", "bound", "feat", "geo", "map"),
+    "default": tuple(name for name in LOSSES if name != "bound"),  # a heatmap's coordinates cannot leave the image
+    "paper": tuple(PAPER_LOSSES),
 }
 """Losses that are not zero by construction."""
 
@@ -32,7 +35,7 @@ class Variant:
     Attributes:
         name: of its folder.
         network: what it is.
-        losses: their weights.
+        losses: weights of losses that differ from the preset's.
         windows: how windows are drawn.
         flow: whether stage 2 trains a flow head.
         no_depth: whether it never sees depth.
@@ -40,8 +43,8 @@ class Variant:
     """
 
     name: str
-    network: NetworkConfig
-    losses: LossWeights = field(default_factory=LossWeights)
+    network: DecoderConfig
+    losses: dict[str, float] = field(default_factory=dict)
     windows: WindowConfig = field(default_factory=WindowConfig)
     flow: bool = False
     no_depth: bool = False
@@ -65,32 +68,33 @@ class Line:
     reference: str | None = None
 
 
-_NETWORKS = {**PRESETS, "default": replace(PRESETS["default"], map_layers=0)}
+_NETWORKS: dict[PresetName, DecoderConfig] = {"default": replace(DEFAULT, map_layers=0), "paper": PaperConfig()}
 """The presets, but for the default's map: it is read off what queries look at, so that stage 1 trains all of it."""
 
 
 def full(preset: PresetName) -> Variant:
     """A preset; the default one has a flow head, which changes nothing else."""
-    return Variant(preset, _NETWORKS[preset], losses=LOSSES[preset], flow=preset == "default")
+    return Variant(preset, _NETWORKS[preset], flow=preset == "default")
 
 
 def changed(preset: PresetName, name: str, **fields: object) -> Variant:
     """A preset with other fields of the network."""
     network = replace(_NETWORKS[preset], **fields)  # type: ignore[arg-type]
-    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network, LOSSES[preset])
+    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network)
 
 
 def without(preset: PresetName, name: str, *losses: str) -> Variant:
     """A preset trained without some losses."""
-    return Variant(
-        f"{preset}-no-{name}", _NETWORKS[preset], losses=replace(LOSSES[preset], **dict.fromkeys(losses, 0.0))
-    )
+    off = dict.fromkeys((loss for loss in losses if loss in LOSSES_OF[preset]), 0.0)
+    return Variant(f"{preset}-no-{name}", _NETWORKS[preset], losses=off)
 
 
 def no_3d(preset: PresetName) -> Variant:
     """Pixel losses alone, and no depth in the network: neither as position codes nor as a window's input."""
     flat = without(preset, "3d", *LOSSES_3D)
-    network = replace(flat.network, points3d=False)
+    network = flat.network
+    if isinstance(network, NetworkConfig):  # the paper's never sees depth
+        network = replace(network, points3d=False)
     return replace(flat, network=network, windows=WindowConfig(depth_drop_share=1.0), no_depth=True)
 
 
@@ -185,19 +189,11 @@ def _losses(preset: PresetName) -> list[Line]:
 
 
 def _design(preset: PresetName) -> list[Line]:
+    if preset != "default":
+        return []
     own = f"{preset}: as it is"
-    lines = [Line(own, full(preset))]
-    if preset == "default":
-        codes = changed(preset, "no-points3d", points3d=False)
-        learned = changed(preset, "learned", queries="learned", head="regression")
-        lines += [
-            Line(f"{preset}: no 3D position codes", codes, "quest", own),
-            Line(f"{preset}: learned queries, coordinates by regression", learned, "quest", own),
-        ]
-    else:
-        codes = changed(preset, "points3d", points3d=True)
-        lines.append(Line(f"{preset}: 3D position codes", codes, "quest", own))
-    return lines
+    codes = changed(preset, "no-points3d", points3d=False)
+    return [Line(own, full(preset)), Line(f"{preset}: no 3D position codes", codes, "quest", own)]
 
 
 def _data(preset: PresetName) -> list[Line]:

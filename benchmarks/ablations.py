@@ -29,6 +29,7 @@ from ablation_variants import TABLES, Line, PresetName, TableName, Variant, chos
 from cached_encoder import CachedEncoder
 from rich.console import Console
 
+import quest
 from quest.baselines import TRACKERS, Shared
 from quest.baselines.flow_chain import units_of
 from quest.baselines.memory import remember_frames
@@ -43,9 +44,12 @@ from quest.evaluation.results import Results, Run, read_results, records_path, w
 from quest.evaluation.runner import evaluate, has_protocol
 from quest.evaluation.selection import SplitPart, select_takes
 from quest.evaluation.tuning import discovery_bias
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig, NetworkConfig
+from quest.model.network import QuestNetwork, WindowNetwork
 from quest.model.weights import load_network, save_network
-from quest.track import Tracker, TrackerConfig, load
+from quest.paper.network import PaperConfig, PaperNetwork
+from quest.paper.objective import PaperStageOne
+from quest.track import Tracker, TrackerConfig
 from quest.track.settings import REVISION
 from quest.track.tracker import pick_device
 from quest.train.checkpoint import load_checkpoint
@@ -146,20 +150,29 @@ class Ablations:
         if weights.exists():
             return weights
         torch.manual_seed(seed)
+        about = f"ablation {item.name}, seed {seed}, {self.steps} steps of {self.batch} windows"
+        if isinstance(item.network, PaperConfig):
+            paper = PaperNetwork(item.network)
+            paper.encoder.load_state_dict(encoder)
+            dataset = self._dataset(paper, item)
+            self._fit(PaperStageOne(paper, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
+            paper.save(weights, about=about)
+            return weights
+        assert isinstance(item.network, NetworkConfig)
         network = QuestNetwork(item.network)
         network.encoder.load_state_dict(encoder)
         dataset = self._dataset(network, item)
-        network = self._fit(StageOne(network, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
+        self._fit(StageOne(network, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
         if item.flow:
             torch.manual_seed(seed)
             network = with_flow_head(network)
-            network = self._fit(StageTwo(network), dataset, self.flow_steps, seed, folder / "stage-2", console)
+            second = StageTwo(network, StageOne(network).answered)
+            self._fit(second, dataset, self.flow_steps, seed, folder / "stage-2", console)
         settings = self._settings_of_tracker(network, item)
-        about = f"ablation {item.name}, seed {seed}, {self.steps} steps of {self.batch} windows"
         save_network(weights, network, settings=settings.to_json(), about=about)
         return weights
 
-    def _dataset(self, network: QuestNetwork, item: Variant) -> Dataset:
+    def _dataset(self, network: WindowNetwork[DecoderConfig], item: Variant) -> Dataset:
         return open_dataset(
             network,
             stores=self.train,
@@ -172,9 +185,7 @@ class Ablations:
             sources=item.sources,
         )
 
-    def _fit(
-        self, objective: Objective, dataset: Dataset, steps: int, seed: int, out: Path, console: Console
-    ) -> QuestNetwork:
+    def _fit(self, objective: Objective, dataset: Dataset, steps: int, seed: int, out: Path, console: Console) -> None:
         """Train for so many steps; the only validation is the last step's, so that the best are the last weights."""
 
         def report(done: StepReport) -> None:
@@ -192,15 +203,12 @@ class Ablations:
             seed=seed,
         )
         best = fit(objective, dataset.training, dataset.validation, config, out=out, report=report)
-        network = objective.network.cpu()
-        load_checkpoint(best, network, None)
-        return network.eval()
+        load_checkpoint(best, objective.network.cpu(), None)
+        objective.network.eval()
 
     def _settings_of_tracker(self, network: QuestNetwork, item: Variant) -> TrackerConfig:
         """The tracker's settings as they come, but for the threshold of discovery."""
         config = TrackerConfig()
-        if network.config.head != "heatmap":
-            return config
         tracker = Tracker(network, config, device=pick_device("auto"))
         tracker = PixelsOnly.without_depth(tracker) if item.no_depth else tracker
         stores = [TakeStore(path) for path in self.validation]
@@ -218,7 +226,7 @@ class Ablations:
             "optimizer": self.optimizer,
             "learning_rate": self.learning_rate,
             "network": json.loads(item.network.to_json()),
-            "losses": asdict(item.losses),
+            "losses": item.losses,
             "windows": asdict(item.windows),
             "sources": None if item.sources is None else list(item.sources),
             "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
@@ -266,9 +274,10 @@ class Ablations:
         missing = [name for name in names if not self._answered(item, seed, name, weights, test)]
         if not missing:
             return
-        tracker = load(weights)
+        tracker = quest.load(weights)
         cached.serve(tracker.network)
-        remember_frames(tracker.network, capacity=1000)
+        if isinstance(tracker, Tracker):
+            remember_frames(tracker.network, capacity=1000)
         for name in missing:
             start_s = time.monotonic()
             one = self._tracker(tracker, name, test, seed)

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig
+from quest.model.network import WindowNetwork
 from quest.train.feature_cache import CachedView
 
 
@@ -26,7 +27,7 @@ class CachedEncoder:
             for t, image in enumerate(view.rgb):
                 self._place[_digest(image)] = (view, t)
 
-    def serve(self, network: QuestNetwork) -> None:
+    def serve(self, network: WindowNetwork[DecoderConfig]) -> None:
         """Make a network read features instead of computing them; frames that are not there are still encoded.
 
         Args:

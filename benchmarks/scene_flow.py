@@ -8,7 +8,7 @@ kept. The result file is written anew after each take, and says until the last o
 
 Every frame of a view is the newest one of a window of the network's T frames, a stride apart, and every scored entity
 is asked for its displacement one stride on. Queries are bound as in the protocol point, at one frame: that of the first
-eight in which most entities are seen; learned slots are matched to entities there. What each answer rests on:
+eight in which most entities are seen. What each answer rests on:
 
 - ``head``: the flow head, which sees the window;
 - ``zero``: nothing moves; sees nothing;
@@ -263,8 +263,8 @@ def _plans(view: CachedView, anchor: int, *, window: int, stride: int, batch: in
 
 def _answers(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, "B K"]]:
     with torch.inference_mode():
-        prediction = roll_out(network, frames, truth).prediction
-        flow = network.displace(prediction)
+        answered = roll_out(network, frames, truth)
+        flow = network.displace(answered.embedding, answered.point)
     newest = frames.during(slice(-2, None))
     uv_px = truth.uv[:, -2:].nan_to_num(-1) * network.config.encoder.image_size
     seen = truth.visible[:, -2:].unsqueeze(-1)
@@ -272,7 +272,7 @@ def _answers(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> d
     answers = {
         "head": flow,
         "zero": torch.zeros_like(flow),
-        "lifted": _difference(prediction.point[:, -2:]),
+        "lifted": _difference(answered.point[:, -2:]),
         "lifted-truth": _difference(at_truth),
     }
     return {name: (a - truth.flow).norm(dim=-1) / truth.unit[:, None] for name, a in answers.items()}

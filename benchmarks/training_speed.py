@@ -20,7 +20,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,13 +32,14 @@ from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import device_name, provenance, write_report
-from quest.model.config import PRESETS
+from quest.model.config import DEFAULT
 from quest.model.network import QuestNetwork
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
+from quest.train.losses import weighted_sum
 from quest.train.optimizer import make_optimizer
-from quest.train.settings import LossWeights, TrainingConfig, WindowConfig
+from quest.train.settings import TrainingConfig, WindowConfig
 from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler
 
@@ -55,8 +56,6 @@ class TrainingSpeed:
     """Turns of each."""
     steps: int = 8
     """Steps of a turn that are timed."""
-    preset: Literal["default", "paper"] = "default"
-    """Network."""
     cache: Path | None = None
     """Folder of the feature cache; a temporary one by default."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -69,7 +68,7 @@ class TrainingSpeed:
     def run(self) -> int:
         """Time both in turn and print means with 95 % bootstrap intervals over turns."""
         torch.manual_seed(self.training.seed)
-        network = QuestNetwork(PRESETS[self.preset])
+        network = QuestNetwork(DEFAULT)
         fabric = launch(replace(self.training, devices=1))
         with tempfile.TemporaryDirectory() as scratch:
             sampler, data_hash = self._sampler(network, self.cache or Path(scratch) / "cache", fabric.device)
@@ -78,7 +77,7 @@ class TrainingSpeed:
         result = _summary(np.array(turns), frames)
         Console(highlight=False).print_json(data=result)
         if self.out is not None:
-            about = {"preset": self.preset, "batch": self.windows.batch}
+            about = {"preset": "default", "batch": self.windows.batch}
             about |= {
                 name: getattr(self.training, name) for name in ("precision", "optimizer", "accumulate", "compile")
             }
@@ -119,7 +118,7 @@ class TrainingSpeed:
                 if len(turns) > self.blocks:
                     raise _EnoughError
 
-        objective = StageOne(network, LossWeights())
+        objective = StageOne(network)
         with suppress(_EnoughError):
             fit(objective, sampler, sampler, config, out=scratch / "run", report=stepped, fabric=fabric)
         return turns[1:]  # the first turn warms up
@@ -136,7 +135,7 @@ class _Bare:
         self, network: QuestNetwork, sampler: WindowSampler, config: TrainingConfig, autocast: Callable[[], Any]
     ) -> None:
         network.encoder.requires_grad_(False)
-        self.objective = StageOne(network.train(), LossWeights())
+        self.objective = StageOne(network.train())
         self.optimizer = make_optimizer(network, network.trainable(), replace(config, learning_rate=1e-5))
         self.autocast = autocast
         self.device = next(network.parameters()).device
@@ -157,7 +156,7 @@ class _Bare:
     def _step(self, i: int) -> None:
         self.optimizer.zero_grad(set_to_none=True)
         with self.autocast():
-            loss, _ = self.objective.losses(*self.batches[i % len(self.batches)])
+            loss = weighted_sum(self.objective.losses(*self.batches[i % len(self.batches)]), self.objective.weights)
         loss.backward()
         self.optimizer.step()
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import TypeCheckError
 
 from quest.errors import InputError
-from quest.model.config import NetworkConfig
+from quest.model.config import DecoderConfig, NetworkConfig
 from quest.model.encoder import EncoderConfig
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, cell_depth, reference_of
@@ -29,18 +29,7 @@ DEFAULT = NetworkConfig(
 )
 """The preset ``default``, tiny."""
 
-PAPER = replace(
-    DEFAULT,
-    preset="paper",
-    queries="learned",
-    head="regression",
-    token_layers=0,
-    slots=5,
-    points3d=False,
-    intents=False,
-    map_layers=0,
-)
-"""The preset ``paper``, tiny."""
+Network = TypeVar("Network", bound=torch.nn.Module)
 
 
 def make_network(config: NetworkConfig = DEFAULT, *, seed: int = 0, **changes: Any) -> QuestNetwork:
@@ -48,6 +37,11 @@ def make_network(config: NetworkConfig = DEFAULT, *, seed: int = 0, **changes: A
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         network = QuestNetwork(replace(config, **changes))
+    return shaken(network, seed=seed)
+
+
+def shaken(network: Network, *, seed: int = 0) -> Network:
+    """The network in evaluation mode with some noise on every weight, so that none is trivial."""
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
         for parameter in network.parameters():
@@ -57,7 +51,7 @@ def make_network(config: NetworkConfig = DEFAULT, *, seed: int = 0, **changes: A
 
 
 def make_frames(
-    config: NetworkConfig = DEFAULT, *, batch: int = 2, frames: int = 4, seed: int = 0, depth: bool = True
+    config: DecoderConfig = DEFAULT, *, batch: int = 2, frames: int = 4, seed: int = 0, depth: bool = True
 ) -> FrameBatch:
     """Random frames of a camera that moves a little; a fifth of the depth is missing, or all."""
     generator = torch.Generator().manual_seed(seed)

@@ -9,6 +9,8 @@ from quest.types import LABELS, Camera, Clip, Frame, Joints, Query, State, Track
 
 if TYPE_CHECKING:
     from quest.data.recording import read_recording as read
+
+    # Of weights of the published network it gives a PaperTracker, whose only door is the same ``track``.
     from quest.track import Stream, StreamState, Tracker, load
 
 __version__ = "0.1.0"
@@ -36,7 +38,11 @@ def __getattr__(name: str) -> object:
         from quest.data.recording import read_recording as read
 
         return read
-    if name in {"Stream", "StreamState", "Tracker", "load"}:
+    if name == "load":
+        from quest.paper.tracker import load
+
+        return load
+    if name in {"Stream", "StreamState", "Tracker"}:
         from quest import track
 
         return getattr(track, name)

@@ -19,7 +19,9 @@ from quest.tracks import Joints as Joints
 from quest.tracks import State as State
 from quest.tracks import Tracks as Tracks
 
-LABELS = ("handle", "knob", "rim", "front")
+GRIPS = ("handle", "knob")
+"""Labels of parts made to be gripped, which have an outline of their own; the others are places on a link."""
+LABELS = (*GRIPS, "rim", "front")
 """Labels of the entities that a tracker follows, in the order of the network's outputs."""
 INTENTS = ("open", "lift")
 """What one takes hold of an entity for: to move its joint, or to lift the whole thing by its base."""

@@ -16,7 +16,7 @@ from quest.errors import ConfigError, InputError, WeightsError
 from quest.geometry import project, transform
 from quest.types import Clip, Query, State, Take
 from tests.synthetic import make_take
-from tests.tiny import PAPER, make_network
+from tests.tiny import make_network
 
 CPU = torch.device("cpu")
 
@@ -88,11 +88,6 @@ def test_detections_lie_in_the_image_and_above_the_threshold(take: Take) -> None
     assert (found.confidence > 0.5).all()
     nothing = Detector(make_network(), device=CPU, min_logit=100.0)
     assert nothing.detect(clip, nothing.frames(clip), 0).uv_px.shape == (0, 2)
-
-
-def test_learned_queries_have_no_map() -> None:
-    with pytest.raises(WeightsError, match="affordance map"):
-        Detector(make_network(PAPER), device=CPU)
 
 
 def test_link_makes_most_pairs_then_the_least_distance() -> None:
@@ -192,7 +187,7 @@ def test_flow_moves_by_the_heads_displacement(take: Take) -> None:
     clip = take.views[0].clip
     chain = make_flow_chain()
     network = chain.detector.network
-    network.displace = lambda prediction: torch.full((1, prediction.uv.shape[2], 3), 0.01)  # type: ignore[method-assign]
+    network.displace = lambda embedding, point: torch.full((1, point.shape[2], 3), 0.01)  # type: ignore[method-assign]
     frames = ClipFrames(network, clip, device=CPU)
     tracks = chain.track(clip, [Query.point(0, 30.0, 20.0)])
     expected = frames.to_world(torch.full((1, 3), 0.01))

@@ -13,6 +13,7 @@ from benchmarks.ablation_rows import AblationRow, Answers, ablation_rows
 from benchmarks.cached_encoder import CachedEncoder
 from quest.errors import InputError
 from quest.evaluation.records import Discovery, EntityRecord
+from quest.model.config import NetworkConfig
 from quest.train.feature_cache import FeatureCache
 from tests.evaluation.answers import make_answer
 from tests.tiny import make_network
@@ -124,10 +125,8 @@ def test_what_does_not_belong_together_is_refused() -> None:
 
 
 def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
-    from dataclasses import fields
-
     from quest.baselines import TRACKERS
-    from quest.train.settings import LossWeights
+    from quest.paper.network import PaperConfig
 
     both = ("default", "paper")
     tables = {table: variants.lines_of(table, both) for table in variants.TABLES}
@@ -140,21 +139,24 @@ def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
     for lines in tables.values():
         for line in lines:
             assert by_name.setdefault(line.variant.name, line.variant) == line.variant
-    windows = {(line.variant.network.preset, line.variant.network.window) for line in tables["window"]}
-    assert windows == {(p, t) for p in both for t in (2, 4, 8)}
+    windows = {
+        (isinstance(line.variant.network, PaperConfig), line.variant.network.window) for line in tables["window"]
+    }
+    assert windows == {(paper, t) for paper in (False, True) for t in (2, 4, 8)}
     assert {line.variant.network.slots for line in tables["slots"]} == {4, 8, 16}
     some = variants.chosen_lines(variants.TABLES, both, ("default-no-aff",))
     assert {t: [line.label for line in lines] for t, lines in some.items()} == {
         "losses": ["default: all losses", "default: no aff"]
     }
     assert "slots" not in variants.chosen_lines(variants.TABLES, ("default",), ())
-    off = {f.name for f in fields(LossWeights)}
-    assert off == {name for line in tables["losses"] for name in off if getattr(line.variant.losses, name) == 0}
+    off = {name for line in tables["losses"] for name in line.variant.losses}
+    assert off == {name for names in variants.LOSSES_OF.values() for name in names}
     assert [line.variant.sources for line in tables["data"]] == [None, ("procedural",)]
     flat = next(line.variant for line in tables["parts"] if line.label == "default: no 3D")
+    assert isinstance(flat.network, NetworkConfig)
     assert not flat.network.points3d
     assert flat.windows.depth_drop_share == 1.0
-    assert flat.losses.aff > 0 == flat.losses.point == flat.losses.joint
+    assert flat.losses == dict.fromkeys(("point", "vel", "acc", "geo", "joint"), 0.0)
 
 
 def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from safetensors.torch import save_file
 
 from quest.cli.main import main
 from quest.data.store import TakeStore
-from quest.model.config import PRESETS
 from quest.model.weights import load_network, save_network
 from quest.track import TrackerConfig
 from quest.tracks import read_tracks
@@ -58,7 +57,7 @@ def one_line(text: str) -> bool:
 
 @pytest.mark.slow
 def test_train_resume_track_evaluate(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.setitem(PRESETS, "default", DEFAULT)
+    monkeypatch.setattr("quest.model.config.DEFAULT", DEFAULT)
     out = tmp_path / "run"
     train = ["train", "--data", str(store), "--out", str(out), *QUICK]
     assert main([*train, "--encoder", str(encoder)]) == 0

@@ -10,17 +10,23 @@ import torch
 
 from quest.errors import ConfigError
 from quest.model.config import NetworkConfig
-from quest.model.decoder import Prediction
 from quest.model.flow_head import REST, FlowHead
-from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+from tests.tiny import DEFAULT, make_frames, make_network
 
-CONFIGS = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
+FLAT = replace(DEFAULT, points3d=False)
+"""As the published network's: embeddings are all there is."""
+
+CONFIGS = pytest.mark.parametrize("config", [DEFAULT, FLAT], ids=lambda c: f"points3d {c.points3d}")
 
 
 def inputs(config: NetworkConfig, *, frames: int = 4) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     embedding = torch.randn(2, frames, 3, config.width, generator=generator)
     return embedding, torch.randn(2, frames, 3, 3, generator=generator)
+
+
+def fresh(config: NetworkConfig) -> FlowHead:
+    return FlowHead(config.width, window=config.window, points3d=config.points3d)
 
 
 def lively(config: NetworkConfig) -> FlowHead:
@@ -32,7 +38,7 @@ def lively(config: NetworkConfig) -> FlowHead:
 
 @CONFIGS
 def test_it_starts_by_saying_that_nothing_moves(config: NetworkConfig):
-    assert (FlowHead(config)(*inputs(config)) == 0).all()
+    assert (fresh(config)(*inputs(config)) == 0).all()
 
 
 @CONFIGS
@@ -100,27 +106,22 @@ def test_queries_do_not_know_of_each_other(config: NetworkConfig):
 
 @CONFIGS
 def test_the_network_displaces(config: NetworkConfig):
-    """Through the network, for anchored queries and for slots."""
-    network = make_network(replace(config, flow=True))
-    frames = make_frames(config)
+    network, frames = make_network(replace(config, flow=True)), make_frames(config)
     observed = network.observe(frames)
-    if config.queries == "anchored":
-        uv = torch.full((2, 3, 2), 0.4)
-        label = torch.zeros(2, 3, dtype=torch.long)
-        anchor = network.bind(observed.during(slice(0, 1)), uv, torch.zeros(2, 3, 3), label, label == 0)
-    else:
-        anchor = network.slots(2)
-    prediction: Prediction = network.decode(anchor, observed, frames)
-    assert network.displace(prediction).shape == (2, prediction.uv.shape[2], 3)
+    uv = torch.full((2, 3, 2), 0.4)
+    label = torch.zeros(2, 3, dtype=torch.long)
+    anchor = network.bind(observed.during(slice(0, 1)), uv, torch.zeros(2, 3, 3), label, label == 0)
+    seen = network.decode(anchor, observed)
+    assert network.displace(seen.embedding, seen.point).shape == (2, 3, 3)
     with pytest.raises(ConfigError, match="stage 2"):
-        make_network(config).displace(prediction)
+        make_network(config).displace(seen.embedding, seen.point)
 
 
 @pytest.mark.slow
 def test_it_learns_to_go_on():
     """Steady motion of any size and direction goes on, rest stays rest; embeddings tell nothing here."""
     torch.manual_seed(0)
-    head = FlowHead(DEFAULT)
+    head = fresh(DEFAULT)
     optimizer = torch.optim.AdamW(head.parameters(), lr=3e-3)
     time = torch.arange(5.0)[:, None, None]
 

@@ -13,7 +13,7 @@ from quest.errors import WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.merge import merge
 from quest.model.weights import LoadedNetwork, load_network, save_network
-from tests.tiny import DEFAULT, PAPER, make_network
+from tests.tiny import DEFAULT, make_network
 
 
 def write(path: Path, config: NetworkConfig = DEFAULT, *, add: float = 0.0, to: str = "affordance") -> LoadedNetwork:
@@ -84,7 +84,7 @@ def test_what_does_not_fit_is_refused(tmp_path: Path):
     with pytest.raises(WeightsError, match=r"map was trained behind another encoder\."):
         merge(base, maps=[write(tmp_path / "e.safetensors", add=1.0, to="encoder.")])
     with pytest.raises(WeightsError, match="another shape"):
-        merge(base, maps=[write(tmp_path / "paper.safetensors", PAPER)])
+        merge(base, maps=[write(tmp_path / "wide.safetensors", replace(DEFAULT, width=64))])
     old = write(tmp_path / "old.safetensors", replace(DEFAULT, map_layers=0))
     with pytest.raises(WeightsError, match="no trunk of its own"):
         merge(old, maps=[old])

@@ -8,18 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from quest.errors import ConfigError
 from quest.model.affordance import AffordanceMap
-from quest.model.config import PRESETS, NetworkConfig
-from quest.model.decoder import Anchor, HeatmapHead, Prediction, sample_grid
+from quest.model.decoder import Anchor, Prediction, sample_grid
 from quest.model.discovery import find_peaks
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL, QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.types import INTENTS, LABELS
-from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+from tests.tiny import DEFAULT, make_frames, make_network
 from tests.tolerances import NETWORK, NETWORK_DEEP
-
-BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 
 
 @pytest.fixture(autouse=True)
@@ -29,9 +25,7 @@ def _no_grad():
 
 
 def bound(network: QuestNetwork, frames: FrameBatch, *, queries: int = 3, seed: int = 0) -> Anchor:
-    """Queries bound at the first frame; learned ones if the network has them."""
-    if network.config.queries == "learned":
-        return network.slots(len(frames.scale))
+    """Queries bound at the first frame."""
     generator = torch.Generator().manual_seed(seed)
     uv = torch.rand(len(frames.scale), queries, 2, generator=generator)
     label = torch.arange(queries).expand(len(uv), -1) % (UNKNOWN_LABEL + 1)
@@ -42,7 +36,7 @@ def bound(network: QuestNetwork, frames: FrameBatch, *, queries: int = 3, seed: 
 
 
 def answers(network: QuestNetwork, anchor: Anchor, frames: FrameBatch) -> dict[str, Tensor]:
-    prediction = network.decode(anchor, network.observe(frames), frames)
+    prediction = network.decode(anchor, network.observe(frames))
     return {name: getattr(prediction, name) for name in Prediction.__dataclass_fields__}
 
 
@@ -53,41 +47,36 @@ def assert_same(got: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
         )
 
 
-@BOTH
 @pytest.mark.parametrize("frames_in_window", [1, 2, 4])
-def test_shapes(config: NetworkConfig, frames_in_window: int):
-    network, frames = make_network(config), make_frames(config, frames=frames_in_window)
+def test_shapes(frames_in_window: int):
+    network, frames = make_network(), make_frames(frames=frames_in_window)
     got = answers(network, bound(network, frames), frames)
-    k = 3 if config.queries == "anchored" else config.slots
-    assert got["uv"].shape == (2, frames_in_window, k, 2)
-    assert got["point"].shape == (2, frames_in_window, k, 3)
-    assert got["logits"].shape == (2, frames_in_window, k, 64 if config.head == "heatmap" else 0)
+    assert got["uv"].shape == (2, frames_in_window, 3, 2)
+    assert got["point"].shape == (2, frames_in_window, 3, 3)
+    assert got["logits"].shape == (2, frames_in_window, 3, 64)
     assert got["uv"].isfinite().all()
 
 
-@BOTH
-def test_batch_elements_are_independent(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config, batch=3)
+def test_batch_elements_are_independent():
+    network, frames = make_network(), make_frames(batch=3)
     anchor = bound(network, frames)
     alone = frames.of(slice(1, 2))
     got = answers(network, Anchor(anchor.content[1:2], anchor.template[1:2], anchor.valid[1:2]), alone)
     assert_same(got, {name: value[1:2] for name, value in answers(network, anchor, frames).items()})
 
 
-@BOTH
-def test_permuting_queries_permutes_answers(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config)
+def test_permuting_queries_permutes_answers():
+    network, frames = make_network(), make_frames()
     anchor = bound(network, frames)
     order = torch.randperm(anchor.valid.shape[1], generator=torch.Generator().manual_seed(3))
     got = answers(network, Anchor(anchor.content[:, order], anchor.template[:, order], anchor.valid[:, order]), frames)
     assert_same(got, {name: value[:, :, order] for name, value in answers(network, anchor, frames).items()})
 
 
-@BOTH
-def test_later_frames_do_not_change_earlier_answers(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config)
+def test_later_frames_do_not_change_earlier_answers():
+    network, frames = make_network(), make_frames()
     anchor = bound(network, frames)
-    other = make_frames(config, seed=1)
+    other = make_frames(seed=1)
     changed = replace(
         frames,
         **{
@@ -100,9 +89,8 @@ def test_later_frames_do_not_change_earlier_answers(config: NetworkConfig):
     assert not torch.allclose(before["embedding"][:, 2:], after["embedding"][:, 2:], atol=1e-4)
 
 
-@BOTH
-def test_earlier_frames_do_change_later_answers(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config)
+def test_earlier_frames_do_change_later_answers():
+    network, frames = make_network(), make_frames()
     anchor = bound(network, frames)
     short = answers(network, anchor, frames.during(slice(3, 4)))
     assert not torch.allclose(answers(network, anchor, frames)["embedding"][:, 3:], short["embedding"], atol=1e-4)
@@ -126,9 +114,8 @@ def test_nothing_but_padding_is_no_nan():
     assert answers(network, padding, frames)["uv"].isfinite().all()
 
 
-@BOTH
-def test_without_any_depth_pixels_stay_finite(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config, depth=False)
+def test_without_any_depth_pixels_stay_finite():
+    network, frames = make_network(), make_frames(depth=False)
     got = answers(network, bound(network, frames), frames)
     assert all(value.isfinite().all() for name, value in got.items() if name != "point")
     assert got["point"].isnan().all()
@@ -161,67 +148,12 @@ def test_label_place_and_depth_reach_the_anchor():
         assert not torch.allclose(changed.content, base, atol=1e-3)
 
 
-def test_learned_queries_cannot_be_bound():
-    network, frames = make_network(PAPER), make_frames(PAPER)
-    observed, some = network.observe(frames), torch.zeros(2, 1, 2)
-    with pytest.raises(ConfigError, match="paper"):
-        network.bind(observed, some, torch.zeros(2, 1, 3), torch.zeros(2, 1).long(), torch.ones(2, 1, dtype=torch.bool))
-
-
-def test_learned_queries_begin_a_stream_as_they_begin_a_window():
-    """The answer for a window's i-th frame is that of a stream that has given i frames."""
-    network, frames = make_network(PAPER), make_frames(PAPER)
-    slots = network.slots(2)
-    whole = answers(network, slots, frames)
-    for t in range(1, 4):
-        assert_same(answers(network, slots, frames.during(slice(0, t))), {n: v[:, :t] for n, v in whole.items()})
-
-
-def test_slots_do_not_begin_alike():
-    """Before any training: what they read from the tokens is the same, so it must not drown what they are."""
-    torch.manual_seed(0)
-    network, frames = QuestNetwork(PAPER).eval(), make_frames(PAPER, batch=1)
-    x = network.embed(network.slots(1), network.observe(frames))[0, -1]
-    cosine = torch.nn.functional.cosine_similarity(x[:, None], x[None], dim=-1)
-    assert (cosine - torch.eye(PAPER.slots)).max() < 0.7
-
-
-def test_time_reaches_the_tokens_that_learned_queries_look_at():
-    network, frames = make_network(PAPER), make_frames(PAPER)
-    again = frames.during([2, 2, 2, 2])
-    same = network.decode(network.slots(2), network.observe(again), again).embedding
-    assert not torch.allclose(same[:, 1:], same[:, :-1], atol=1e-4)
-    torch.nn.init.zeros_(network.age)
-    still = network.decode(network.slots(2), network.observe(again), again).embedding
-    torch.testing.assert_close(still[:, 1:], still[:, :-1])
-
-
-def test_the_newest_answer_alone_is_that_of_the_window():
-    network, frames = make_network(PAPER), make_frames(PAPER)
-    slots, observed, newest = network.slots(2), network.observe(frames), slice(-1, None)
-    x = network.embed(slots, observed)[:, newest]
-    got = network.answer(x, slots, observed.during(newest), frames.during(newest))
-    whole = answers(network, slots, frames)
-    assert_same({n: getattr(got, n) for n in whole}, {n: v[:, newest] for n, v in whole.items()})
-
-
-def test_labels_are_read_off_what_slots_see():
-    network, frames = make_network(PAPER), make_frames(PAPER)
-    logits = network.labels(network.decode(network.slots(2), network.observe(frames), frames))
-    assert logits.shape == (2, 4, PAPER.slots, len(LABELS))
-    assert not torch.allclose(logits[0], logits[1], atol=1e-3)
-    default, other = make_network(), make_frames()
-    with pytest.raises(ConfigError, match="default"):
-        default.labels(default.decode(bound(default, other), default.observe(other), other))
-
-
 def test_the_answer_lies_around_the_best_cell():
     """The second look starts at the mean of the 3 x 3 cells and sees four close cells to every side."""
     network, frames = make_network(), make_frames()
     got = answers(network, bound(network, frames), frames)
     assert (got["peak"] == got["logits"].argmax(-1)).all()
     peak = torch.stack((got["peak"] % 8 + 0.5, got["peak"] // 8 + 0.5), dim=-1) / 8
-    assert isinstance(network.head, HeatmapHead)
     for parameter in network.head.look.out.parameters():
         torch.nn.init.zeros_(parameter)
     plain = answers(network, bound(network, frames), frames)
@@ -307,17 +239,3 @@ def test_a_network_without_intents_and_trunk_reads_its_map_off_its_cells():
     peaks = find_peaks(network, frames, network.observe(frames), radius_cells=1.5)
     assert len(peaks.uv) >= 1
     assert (peaks.intent == UNKNOWN_INTENT).all()
-    with pytest.raises(ConfigError, match="no affordance map"):
-        make_network(PAPER).afford(frames, network.observe(frames))
-
-
-@pytest.mark.slow
-def test_the_published_network_runs():
-    torch.manual_seed(0)
-    config = PRESETS["paper"]
-    network, frames = QuestNetwork(config).eval(), make_frames(config, batch=1, frames=2)
-    features = network.encode(frames.rgb[0])
-    assert features.shape == (2, 196, 384)
-    got = answers(network, network.slots(1), replace(frames, features=features[None]))
-    assert got["uv"].shape == (1, 2, 8, 2)
-    assert network.encoder.patch.weight.shape == (384, 3, 16, 16)

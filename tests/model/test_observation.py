@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from quest.geometry import invert, project, transform
-from quest.model.config import NetworkConfig
 from quest.model.observation import FrameBatch, Observation, cell_centres, cell_depth, reference_of
 from quest.types import Camera
-from tests.tiny import DEFAULT, PAPER, make_frames, make_network
+from tests.tiny import DEFAULT, make_frames, make_network
 from tests.tolerances import NETWORK, PIXEL_MOVED
 
 
@@ -131,9 +130,8 @@ def one(frames: FrameBatch, b: int) -> FrameBatch:
     return frames.of(slice(b, b + 1))
 
 
-@pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
-def test_neither_batch_nor_time_mix(config: NetworkConfig):
-    network, frames = make_network(config), make_frames(config, batch=3)
+def test_neither_batch_nor_time_mix():
+    network, frames = make_network(), make_frames(batch=3)
     with torch.no_grad():
         together = network.observe(frames)
         alone = network.observe(one(frames, 1).during(slice(2, 3)))

@@ -11,8 +11,8 @@ from quest.model.affordance import AffordanceMap
 from quest.model.discovery import Candidates, find_candidates, sight
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
-from quest.model.pieces import PIECE_LABELS, PieceHead, groups
-from quest.types import INTENTS, LABELS
+from quest.model.pieces import PieceHead, groups
+from quest.types import GRIPS, INTENTS, LABELS
 from tests.tiny import DEFAULT, make_frames, make_network
 
 HANDLE, KNOB, RIM = (LABELS.index(label) for label in ("handle", "knob", "rim"))
@@ -78,7 +78,7 @@ def test_the_best_score_on_a_piece_counts_whatever_its_purpose():
         patch.setattr(network, "afford", lambda *_: AffordanceMap(logits, torch.zeros(1, 1, 64, len(INTENTS), 2)))
         sighted = sight(network, frames, network.observe(frames), radius_cells=1.5, mirror=False)
     (bar,) = [p for p, shape in enumerate(sighted.pieces.shapes) if len(shape.rows) > 100]
-    assert sighted.pieces.inputs[bar, -len(PIECE_LABELS) :].tolist() == [2.0, -9.0]
+    assert sighted.pieces.inputs[bar, -len(GRIPS) :].tolist() == [2.0, -9.0]
     assert sighted.pieces.purpose[bar, 0] == 1
 
 

@@ -14,7 +14,7 @@ from quest.track.settings import TrackerConfig
 def test_what_goes_back_or_is_found_begins_in_plain_view(found: bool):
     """What hid it, and how often it was refused, was said of where it was before."""
     place = np.zeros(3)
-    query = Following(0, "handle", None, None, Ground(TrackerConfig()), place=place, buried=True, refused=3)
+    query = Following(0, "handle", None, Ground(TrackerConfig()), place=place, buried=True, refused=3)
     query.keep()
     if found:
         query.trust(np.ones(3))

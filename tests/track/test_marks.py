@@ -21,7 +21,7 @@ OWN = np.array([[0.1, 0.2, 0.3]])
 
 
 def make_query() -> Following:
-    return Following(0, "handle", None, None, Ground(TrackerConfig()), asked_px=ASKED_PX)
+    return Following(0, "handle", None, Ground(TrackerConfig()), asked_px=ASKED_PX)
 
 
 def make_prediction(uv_px: torch.Tensor) -> Prediction:

@@ -23,7 +23,7 @@ BLIND_M, COVERED_M = 0.0, 0.1
 def handle_on_a_door() -> Following:
     """Followed while the door opened by 0.8 radians."""
     ground, point = ground_of_a_door()
-    return Following(0, "handle", None, None, ground, place=point)
+    return Following(0, "handle", None, ground, place=point)
 
 
 def seen_at(query: Following, place: np.ndarray, depth_m: float, *, right: float = 0.6) -> float:

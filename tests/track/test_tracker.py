@@ -14,7 +14,6 @@ from quest.data.cut import cut_clip
 from quest.data.recording import read_recording, write_recording
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.grounding import Joint, JointKind
-from quest.model.config import NetworkConfig
 from quest.model.decoder import HeatmapHead
 from quest.model.weights import save_network
 from quest.track import StreamState, Tracker, load
@@ -29,11 +28,10 @@ from quest.track.tracker import (
     pick_device,
 )
 from quest.types import GUESSED_CAMERA, LABELS, Clip, Query, State, Tracks
-from tests.tiny import BAD_INPUT, DEFAULT, PAPER
+from tests.tiny import BAD_INPUT, DEFAULT
 from tests.tolerances import PIXEL, PIXEL_MOVED, POINT, POINT_MOVED
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
-BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
 
 
@@ -50,9 +48,8 @@ def assert_same(got: Tracks, expected: Tracks, *, atol: float = 1e-5) -> None:
     assert (got.state == expected.state).all()
 
 
-@BOTH
-def test_answers(config: NetworkConfig, clip: Clip):
-    tracks = make_tracker(config).track(clip, POINTS)
+def test_answers(clip: Clip):
+    tracks = make_tracker().track(clip, POINTS)
     assert (tracks.names, tracks.labels) == (("a", "b"), (None, "knob"))
     assert tracks.uv_px.shape == (6, 2, 2)
     assert np.isfinite(tracks.uv_px).all()
@@ -62,10 +59,9 @@ def test_answers(config: NetworkConfig, clip: Clip):
     assert tracks.frame_flags == ()
 
 
-@BOTH
 @pytest.mark.parametrize("queries", [POINTS, None], ids=["points", "discovery"])
-def test_stream_equals_clip(config: NetworkConfig, queries: tuple[Query, ...] | None, clip: Clip):
-    tracker = make_tracker(config)
+def test_stream_equals_clip(queries: tuple[Query, ...] | None, clip: Clip):
+    tracker = make_tracker()
     stream, states = tracker.stream(clip.camera, queries), []
     for t in range(len(clip)):
         frame = clip.frame(t)
@@ -73,9 +69,8 @@ def test_stream_equals_clip(config: NetworkConfig, queries: tuple[Query, ...] | 
     assert_same(collect(states, queries), tracker.track(clip, queries))
 
 
-@BOTH
-def test_the_future_is_not_used(config: NetworkConfig, clip: Clip):
-    tracker = make_tracker(config)
+def test_the_future_is_not_used(clip: Clip):
+    tracker = make_tracker()
     whole, start = tracker.track(clip, POINTS), tracker.track(cut_clip(clip, slice(0, 3)), POINTS)
     np.testing.assert_allclose(whole.uv_px[:3], start.uv_px, **PIXEL)
     np.testing.assert_allclose(whole.point_world[:3], start.point_world, **POINT)
@@ -245,10 +240,9 @@ def test_permuting_queries_permutes_tracks(clip: Clip):
     assert_same(tracker.track(clip, POINTS[::-1]), tracker.track(clip, POINTS).select([1, 0]), atol=1e-3)
 
 
-@BOTH
-def test_discovery(config: NetworkConfig, clip: Clip):
-    tracks = make_tracker(config).track(clip)
-    assert 1 <= len(tracks.names) <= config.slots
+def test_discovery(clip: Clip):
+    tracks = make_tracker().track(clip)
+    assert 1 <= len(tracks.names) <= DEFAULT.slots
     assert len(set(tracks.names)) == len(tracks.names)
     assert set(tracks.labels) <= set(LABELS)
     assert np.isfinite(tracks.uv_px).all()
@@ -288,10 +282,9 @@ def test_a_label_that_is_not_there_is_lost_and_flagged(clip: Clip):
     assert "'knob'" in tracks.frame_flags[0]
 
 
-@BOTH
-def test_a_clip_without_depth(config: NetworkConfig, clip: Clip):
+def test_a_clip_without_depth(clip: Clip):
     for dark in (replace(clip, depth_m=None), without_depth(clip, slice(None))):
-        tracks = make_tracker(config).track(dark, POINTS)
+        tracks = make_tracker().track(dark, POINTS)
         assert tracks.frame_flags == (NO_DEPTH_FLAG,)
         assert np.isnan(tracks.point_world).all()
         assert np.isfinite(tracks.uv_px).all()
@@ -352,35 +345,6 @@ def test_world_points_follow_the_world(clip: Clip):
     here, there = tracker.track(clip, POINTS), tracker.track(moved_world(clip, motion), POINTS)
     np.testing.assert_allclose(there.uv_px, here.uv_px, **PIXEL_MOVED)
     np.testing.assert_allclose(there.point_world, here.point_world @ motion[:3, :3].T + motion[:3, 3], **POINT_MOVED)
-
-
-def test_lifted_points_are_where_the_cameras_say(clip: Clip):
-    """What is answered for a pixel with depth is that pixel's world point, in every pose of the camera."""
-    assert clip.depth_m is not None
-    tracker = make_tracker(PAPER)
-    with torch.no_grad():
-        for parameter in tracker.network.head.mlp[-1].parameters():  # type: ignore[union-attr]
-            parameter.mul_(0.3)  # so that random answers stay in the image
-    turn, poses = 0.03, []
-    for t in range(len(clip)):
-        motion = np.eye(4)
-        c, s = np.cos(turn * t), np.sin(turn * t)
-        motion[:3, :3] = [[c, 0, s], [0, 1, 0], [-s, 0, c]]
-        motion[0, 3] = 0.02 * t
-        poses.append(motion @ clip.cam_from_world[t])
-    moving = replace(clip, cam_from_world=np.stack(poses))
-    tracks = tracker.track(moving)
-    camera, checked = clip.camera, 0
-    for t, k in np.ndindex(*tracks.confidence.shape):
-        x, y = tracks.uv_px[t, k]
-        if not (0 <= x < camera.width and 0 <= y < camera.height):
-            continue
-        z = moving.depth_m[t, int(y), int(x)]  # type: ignore[index]
-        cam = np.array([(x - camera.cx) / camera.fx * z, (y - camera.cy) / camera.fy * z, z])
-        back = np.linalg.inv(poses[t]) @ np.append(cam, 1)
-        np.testing.assert_allclose(tracks.point_world[t, k], back[:3], atol=2e-3)
-        checked += 1
-    assert checked > 0
 
 
 def test_memory_is_bounded(clip: Clip):

@@ -16,7 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
-from quest.train.settings import LossWeights, TrainingConfig, WindowConfig
+from quest.train.settings import TrainingConfig, WindowConfig
 from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler
 from tests.tiny import make_network
@@ -41,7 +41,7 @@ def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[floa
     views = FeatureCache(cache, network.config, network.encoder).views(names)
     sampler = WindowSampler(views, network.config, WindowConfig(batch=8))
     reports: list[StepReport] = []
-    objective = StageOne(network, LossWeights())
+    objective = StageOne(network)
     fit(objective, sampler, sampler, config, out=out, report=reports.append, fabric=fabric)
     losses = [report.loss for report in reports]
     if fabric.is_global_zero:

@@ -9,29 +9,34 @@ import pytest
 import torch
 
 from quest.cli.main import main
-from quest.model.config import NetworkConfig
 from quest.model.weights import load_network, save_network
 from quest.train.flow import FlowScores, StageTwo, leaping, with_flow_head, without_flow_head
 from quest.train.loop import StepReport, fit
 from quest.train.settings import TrainingConfig
-from tests.tiny import DEFAULT, PAPER, make_network
+from quest.train.stage import StageOne
+from tests.tiny import DEFAULT, make_network
 from tests.train.prepared import make_sampler, make_store
 
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
 
-CONFIGS = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
 SHORT = TrainingConfig(
     steps=2, warmup_steps=1, learning_rate=1e-3, validate_every=2, validation_batches=4, precision="32-true"
 )
 
 
-@CONFIGS
-def test_only_the_flow_head_learns(tmp_path: Path, config: NetworkConfig):
-    network = with_flow_head(make_network(config))
+def test_only_the_flow_head_learns(tmp_path: Path):
+    network = with_flow_head(make_network())
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}
     sampler, reports = make_sampler(tmp_path, network, batch=4), list[StepReport]()
-    fit(StageTwo(network), sampler, sampler, SHORT, out=tmp_path / "run", report=reports.append)
+    fit(
+        StageTwo(network, StageOne(network).answered),
+        sampler,
+        sampler,
+        SHORT,
+        out=tmp_path / "run",
+        report=reports.append,
+    )
     changed = {name for name, tensor in network.state_dict().items() if not torch.equal(tensor, before[name])}
     assert changed
     assert all(name.startswith("flow.") for name in changed)
@@ -42,25 +47,23 @@ def test_only_the_flow_head_learns(tmp_path: Path, config: NetworkConfig):
     assert "EPE3D" in str(scores)
 
 
-@CONFIGS
-def test_a_new_head_scores_as_zero_flow(tmp_path: Path, config: NetworkConfig):
-    network = with_flow_head(make_network(config))
+def test_a_new_head_scores_as_zero_flow(tmp_path: Path):
+    network = with_flow_head(make_network())
     sampler = make_sampler(tmp_path, network, batch=4)
-    scores = StageTwo(network).validate(sampler, batches=2, device=torch.device("cpu"))
+    scores = StageTwo(network, StageOne(network).answered).validate(sampler, batches=2, device=torch.device("cpu"))
     assert scores.epe == pytest.approx(scores.zero)
     assert scores.epe_moving == pytest.approx(scores.zero_moving)
     assert network.training
 
 
-@CONFIGS
-def test_heads_come_and_go(config: NetworkConfig):
-    network = make_network(config)
+def test_heads_come_and_go():
+    network = make_network()
     assert without_flow_head(network) is network
     grown = with_flow_head(network)
     assert with_flow_head(grown) is grown
-    assert grown.config == replace(config, flow=True)
+    assert grown.config == replace(DEFAULT, flow=True)
     back = without_flow_head(grown)
-    assert back.config == config
+    assert back.config == DEFAULT
     for name, tensor in network.state_dict().items():
         assert torch.equal(back.state_dict()[name], tensor), name
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from quest.errors import ConfigError
 from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
 from quest.train import losses
@@ -166,15 +167,6 @@ def test_confidence_loss():
     lives(loss, logit)
     sure = torch.where(target, 50.0, -50.0)
     assert losses.confidence_loss(sure, target, mask) == approx(0, LOSS)
-
-
-def test_label_loss():
-    logits, label = torch.randn(B, K, 4, requires_grad=True), torch.randint(0, 4, (B, K))
-    mask = torch.tensor([[True, False, True], [False, True, True]])
-    expected = [-float(logits[b, k].log_softmax(-1)[label[b, k]]) for b, k in mask.nonzero().tolist()]
-    loss = losses.label_loss(logits, label, mask)
-    assert float(loss.detach()) == approx(mean(expected), LOSS)
-    lives(loss, logits)
 
 
 def test_bound_loss():
@@ -391,3 +383,14 @@ def test_joint_loss_does_not_know_the_sign_of_an_axis():
     torch.testing.assert_close(
         losses.joint_loss(belief, point, axis, revolute, mask), losses.joint_loss(flipped, point, axis, revolute, mask)
     )
+
+
+def test_weights_come_from_the_table():
+    table = {"near": losses.Loss(2.0, lambda _: torch.zeros(())), "far": losses.Loss(0.5, lambda _: torch.zeros(()))}
+    assert losses.weights_of(table, {}) == {"near": 2.0, "far": 0.5}
+    assert losses.weights_of(table, {"far": 0}) == {"near": 2.0, "far": 0.0}
+    with pytest.raises(ConfigError, match="no 'fra'; expected some of near, far"):
+        losses.weights_of(table, {"fra": 1.0})
+    for wrong in (-1.0, math.nan, math.inf):
+        with pytest.raises(ConfigError, match="far to be at least 0"):
+            losses.weights_of(table, {"far": wrong})

@@ -2,50 +2,42 @@
 
 from __future__ import annotations
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from quest.model.config import NetworkConfig
-from quest.model.decoder import RegressionHead
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
-from quest.train.objective import LossTerms, is_right, roll_out, stage_one
-from quest.train.settings import LossWeights
+from quest.train.losses import weighted_sum, weights_of
+from quest.train.objective import LOSSES, is_right, roll_out
+from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler, WindowTruth
-from tests.tiny import DEFAULT, PAPER, make_network
+from tests.tiny import DEFAULT, make_network
 from tests.train.prepared import make_sampler
 
-BOTH = pytest.mark.parametrize("config", [DEFAULT, PAPER], ids=lambda c: c.preset)
+WEIGHTS = weights_of(LOSSES, {})
 
 
 @pytest.fixture(scope="module")
-def samplers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, WindowSampler]:
-    return {
-        c.preset: make_sampler(tmp_path_factory.mktemp(c.preset), make_network(c), batch=3) for c in (DEFAULT, PAPER)
-    }
+def sampler(tmp_path_factory: pytest.TempPathFactory) -> WindowSampler:
+    return make_sampler(tmp_path_factory.mktemp("objective"), make_network(), batch=3)
 
 
-def draw(samplers: dict[str, WindowSampler], config: NetworkConfig) -> tuple[QuestNetwork, FrameBatch, WindowTruth]:
-    frames, truth = samplers[config.preset].draw(np.random.default_rng(0), disturb=False)
-    return make_network(config), frames, truth
+def draw(sampler: WindowSampler) -> tuple[QuestNetwork, FrameBatch, WindowTruth]:
+    frames, truth = sampler.draw(np.random.default_rng(0), disturb=False)
+    return make_network(), frames, truth
 
 
-@BOTH
-def test_every_loss_is_finite_and_the_gradient_reaches_every_part(samplers, config: NetworkConfig):
-    network, frames, truth = draw(samplers, config)
-    terms, _ = stage_one(network, frames, truth)
-    assert all(getattr(terms, f.name).isfinite() for f in fields(terms))
-    # Random answers of direct regression need not lie where there is depth.
-    always = ("aff", "conf")
-    assert all(
-        getattr(terms, n) > 0 for n in ((*always, "map") if config is PAPER else (*always, "point", "vel", "geo"))
-    )
-    assert (terms.heat > 0) == (config.head == "heatmap")
-    terms.total(LossWeights()).backward()
+def test_every_loss_is_finite_and_the_gradient_reaches_every_part(sampler):
+    network, frames, truth = draw(sampler)
+    values = StageOne(network).losses(frames, truth)
+    assert set(values) == set(LOSSES)
+    assert all(value.isfinite() for value in values.values())
+    assert all(values[name] > 0 for name in ("aff", "heat", "conf", "point", "vel", "geo"))
+    weighted_sum(values, WEIGHTS).backward()
     assert all(p.grad is not None for p in network.trainable())
     assert all(p.grad.isfinite().all() for p in network.trainable() if p.grad is not None)
     still = [n for n, p in network.named_parameters() if p.grad is not None and not p.grad.any()]
@@ -53,37 +45,36 @@ def test_every_loss_is_finite_and_the_gradient_reaches_every_part(samplers, conf
     assert not [n for n in still if not n.endswith(".missing") and "binder.label" not in n]
 
 
-@BOTH
-def test_windows_without_depth_teach_too(samplers, config: NetworkConfig):
-    network, frames, truth = draw(samplers, config)
+def test_windows_without_depth_teach_too(sampler):
+    network, frames, truth = draw(sampler)
     dark = replace(frames, depth_m=0 * frames.depth_m, cell_depth_m=0 * frames.cell_depth_m)
-    terms, roll = stage_one(network, dark, truth)
-    assert roll.prediction.point.isnan().all()
-    terms.total(LossWeights()).backward()
+    values = StageOne(network).losses(dark, truth)
+    assert roll_out(network, dark, truth).point.isnan().all()
+    weighted_sum(values, WEIGHTS).backward()
     assert all(p.grad.isfinite().all() for p in network.trainable() if p.grad is not None)
-    assert terms.aff > 0
-    assert terms.point == 0
+    assert values["aff"] > 0
+    assert values["point"] == 0
 
 
-@BOTH
-def test_nothing_to_learn_from_is_no_nan(samplers, config: NetworkConfig):
-    network, frames, truth = draw(samplers, config)
+def test_nothing_to_learn_from_is_no_nan(sampler):
+    network, frames, truth = draw(sampler)
     nothing = replace(truth, bound=torch.zeros_like(truth.bound), visible=torch.zeros_like(truth.visible))
-    terms, _ = stage_one(network, frames, replace(nothing, uv=torch.full_like(truth.uv, torch.nan)))
-    terms.total(LossWeights()).backward()
+    weighted_sum(
+        StageOne(network).losses(frames, replace(nothing, uv=torch.full_like(truth.uv, torch.nan))), WEIGHTS
+    ).backward()
     assert all(p.grad.isfinite().all() for p in network.trainable() if p.grad is not None)
 
 
-def test_answers_do_not_depend_on_the_truth_of_the_window(samplers):
-    network, frames, truth = draw(samplers, DEFAULT)
+def test_answers_do_not_depend_on_the_truth_of_the_window(sampler):
+    network, frames, truth = draw(sampler)
     lie = replace(truth, uv=torch.cat((truth.uv[:, :1], torch.rand_like(truth.uv[:, 1:])), dim=1))
     honest, taught = roll_out(network, frames, truth), roll_out(network, frames, lie)
     torch.testing.assert_close(honest.prediction.uv, taught.prediction.uv)
     assert not torch.allclose(honest.taught.uv, taught.taught.uv)
 
 
-def test_teaching_refines_around_the_true_cell(samplers):
-    network, frames, truth = draw(samplers, DEFAULT)
+def test_teaching_refines_around_the_true_cell(sampler):
+    network, frames, truth = draw(sampler)
     roll = roll_out(network, frames, truth)
     side = DEFAULT.cells
     for b, t, k in roll.mask.nonzero().tolist():
@@ -92,16 +83,8 @@ def test_teaching_refines_around_the_true_cell(samplers):
         assert int(roll.taught.peak[b, t, k]) == (peak if near else y * side + x)
 
 
-def test_the_total_weighs_every_term():
-    values = torch.arange(1.0, 1 + len(fields(LossTerms)))
-    terms = LossTerms(*values)
-    weights = LossWeights(*(0.5 * v for v in values.tolist()))
-    assert float(terms.total(weights)) == pytest.approx(float((0.5 * values * values).sum()))
-    assert [f.name for f in fields(LossTerms)] == [f.name for f in fields(LossWeights)]
-
-
-def test_is_right_against_a_plain_loop(samplers):
-    _, _, truth = draw(samplers, DEFAULT)
+def test_is_right_against_a_plain_loop(sampler):
+    _, _, truth = draw(sampler)
     b, s, k = truth.visible.shape
     torch.manual_seed(0)
     point = truth.point[:, 1:].clone()
@@ -128,50 +111,18 @@ def test_is_right_against_a_plain_loop(samplers):
 
 
 @pytest.mark.slow
-@BOTH
-def test_a_tiny_set_can_be_learned_by_heart(samplers, config: NetworkConfig):
-    network, frames, truth = draw(samplers, config)
+def test_a_tiny_set_can_be_learned_by_heart(sampler):
+    network, frames, truth = draw(sampler)
     network.train().encoder.requires_grad_(False)
     optimizer = torch.optim.AdamW(network.trainable(), lr=5e-3)
     history = []
     for _ in range(16):
-        terms, _ = stage_one(network, frames, truth)
-        loss = terms.total(LossWeights())
+        loss = weighted_sum(StageOne(network).losses(frames, truth), WEIGHTS)
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
         history.append(float(loss.detach()))
     assert np.mean(history[-3:]) < 0.7 * history[0]
-
-
-def test_learned_queries_keep_their_slot_from_the_anchor_frame_on(samplers):
-    network, frames, truth = draw(samplers, PAPER)
-    roll = roll_out(network, frames, truth)
-    slots, observed = network.slots(3), network.observe(frames)
-    with torch.no_grad():
-        every = network.decode(slots, observed.during(slice(1, None)), frames.during(slice(1, None)))
-        start = network.decode(slots, observed.during(slice(0, 1)), frames.during(slice(0, 1)))
-    assert roll.slots is not None
-    assert (roll.asked == truth.bound).all()
-    for b in range(3):
-        taken = [int(roll.slots.slot[b, k]) for k in truth.bound[b].nonzero().flatten()]
-        assert len(set(taken)) == len(taken)
-    for b, k in truth.bound.nonzero().tolist():
-        slot = int(roll.slots.slot[b, k])
-        torch.testing.assert_close(roll.prediction.uv[b, :, k].detach(), every.uv[b, :, slot])
-        torch.testing.assert_close(roll.slots.prediction.uv[b, 0, slot].detach(), start.uv[b, 0, slot])
-
-
-def test_a_hidden_entity_teaches_no_lifting_of_what_hides_it(samplers):
-    network, frames, truth = draw(samplers, PAPER)
-    assert isinstance(network.head, RegressionHead)
-    for parameter in network.head.mlp[-1].parameters():  # every slot answers the middle, where there is depth
-        torch.nn.init.zeros_(parameter)
-    terms, roll = stage_one(network, frames, truth)
-    assert roll.prediction.point.isfinite().all()
-    hidden = torch.cat((truth.visible[:, :1], torch.zeros_like(truth.visible[:, 1:])), dim=1)
-    assert terms.point > 0
-    assert stage_one(network, frames, replace(truth, visible=hidden))[0].point == 0
 
 
 def test_prepared_views_keep_their_files(tmp_path: Path):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
-from quest.errors import ConfigError
+from quest.errors import ConfigError, WeightsError
 from quest.types import Clip, Query, Tracks
 
 if TYPE_CHECKING:
@@ -126,7 +126,13 @@ def line_up(
     if any(TRACKERS[name].of_weights for name in names):
         import quest
         from quest.baselines.memory import remember_frames
+        from quest.track import Tracker
 
         shared = Shared(quest.load(weights), unit_m, seed)
-        remember_frames(shared.tracker.network, capacity=_REMEMBERED_FRAMES)  # all of them see the same frames
+        if isinstance(shared.tracker, Tracker):
+            remember_frames(shared.tracker.network, capacity=_REMEMBERED_FRAMES)  # all of them see the same frames
+        elif other := [name for name in names if TRACKERS[name].of_weights and name != "quest"]:
+            raise WeightsError(
+                f"tracker {other[0]!r}: these weights are of the published network; use preset default's"
+            )
     return tuple(TRACKERS[name].build(name, shared) for name in dict.fromkeys(names))

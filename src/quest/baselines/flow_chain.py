@@ -140,7 +140,8 @@ class FlowChain:
             asked = torch.from_numpy(valid).to(point.device) & torch.isfinite(uv).all(dim=-1)
             label = torch.full((1, len(point)), UNKNOWN_LABEL, device=point.device)
             anchor = network.bind(observed, uv.nan_to_num(0.5).clamp(0, 1)[None], point[None], label, asked[None])
-            moved = network.displace(network.decode(anchor, frames.window(), batch))[0].float()
+            seen = network.decode(anchor, frames.window())
+            moved = network.displace(seen.embedding, seen.point)[0].float()
         return _where(asked, frames.to_world(moved))
 
 

@@ -19,7 +19,6 @@ from scipy.optimize import linear_sum_assignment
 from quest.baselines.clip_frames import ClipFrames
 from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
 from quest.data.cut import cut_clip
-from quest.errors import WeightsError
 from quest.model.discovery import find_peaks
 from quest.model.network import QuestNetwork
 from quest.types import LABELS, Clip, Query, State, Tracks
@@ -55,9 +54,6 @@ class Detector:
         depth_window_px: odd side of the window whose median depth lifts a pixel.
         autocast: whether the network computes in bfloat16.
         weights_hash: SHA-256 of the file that the network came from, for result files.
-
-    Raises:
-        WeightsError: the network has learned queries and no affordance map.
     """
 
     def __init__(
@@ -71,11 +67,6 @@ class Detector:
         autocast: bool = False,
         weights_hash: str | None = None,
     ) -> None:
-        if network.config.head != "heatmap":
-            raise WeightsError(
-                f"detection: expected weights with a heatmap, got preset {network.config.preset!r} with learned "
-                "queries, which has no affordance map; use weights of preset default"
-            )
         self.network = network.to(device).eval()
         self.device = device
         self.min_logit = min_logit

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,16 +19,18 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from quest.train.settings import LossChanges, TrainingConfig, WindowConfig
+from quest.train.settings import TrainingConfig, WindowConfig
 
 if TYPE_CHECKING:
     import torch
 
-    from quest.model.config import NetworkConfig
-    from quest.model.network import QuestNetwork
+    from quest.model.config import DecoderConfig
+    from quest.model.network import WindowNetwork
     from quest.train.dataset import Dataset
     from quest.train.loop import StepReport
     from quest.train.stage import Objective
+
+C = TypeVar("C", bound="DecoderConfig")
 
 
 @dataclass(frozen=True)
@@ -46,9 +48,19 @@ class NetworkChanges:
     intents: bool | None = None
     """Whether entities to open are told from entities to lift."""
 
-    def apply(self, preset: NetworkConfig) -> NetworkConfig:
-        """The preset with the changes."""
-        return replace(preset, **{name: value for name, value in asdict(self).items() if value is not None})
+    def apply(self, preset: C) -> C:
+        """The preset with the changes.
+
+        Raises:
+            ConfigError: the preset has no such setting.
+        """
+        from quest.errors import ConfigError
+
+        changes = {name: value for name, value in asdict(self).items() if value is not None}
+        for name in changes:
+            if not hasattr(preset, name):
+                raise ConfigError(f"--network.{name}: the network of this preset has no such setting; omit it")
+        return replace(preset, **changes)
 
 
 @dataclass(frozen=True)
@@ -83,8 +95,8 @@ class Train:
     """How to train."""
     windows: WindowConfig = field(default_factory=WindowConfig)
     """How windows are drawn."""
-    losses: LossChanges = field(default_factory=LossChanges)
-    """Which losses of stage 1 count more or less than in the preset."""
+    losses: dict[str, float] = field(default_factory=dict)
+    """Losses of stage 1 that are to count more or less than in the preset, such as vel 0 acc 1; 0 turns one off."""
 
     def run(self) -> int:
         """Prepare, train, write the file."""
@@ -120,39 +132,57 @@ class Train:
     def _start(self) -> _Start:
         """What to train, and what to store with it."""
         from quest.errors import ConfigError
-        from quest.model.config import PRESETS
+        from quest.model.config import DEFAULT
         from quest.model.network import QuestNetwork
-        from quest.model.weights import load_network
+        from quest.paper.network import PaperConfig, PaperNetwork
         from quest.track.settings import TrackerConfig
         from quest.train.dataset import load_initial_encoder
-        from quest.train.flow import with_flow_head, without_flow_head
-        from quest.train.mapping import with_own_map
 
-        if self.stage != 1 and self.losses != LossChanges():
-            raise ConfigError(f"train: stage {self.stage} has a loss of its own; leave --losses.* away")
+        if self.stage != 1 and self.losses:
+            raise ConfigError(f"train: stage {self.stage} has a loss of its own; omit --losses")
         if self.weights is not None:
             if self.encoder is not None:
-                raise ConfigError("train: trained weights have an encoder of their own; leave --encoder away")
+                raise ConfigError("train: trained weights have an encoder of their own; omit --encoder")
             if self.network != NetworkChanges():
-                raise ConfigError("train: trained weights have a network of their own; leave --network.* away")
-            loaded = load_network(self.weights)
-            network, before = loaded.network.train(), f"{loaded.about}; "
-            if self.stage != 1:
-                # Tracking stays as it is, and so does what the monitor was calibrated on.
-                grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
-                return _Start(grown, loaded.settings, loaded.monitor, before, loaded.licence)
-            return _Start(without_flow_head(network), loaded.settings, about=before, licence=loaded.licence)
+                raise ConfigError("train: trained weights have a network of their own; omit --network.*")
+            return self._start_from(self.weights)
         if self.stage != 1:
             raise ConfigError(f"train: stage {self.stage} needs --weights, a network that stage 1 has trained")
         if self.encoder is None:
             raise ConfigError(
                 "train: pass --encoder FILE to start anew, or --weights NAME to start from trained weights"
             )
-        network = QuestNetwork(self.network.apply(PRESETS[self.preset]))
+        if self.preset == "paper":
+            network = PaperNetwork(self.network.apply(PaperConfig()))
+        else:
+            network = QuestNetwork(self.network.apply(DEFAULT))
         load_initial_encoder(network, self.encoder)
         return _Start(network, TrackerConfig().to_json())
 
-    def _dataset(self, network: QuestNetwork, device: torch.device, progress: Progress) -> Dataset:
+    def _start_from(self, weights: str) -> _Start:
+        """Trained weights, with the head that the stage trains."""
+        from quest.errors import ConfigError
+        from quest.model.weights import find_weights, load_network
+        from quest.paper.network import is_paper, read_paper
+        from quest.train.flow import with_flow_head, without_flow_head
+        from quest.train.mapping import with_own_map
+
+        path = find_weights(weights)
+        if is_paper(path):
+            if self.stage == "map":
+                raise ConfigError(f"train: {weights} is the published network, which has no affordance map to train")
+            paper = read_paper(path)
+            network = (with_flow_head if self.stage == 2 else without_flow_head)(paper.network.train())
+            return _Start(network, about=f"{paper.about}; ", licence=paper.licence)
+        loaded = load_network(weights)
+        network, before = loaded.network.train(), f"{loaded.about}; "
+        if self.stage == 1:
+            return _Start(without_flow_head(network), loaded.settings, about=before, licence=loaded.licence)
+        # Tracking stays as it is, and so does what the monitor was calibrated on.
+        grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
+        return _Start(grown, loaded.settings, loaded.monitor, before, loaded.licence)
+
+    def _dataset(self, network: WindowNetwork[DecoderConfig], device: torch.device, progress: Progress) -> Dataset:
         from quest.cli.takes import open_store, say_corrupt
         from quest.train.dataset import open_dataset
 
@@ -169,28 +199,43 @@ class Train:
             anchors_only=self.stage == "map",
         )
 
-    def _objective(self, network: QuestNetwork) -> Objective:
+    def _objective(self, network: WindowNetwork[DecoderConfig]) -> Objective:
+        from quest.model.network import QuestNetwork
+        from quest.paper.network import PaperNetwork
+        from quest.paper.objective import PaperStageOne
         from quest.train.flow import StageTwo
         from quest.train.mapping import StageMap
         from quest.train.stage import StageOne
 
-        if self.stage == 1:
-            return StageOne(network, self.losses.apply(network.config.preset))
-        return StageMap(network) if self.stage == "map" else StageTwo(network)
+        if self.stage == "map":
+            assert isinstance(network, QuestNetwork)
+            return StageMap(network)
+        if isinstance(network, PaperNetwork):
+            first = PaperStageOne(network, self.losses)
+        else:
+            assert isinstance(network, QuestNetwork)
+            first = StageOne(network, self.losses)
+        return first if self.stage == 1 else StageTwo(network, first.answered)
 
     def _write(self, best: Path, start: _Start, dataset: Dataset) -> Path:
         """The best checkpoint as a file that the tracker loads."""
+        from quest.model.network import QuestNetwork
         from quest.model.weights import save_network
+        from quest.paper.network import PaperNetwork
         from quest.train.checkpoint import load_checkpoint
         from quest.train.dataset import licence_after
 
         network = start.network.cpu()
         load_checkpoint(best, network, None)
         file = self.out / "weights.safetensors"
-        how = f"--preset {network.config.preset}" if self.weights is None else f"--stage {self.stage}"
+        how = f"--preset {self.preset}" if self.weights is None else f"--stage {self.stage}"
         about = f"{start.about}quest train {how}, {dataset.training_takes} training takes"
         licence = licence_after(start.licence, dataset.training_sources)
-        save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=licence)
+        if isinstance(network, PaperNetwork):
+            network.save(file, about=about, licence=licence)
+        else:
+            assert isinstance(network, QuestNetwork)
+            save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=licence)
         return file
 
 
@@ -198,8 +243,8 @@ class Train:
 class _Start:
     """What to train; settings of the tracker and calibration of the monitor to store with it, as JSON text; licence."""
 
-    network: QuestNetwork
-    settings: str
+    network: WindowNetwork[DecoderConfig]
+    settings: str = ""
     monitor: str | None = None
     about: str = ""
     licence: str = ""

@@ -21,10 +21,10 @@ from quest.geometry import transform
 from quest.model.discovery import FOUND_WITHIN, match_peaks, sight
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
-from quest.model.pieces import PIECE_LABELS, PieceHead
+from quest.model.pieces import PieceHead
 from quest.track import Tracker
 from quest.track.intake import Intake
-from quest.types import LABELS, Camera, Frame, Take
+from quest.types import GRIPS, LABELS, Camera, Frame, Take
 
 _STEPS = 500
 _RATE = 1e-2
@@ -144,7 +144,7 @@ def _lesson(tracker: Tracker, frames: FrameBatch, full: FrameBatch, entities: _E
         sighted = sight(network, frames, None, radius_cells=radius_cells)
     pieces_m = _lifted(full, sighted.pieces.uv_px)
     kind = torch.zeros(len(pieces_m), dtype=torch.long)
-    for number, name in enumerate(PIECE_LABELS, start=1):
+    for number, name in enumerate(GRIPS, start=1):
         gap = torch.cdist(pieces_m, entities.point_m[entities.label == LABELS.index(name)]) / entities.half_diagonal_m
         if gap.numel():
             gap = gap.nan_to_num(torch.inf)

@@ -171,15 +171,14 @@ def tracker_id(tracker: Tracker) -> str:
     Streams are asked for by points. So a better affordance map or flow head, another threshold of discovery, or what
     else is in a weights file leaves records, and with them the monitor's calibration, as good as they were.
     """
-    config, settings = asdict(tracker.network.config) | {"flow": None}, asdict(tracker.config)
+    # Networks once said how their queries and head work; with that, records made before keep their name.
+    said = {"flow": None, "queries": "anchored", "head": "heatmap"}
+    config, settings = asdict(tracker.network.config) | said, asdict(tracker.config)
     del config["pieces"]
-    elsewhere: tuple[str, ...] = ("flow.",)
-    if tracker.network.config.queries == "anchored":
-        elsewhere += ("affordance",)
-        settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
+    settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
     digest = hashlib.sha256(json.dumps([config, settings, REVISION, SIGNALS], sort_keys=True).encode())
     for name, tensor in sorted(tracker.network.state_dict().items()):
-        if name.startswith(elsewhere):
+        if name.startswith(("flow.", "affordance")):
             continue
         digest.update(name.encode())
         digest.update(tensor.detach().cpu().float().numpy().tobytes())

@@ -23,7 +23,7 @@ class Anchor:
     content: Float[Tensor, "B K D"]
     """Embedding of the entity at the frame where it was bound."""
     template: Float[Tensor, "B K M F"]
-    """What the close cells around it looked like there (none for learned queries)."""
+    """What the close cells around it looked like there."""
     valid: Bool[Tensor, "B K"]
     """False for padding queries, which nothing attends to."""
 
@@ -47,11 +47,11 @@ class Prediction:
     embedding: Float[Tensor, "B T K D"]
     """The queries after the decoder."""
     logits: Float[Tensor, "B T K C"]
-    """Score of every cell (empty for direct regression)."""
+    """Score of every cell."""
     peak: Int[Tensor, "B T K"]
-    """Best cell (0 for direct regression)."""
+    """Best cell."""
     uv: Float[Tensor, "B T K 2"]
-    """Coordinates in [0, 1]^2 of the input; raw for direct regression, so they may leave it."""
+    """Coordinates in [0, 1]^2 of the input."""
     point: Float[Tensor, "B T K 3"]
     """Position in the reference frame; NaN where it cannot be lifted."""
     visible_logit: Float[Tensor, "B T K"]
@@ -109,13 +109,12 @@ class Binder(nn.Module):
 class DecoderLayer(nn.Module):
     """Queries look at one frame, at each other, and at themselves in earlier frames."""
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, width: int, heads: int) -> None:
         super().__init__()
-        d, heads = config.width, config.heads
-        self.look = Attention(d, heads)
-        self.remember = Attention(d, heads)
-        self.compare = Attention(d, heads)
-        self.mlp = FeedForward(d)
+        self.look = Attention(width, heads)
+        self.remember = Attention(width, heads)
+        self.compare = Attention(width, heads)
+        self.mlp = FeedForward(width)
 
     def forward(
         self, x: Float[Tensor, "B T K D"], tokens: Float[Tensor, "B T N D"], valid: Bool[Tensor, "B K"]
@@ -204,31 +203,6 @@ class HeatmapHead(nn.Module):
         at_peak = log_p.gather(-1, peak.unsqueeze(-1))
         fine = gather_cells(observed.fine, peak.unsqueeze(-1)).squeeze(-2)
         return self.judge(torch.cat((x, fine, at_peak, entropy), dim=-1).detach()).float()
-
-
-class RegressionHead(nn.Module):
-    """One shared MLP to coordinates and one confidence, as published, and what a slot takes its entity for.
-
-    The publication has no labels; the protocol that gives no point asks for them.
-    """
-
-    def __init__(self, config: NetworkConfig) -> None:
-        super().__init__()
-        d = config.width
-        self.mlp = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
-        self.label = nn.Linear(d, len(LABELS))
-
-    def forward(self, x: Float[Tensor, "B T K D"]) -> Prediction:
-        """Raw coordinates; the point is lifted by the network, which knows the depth."""
-        out = self.mlp(x).float()
-        empty = out.new_zeros(*out.shape[:-1], 0)
-        nowhere = torch.full((*out.shape[:-1], 3), torch.nan, device=out.device)
-        peak = torch.zeros(out.shape[:-1], dtype=torch.long, device=out.device)
-        return Prediction(x, empty, peak, out[..., :2] + 0.5, nowhere, out[..., 2], out[..., 2])
-
-    def labels(self, x: Float[Tensor, "B T K D"]) -> Float[Tensor, "B T K L"]:
-        """Score of every label for the entity that a query answers for in every frame."""
-        return self.label(x).float()
 
 
 def sample_grid(cells: Float[Tensor, "B N D"], uv: Float[Tensor, "B K 2"], side: int) -> Float[Tensor, "B K D"]:

@@ -13,8 +13,8 @@ from torch import Tensor
 from quest.model.affordance import AffordanceMap
 from quest.model.network import UNKNOWN_INTENT, QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
-from quest.model.pieces import PIECE_LABELS, PIECES_APART_PX, Pieces, find_pieces, groups, may_be_piece
-from quest.types import LABELS
+from quest.model.pieces import PIECES_APART_PX, Pieces, find_pieces, groups, may_be_piece
+from quest.types import GRIPS, LABELS
 
 FOUND_WITHIN = 0.1
 """A candidate this close to an entity of its label has found it, normalised units: the gate of protocol semantic."""
@@ -178,8 +178,8 @@ def _ranked(network: QuestNetwork, frames: FrameBatch, sighted: Sighted, *, radi
     head = network.affordance_pieces
     assert head is not None
     peaks, pieces, size = sighted.peaks.peaks, sighted.pieces, network.config.encoder.image_size
-    device, kinds, count = peaks.uv.device, len(PIECE_LABELS), len(sighted.pieces.shapes)
-    label = torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=device).repeat(count)
+    device, kinds, count = peaks.uv.device, len(GRIPS), len(sighted.pieces.shapes)
+    label = torch.tensor([LABELS.index(name) for name in GRIPS], device=device).repeat(count)
     purpose = pieces.purpose.flatten().to(device)
     intent = purpose if network.config.intents else torch.full_like(purpose, UNKNOWN_INTENT)
     logit = head(pieces.inputs.to(device)).flatten()

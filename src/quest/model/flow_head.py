@@ -13,8 +13,6 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from quest.model.config import NetworkConfig
-
 REST = 0.003
 """Displacements shorter than this, in units of the reference frame, are answered as 0."""
 
@@ -24,19 +22,24 @@ class FlowHead(nn.Module):
 
     With ``points3d`` it also sees the lifted points and may go on with their steps; without, as in the published
     network, embeddings are all there is. It starts out by saying that nothing moves.
+
+    Args:
+        width: of the embeddings.
+        window: T, frames of a window.
+        points3d: whether it sees points.
     """
 
-    def __init__(self, config: NetworkConfig) -> None:
+    def __init__(self, width: int, *, window: int, points3d: bool) -> None:
         super().__init__()
-        d = config.width
-        self.window = config.window
-        self.points3d = config.points3d and config.window > 1
+        d = width
+        self.window = window
+        self.points3d = points3d and window > 1
         self.norm = nn.LayerNorm(d)
         self.frame = nn.Linear(d, d)
-        self.age = nn.Parameter(0.02 * torch.randn(config.window, d))
-        self.steps = nn.Linear(7 * (config.window - 1), d) if self.points3d else None
-        self.fuse = nn.Linear(config.window * d, d)
-        weights = config.window - 1 if self.points3d else 0
+        self.age = nn.Parameter(0.02 * torch.randn(window, d))
+        self.steps = nn.Linear(7 * (window - 1), d) if self.points3d else None
+        self.fuse = nn.Linear(window * d, d)
+        weights = window - 1 if self.points3d else 0
         self.out = nn.Sequential(nn.GELU(), nn.Linear(d, d), nn.GELU(), nn.Linear(d, weights + 3))
         final = self.out[-1]
         assert isinstance(final, nn.Linear)

@@ -10,7 +10,8 @@ from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
 from quest.geometry import exact_product, invert
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig
+from quest.model.network import WindowNetwork
 from quest.model.observation import FrameBatch, cell_depth, reference_of
 from quest.types import Camera
 
@@ -38,7 +39,7 @@ class Framer:
         device: where the network runs.
     """
 
-    def __init__(self, network: QuestNetwork, camera: Camera, *, device: torch.device) -> None:
+    def __init__(self, network: WindowNetwork[DecoderConfig], camera: Camera, *, device: torch.device) -> None:
         self._network = network
         self._device = device
         self._intrinsics = torch.tensor(

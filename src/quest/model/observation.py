@@ -169,11 +169,11 @@ class Observation:
     tokens: Float[Tensor, "B T N D"]
     """One per patch, with position codes."""
     fine: Float[Tensor, "B T C F"]
-    """One per cell of the heatmap (no channels without a heatmap)."""
+    """One per cell of the heatmap."""
     cell_point: Float[Tensor, "B T C 3"]
     """Lifted point of each cell in the reference frame, NaN where depth is missing."""
     close: Float[Tensor, "B T M G"]
-    """One per close cell, half as wide as the heatmap's (no channels without a heatmap)."""
+    """One per close cell, half as wide as the heatmap's."""
     close_point: Float[Tensor, "B T M 3"]
     """Lifted point of each close cell, NaN where depth is missing."""
 
@@ -249,30 +249,24 @@ class Observer(nn.Module):
         self.layers = nn.ModuleList(TokenLayer(d, config.heads) for _ in range(config.token_layers))
         self.norm = nn.LayerNorm(d)
         self.points = PointCode(d) if config.points3d else None
-        if config.head == "heatmap":
-            f = self.fine_width
-            self.stem = DetailStem(self.close_width, f, d)
-            self.up = nn.Linear(d, 4 * f)
-            self.fine_points = PointCode(f) if config.points3d else None
-            self.fine_position = nn.Parameter(0.02 * torch.randn(config.cells**2, f))
-            self.fine_mlp = nn.Sequential(nn.LayerNorm(f), nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, f))
-            self.fine_norm = nn.LayerNorm(f)
+        f = self.fine_width
+        self.stem = DetailStem(self.close_width, f, d)
+        self.up = nn.Linear(d, 4 * f)
+        self.fine_points = PointCode(f) if config.points3d else None
+        self.fine_position = nn.Parameter(0.02 * torch.randn(config.cells**2, f))
+        self.fine_mlp = nn.Sequential(nn.LayerNorm(f), nn.Linear(f, 2 * f), nn.GELU(), nn.Linear(2 * f, f))
+        self.fine_norm = nn.LayerNorm(f)
 
     def forward(self, frames: FrameBatch) -> Observation:
         """Observe every frame by itself; nothing crosses time here."""
         b, t = frames.features.shape[:2]
-        config, grid, side = self.config, self.config.encoder.grid, self.config.cells
-        tokens = self.project(frames.features) + self.position
+        grid, side = self.config.encoder.grid, self.config.cells
         cell_point = self._cell_points(frames)
-        detail = None
-        close = close_point = tokens.new_zeros(b, t, 0, 3)
-        if config.head == "heatmap":
-            image = self._detail_image(frames)
-            close, detail, token_detail = (
-                m.flatten(2).transpose(1, 2).unflatten(0, (b, t)) for m in self.stem(image.flatten(0, 1))
-            )
-            tokens = tokens + token_detail
-            close_point = self._close_points(frames)
+        image = self._detail_image(frames)
+        close, detail, token_detail = (
+            m.flatten(2).transpose(1, 2).unflatten(0, (b, t)) for m in self.stem(image.flatten(0, 1))
+        )
+        tokens = self.project(frames.features) + self.position + token_detail
         if self.points is not None:
             # The nearest of a patch's four cells: the one that a thin part would fill.
             quads = cell_point.reshape(b, t, grid, 2, grid, 2, 3).transpose(3, 4).flatten(4, 5)
@@ -283,15 +277,12 @@ class Observer(nn.Module):
         for layer in self.layers:
             flat = layer(flat)
         flat = self.norm(flat)
-        if detail is None:
-            fine = flat.new_zeros(b, t, side * side, 0)
-            return Observation(flat.unflatten(0, (b, t)), fine, cell_point, close, close_point)
         up = self.up(flat).reshape(b * t, grid, grid, 2, 2, -1).transpose(2, 3).reshape(b, t, side * side, -1)
         fine = detail + up + self.fine_position
         if self.fine_points is not None:
             fine = fine + self.fine_points(cell_point)
         fine = self.fine_norm(fine + self.fine_mlp(fine))
-        return Observation(flat.unflatten(0, (b, t)), fine, cell_point, close, close_point)
+        return Observation(flat.unflatten(0, (b, t)), fine, cell_point, close, self._close_points(frames))
 
     def _close_points(self, frames: FrameBatch) -> Float[Tensor, "B T M 3"]:
         """Lifted points of the close cells, each by its nearest pixel."""

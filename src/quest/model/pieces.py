@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from quest.geometry import lift_depth
 from quest.model.config import NetworkConfig
 from quest.model.observation import FrameBatch
-from quest.types import LABELS, Camera
+from quest.types import GRIPS, LABELS, Camera
 
 MEASURES = (
     "pixels", "length", "width", "thinness", "height", "middle_height", "ring", "behind", "before", "plane_px",
@@ -205,15 +205,13 @@ def _largest(pieces: Int[np.ndarray, "H W"], beside: Int[np.ndarray, " N"]) -> B
     return pieces == np.bincount(beside).argmax()
 
 
-PIECE_LABELS = ("handle", "knob")
-"""What a piece may be."""
 PIECES_APART_PX = 4.0
 """Pieces whose middles are closer are one piece before two planes."""
 
 _ON_PX = 6.0
 """A peak that is closer to a pixel of a piece is on it."""
 _AROUND_PX = 11
-_INPUTS = len(MEASURES) + len(PIECE_LABELS)
+_INPUTS = len(MEASURES) + len(GRIPS)
 _HIDDEN = 32
 _MOST_SPREADS = 4.0
 _GROUPS = (*LABELS, "on a piece", "blind")
@@ -228,7 +226,7 @@ class Pieces:
     uv_px: Float[Tensor, "P 2"]
     """Their middles, pixels of the network's input."""
     inputs: Float[Tensor, "P F"]
-    """Their measures, then the best score of the map on them for each of PIECE_LABELS."""
+    """Their measures, then the best score of the map on them for each of GRIPS."""
     purpose: Int[Tensor, "P 2"]
     """For which purpose that score is, index into INTENTS."""
     shapes: tuple[Protrusion, ...]
@@ -254,7 +252,7 @@ def find_pieces(frames: FrameBatch, scores: Float[Tensor, "L P S S"], config: Ne
     """
     shapes = tuple(find_protrusions(_image(frames)))
     side, cell = config.cells, config.cell_px
-    wanted = scores[[LABELS.index(label) for label in PIECE_LABELS]].float()
+    wanted = scores[[LABELS.index(label) for label in GRIPS]].float()
     near = F.max_pool2d(wanted, 3, 1, 1).flatten(2).cpu()
     best: list[Tensor] = []
     for shape in shapes:
@@ -289,7 +287,7 @@ def groups(
 
 def may_be_piece(label: Int[Tensor, " K"]) -> Bool[Tensor, " K"]:
     """Which labels are those of pieces."""
-    return torch.isin(label, torch.tensor([LABELS.index(name) for name in PIECE_LABELS], device=label.device))
+    return torch.isin(label, torch.tensor([LABELS.index(name) for name in GRIPS], device=label.device))
 
 
 class PieceHead(nn.Module):
@@ -299,7 +297,7 @@ class PieceHead(nn.Module):
         super().__init__()
         self.mean = nn.Buffer(torch.zeros(_INPUTS))
         self.spread = nn.Buffer(torch.ones(_INPUTS))
-        self.mlp = nn.Sequential(nn.Linear(_INPUTS, _HIDDEN), nn.SiLU(), nn.Linear(_HIDDEN, 1 + len(PIECE_LABELS)))
+        self.mlp = nn.Sequential(nn.Linear(_INPUTS, _HIDDEN), nn.SiLU(), nn.Linear(_HIDDEN, 1 + len(GRIPS)))
         self.gain = nn.Parameter(torch.ones(len(_GROUPS)))
         self.bias = nn.Parameter(torch.zeros(len(_GROUPS)))
 

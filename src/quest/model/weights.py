@@ -228,11 +228,20 @@ def load_network(name: str | Path) -> LoadedNetwork:
     Raises:
         WeightsError: no such name, file or repository, or the file is torn, foreign, or of another shape.
     """
+    return read_network(find_weights(name), name=str(name))
+
+
+def find_weights(name: str | Path) -> Path:
+    """The file of weights by their name, as for :func:`load_network`; fetched from the hub if it is there.
+
+    Raises:
+        WeightsError: no such name, file or repository.
+    """
     path = shipped_weights().get(str(name), Path(name))
     if path.is_dir():
         path = next((path / file for file in FOLDER_FILES if (path / file).is_file()), path)
     if path.is_file():
-        return read_network(path, name=str(name))
+        return path
     known = ", ".join(shipped_weights()) or "none"
     hub_id = None if isinstance(name, Path) or path.exists() else HubId.parse(name)
     if hub_id is not None and hub_id.revision is None and path.parent.is_dir():
@@ -245,7 +254,7 @@ def load_network(name: str | Path) -> LoadedNetwork:
             f"{name}: no such weights; expected a safetensors file, a folder with {' or '.join(FOLDER_FILES)}, a "
             f"shipped name ({known}), or owner/name on the Hugging Face hub"
         )
-    return read_network(download(hub_id), name=str(name))
+    return download(hub_id)
 
 
 def read_network(path: Path, *, name: str) -> LoadedNetwork:
@@ -262,7 +271,8 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
     if metadata.get("format") != FORMAT:
         raise WeightsError(
             f"{path}: expected a network of format {FORMAT!r}, got {metadata.get('format')!r}; "
-            "make it with `quest train` (networks of format 1 saw no relief; encoder weights alone are no network)"
+            "make it with `quest train` (networks of format 1 saw no relief; encoder weights alone are no network; "
+            "the published network, preset paper, is read by `quest.load` and `quest eval`)"
         )
     try:
         network = QuestNetwork(NetworkConfig.from_json(metadata["config"]))

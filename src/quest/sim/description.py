@@ -25,7 +25,7 @@ from jaxtyping import Float
 from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.entities import PlacedEntity
-from quest.types import LABELS
+from quest.types import GRIPS, LABELS
 
 DESCRIPTION_NAME = "entities.json"
 """Name of the file beside the URDF."""
@@ -128,7 +128,7 @@ def _described(raw: Any, where: str) -> DescribedEntity:
     if link is None and visual is None:
         raise ObjectError(f"{where}: expected a link or a visual, found neither; say which part of the URDF is meant")
     if point is None:
-        if visual is None and label in ("handle", "knob"):
+        if visual is None and label in GRIPS:
             raise ObjectError(f"{where}: a {label} needs a visual or a point; say where on link {link!r} it is")
         return DescribedEntity(where, label, link, visual, None)
     if visual is not None:

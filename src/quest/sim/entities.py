@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, apply
+from quest.types import GRIPS
 
 MOVES_AT_LEAST = 0.1
 """A joint counts as movable if an entity on it moves this far over its range, normalised units."""
@@ -205,7 +206,7 @@ def _placed(
 
 def _handles(articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float) -> list[SimEntity]:
     found = []
-    for label in ("handle", "knob"):
+    for label in GRIPS:
         parts = [i for i in articulation.body_parts(1 + joint) if part_label(articulation.parts[i].name) == label]
         found += _of_parts(articulation, joint, label, parts, surfaces, half_diagonal_m)
     return found

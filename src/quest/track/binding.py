@@ -19,7 +19,6 @@ from quest.model.observation import FrameBatch, Observation
 from quest.track.following import Following, as_rows
 from quest.track.grounded import Ground
 from quest.track.settings import TrackerConfig
-from quest.track.slots import Slots, slots_at
 from quest.types import INTENTS, LABELS, Query
 
 PATIENCE = 8
@@ -97,7 +96,7 @@ class Binding:
         if query.name and query.name in self.names(following).values():
             raise InputError(f"query {query.name!r}: another query is called so already; choose another name")
         network = self._network.config
-        if query.intent is not None and not (network.intents and network.queries == "anchored"):
+        if query.intent is not None and not network.intents:
             raise InputError(
                 f"query {query.name or query.kind!r}: these weights cannot tell what to {query.intent}; leave the "
                 "intent away or use weights of the default preset"
@@ -139,7 +138,6 @@ class Binding:
         observed: Observation,
         frames: FrameBatch,
         following: Sequence[Following],
-        slots: Slots | None = None,
     ) -> list[Following]:
         """Queries that find their entity in this frame.
 
@@ -148,10 +146,7 @@ class Binding:
             observed: the frame as observed (T = 1).
             frames: the frame.
             following: queries that have found theirs.
-            slots: what learned queries say of the frame, for networks that have them.
         """
-        if slots is not None:
-            return self._bind_learned(frame, slots, following)
         found = self._bind_slots(frame, observed, frames, following)
         due = [w for w in self.state.waiting if w.query.kind == "point" and w.since <= frame]
         if due:
@@ -186,13 +181,11 @@ class Binding:
         self.state.numbered += 1
         return self.state.numbered - 1
 
-    def _begin(
-        self, waiting: Waiting, name: str, label: str | None, *, slot: int | None = None, intent: str | None = None
-    ) -> Following:
+    def _begin(self, waiting: Waiting, name: str, label: str | None, *, intent: str | None = None) -> Following:
         self.state.waiting = [w for w in self.state.waiting if w is not waiting]
         # Of what nobody asked for to lift by, the network only thinks so.
         ground = Ground(self._config, fixed=waiting.query.intent == "lift")
-        return Following(waiting.number, name, label, slot, ground, waiting.query.intent or intent)
+        return Following(waiting.number, name, label, ground, waiting.query.intent or intent)
 
     def _canvas(self, due: Sequence[Waiting]) -> Float[Tensor, "K 2"]:
         uv_px = np.array([w.query.uv_px for w in due], np.float32)
@@ -290,35 +283,6 @@ class Binding:
         self.state.anchor = self.state.anchor.select(torch.tensor(order, device=self.state.anchor.content.device))
         for query in again:
             query.asked_px = None if query.mark_px is None else query.bound_px
-
-    def _bind_learned(self, frame: int, slots: Slots, following: Sequence[Following]) -> list[Following]:
-        """Queries take slots and keep them; the thresholds are those of anchored queries."""
-        config, existence, label = self._config, slots.existence(self._config), slots.label
-        found: list[Following] = []
-        free = sorted(range(len(label)), key=lambda i: -existence[i])
-        free = [i for i in free if i not in {f.slot for f in following}]
-        if self.state.discover:
-            for i in [i for i in free if existence[i] > config.slot_threshold]:
-                number = self._next_number()
-                waiting = Waiting(number, Query.slot(), frame)
-                found.append(self._begin(waiting, f"{label[i]} {number}", label[i], slot=i))
-                free.remove(i)
-            self.state.discover = False
-        for waiting in [
-            w for w in self.state.waiting if w.query.kind != "point" and w.since <= frame < w.since + PATIENCE
-        ]:
-            fits = [i for i in free if waiting.query.label in (None, label[i])]
-            if fits and existence[fits[0]] > config.prompt_threshold:
-                name = waiting.query.name or f"{label[fits[0]]} {waiting.number}"
-                found.append(self._begin(waiting, name, label[fits[0]], slot=fits[0]))
-                free.remove(fits[0])
-        due = [w for w in self.state.waiting if w.query.kind == "point" and w.since <= frame]
-        if due:
-            chosen = slots_at(slots, self._canvas(due), [w.query.label for w in due], [*following, *found])
-            for waiting, slot in zip(due, chosen, strict=True):
-                name = waiting.query.name or f"point {waiting.number}"
-                found.append(self._begin(waiting, name, waiting.query.label, slot=slot))
-        return found
 
 
 def _asked_for(query: Query, label: Sequence[str], intent: Sequence[str | None]) -> list[int]:

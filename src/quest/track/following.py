@@ -52,8 +52,6 @@ class Following:
     """What to call it."""
     label: str | None
     """Its label, if known."""
-    slot: int | None
-    """Index of its learned query, for networks that have them."""
     ground: Ground
     """Its joint."""
     intent: str | None = None

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation, cell_centres
 from quest.track.belief import Belief, moved, update
@@ -46,7 +46,6 @@ def match(
         elapsed: frames since the one before.
     """
     head = network.head
-    assert isinstance(head, HeatmapHead)
     x = network.embed(anchor, window)[:, -1:]
     newest = window.during(slice(-1, None))
     logits = head.logits(x, newest)

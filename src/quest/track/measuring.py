@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import Observation
 from quest.monitor import SIGNALS, Signals
@@ -43,7 +43,6 @@ def measure(
         following: the queries before they moved there.
     """
     head = network.head
-    assert isinstance(head, HeatmapHead)
     logits, embedding = prediction.logits[0, 0], prediction.embedding[0, 0].float()
     before, home = as_rows(f.place for f in following), as_rows(f.home for f in following)
     born = torch.stack([embedding[k] if f.born is None else f.born for k, f in enumerate(following)])
@@ -68,11 +67,6 @@ def measure(
         "lead": lead,
     }
     return Signals(np.stack([values[name] for name in SIGNALS], axis=-1).astype(np.float32))
-
-
-def no_signals(queries: int) -> Signals:
-    """Signals of a network that has no heatmap: all unknown."""
-    return Signals(np.full((queries, len(SIGNALS)), np.nan, np.float32))
 
 
 def _likeness(template: Float[Tensor, "1 K M F"], now: Float[Tensor, "1 K M F"]) -> Float[Tensor, " K"]:

@@ -24,11 +24,10 @@ from quest.track.intake import Arrival, Intake, IntakeState
 from quest.track.lifting import lift_near
 from quest.track.marks import beside, marked
 from quest.track.matching import match
-from quest.track.measuring import measure, no_signals
+from quest.track.measuring import measure
 from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
 from quest.track.settings import TrackerConfig
 from quest.track.sharing import SIGMA, share
-from quest.track.slots import Slots, decode_slots, place_slots
 from quest.track.state import StreamState
 from quest.track.world import along_joint, to_world, world_joint
 from quest.types import Camera, Query, State
@@ -228,33 +227,28 @@ class Stream:
                 memory.links = LinkGroups(SIGMA)
                 for following in memory.following:
                     following.forget_places(self._config)
-            observed, slots = self._network.observe(frames), None
+            observed = self._network.observe(frames)
             if renewed:
                 self._binding.bind_again(observed, frames, memory.following)
-            learned = self._network.config.queries == "learned"
-            while not learned and len(memory.ring) < self._network.config.window - 1:
+            while len(memory.ring) < self._network.config.window - 1:
                 memory.ring.append(observed)
             memory.ring.append(observed)
-            if learned:
-                slots = decode_slots(self._network, Observation.stack(list(memory.ring)), frames)
-            for found in self._binding.bind(memory.frame, observed, frames, memory.following, slots):
+            for found in self._binding.bind(memory.frame, observed, frames, memory.following):
                 memory.following.append(found)
                 if self._monitor is not None:
                     self._monitor.watch(found.query, found.name)
             memory.stamp_s, memory.has_depth = stamp_s, bool((frames.depth_m > 0).any())
-            self._answer(frames, slots)
+            self._answer(frames)
         self._memory.frame += 1
         for alarm in self._raised:
             for callback in self._callbacks:
                 callback(alarm)
         return self._state()
 
-    def _answer(self, frames: FrameBatch, slots: Slots | None) -> None:
+    def _answer(self, frames: FrameBatch) -> None:
         """Place every query in the newest frame, judge it, and keep the answers."""
         memory, following = self._memory, self._memory.following
-        if slots is not None and following:
-            self._keep(*place_slots(slots, following, has_depth=memory.has_depth), no_signals(len(following)))
-        if slots is not None or not following or memory.binding.anchor is None:
+        if not following or memory.binding.anchor is None:
             return
         window = Observation.stack(list(memory.ring))
         prediction = match(

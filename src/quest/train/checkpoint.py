@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from quest.errors import WeightsError
-from quest.model.config import NetworkConfig
+from quest.model.config import DecoderConfig
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import save_tensors
 
@@ -138,7 +138,7 @@ def _load_optimizer(
         ) from error
 
 
-def check_same_run(progress: Progress, config: NetworkConfig, objective: str, begun: str, folder: Path) -> None:
+def check_same_run(progress: Progress, config: DecoderConfig, objective: str, begun: str, folder: Path) -> None:
     """Refuse to resume with another network or objective, or from other weights: what is not trained is kept too.
 
     Raises:
@@ -149,7 +149,7 @@ def check_same_run(progress: Progress, config: NetworkConfig, objective: str, be
             f"{folder}: expected a run of {objective}, got one of {progress.objective}; use another --out"
         )
     # Parsed, so that a run that was started before a setting came up goes on with its default.
-    if NetworkConfig.from_json(progress.network) != config:
+    if type(config).from_json(progress.network) != config:
         raise WeightsError(f"{folder}: this run was started with another network; use another --out or its settings")
     if progress.begun not in ("", begun):
         raise WeightsError(f"{folder}: this run began with other weights; use another --out, or the weights of then")

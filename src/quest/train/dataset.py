@@ -12,7 +12,8 @@ from quest.data.mirror import mirrored_name
 from quest.data.split import split_of
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, WeightsError
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig
+from quest.model.network import WindowNetwork
 from quest.train.feature_cache import FeatureCache
 from quest.train.windows import WindowConfig, WindowSampler
 from quest.types import TakeInfo
@@ -55,7 +56,7 @@ class _Wanted:
 
 
 def open_dataset(
-    network: QuestNetwork,
+    network: WindowNetwork[DecoderConfig],
     *,
     stores: Sequence[str | Path],
     validation_stores: Sequence[str | Path],
@@ -141,7 +142,7 @@ def licence_after(licence: str, sources: Collection[str]) -> str:
     return f"{licence}, {PARTNET_TERMS}"
 
 
-def load_initial_encoder(network: QuestNetwork, path: Path) -> None:
+def load_initial_encoder(network: WindowNetwork[DecoderConfig], path: Path) -> None:
     """Load the encoder's initial weights from a safetensors file.
 
     Raises:

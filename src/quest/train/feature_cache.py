@@ -25,12 +25,12 @@ from quest.data.mirror import mirror_take, mirrored_name
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.geometry.letterbox import Letterbox
-from quest.model.config import NetworkConfig
+from quest.model.config import DecoderConfig
 from quest.model.encoder import Encoder
 from quest.model.observation import cell_depth
 from quest.model.precision import fast_bfloat16
 from quest.model.weights import weights_digest
-from quest.types import LABELS, Camera, Take
+from quest.types import GRIPS, LABELS, Camera, Take
 
 _VERSION = 1
 DEPTH_UNIT_M = 1e-4
@@ -136,7 +136,7 @@ class FeatureCache:
         encoder: encoder with its initial weights.
     """
 
-    def __init__(self, root: Path, config: NetworkConfig, encoder: Encoder) -> None:
+    def __init__(self, root: Path, config: DecoderConfig, encoder: Encoder) -> None:
         self.config = config
         self.encoder = encoder.eval()
         layout = json.dumps([_VERSION, asdict(config.encoder), config.cell_px])
@@ -267,7 +267,7 @@ class FeatureCache:
         )
 
 
-def owner_of(take: Take, view: int, config: NetworkConfig) -> Int8[np.ndarray, "T C"]:
+def owner_of(take: Take, view: int, config: DecoderConfig) -> Int8[np.ndarray, "T C"]:
     """The entity that each cell is a part of: its rank among the tracked ones, else -1.
 
     A handle or knob owns the cells that show it in at least a sixteenth of their pixels. Rims and fronts have no
@@ -280,10 +280,10 @@ def owner_of(take: Take, view: int, config: NetworkConfig) -> Int8[np.ndarray, "
     of_link = np.full(take.link_pose.shape[1] + 1, -1, np.int8)
     for rank, e in enumerate(take.tracked):
         entity = take.info.entities[e]
-        if entity.label in ("rim", "front"):
-            of_link[1 + entity.link] = rank
-        else:
+        if entity.label in GRIPS:
             of_entity[1 + e] = rank
+        else:
+            of_link[1 + entity.link] = rank
     owners = []
     for entity_id, link_id in zip(truth.entity_id, truth.link_id, strict=True):
         owner = of_link[box.index(link_id)[cell // 2 :: cell, cell // 2 :: cell]]

@@ -9,7 +9,9 @@ measures both.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -17,10 +19,11 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig
+from quest.model.network import WindowNetwork
 from quest.model.observation import FrameBatch
 from quest.train.losses import masked_mean
-from quest.train.objective import Rollout, roll_out
+from quest.train.objective import Answered
 from quest.train.validation import mean_of
 from quest.train.windows import WindowSampler, WindowTruth
 
@@ -69,25 +72,28 @@ class StageTwo:
 
     Args:
         network: a network with a flow head (see :func:`with_flow_head`).
+        answered: what it answers for the entities of a batch.
     """
 
     name = "stage-2"
-    terms: tuple[str, ...] = ("flow",)
 
-    def __init__(self, network: QuestNetwork) -> None:
+    def __init__(
+        self, network: WindowNetwork[DecoderConfig], answered: Callable[[FrameBatch, WindowTruth], Answered]
+    ) -> None:
         self.network = network
+        self.weights = {"flow": 1.0}
+        self._answered = answered
 
     def trained(self) -> list[nn.Parameter]:
         """The flow head's parameters."""
         assert self.network.flow is not None
         return list(self.network.flow.parameters())
 
-    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
         """L1 of the displacement; what rests counts like what moves, or it would be said to move a little."""
         roll, flow = self._answer(frames, truth, leaps=True)
         error = (flow - truth.flow.nan_to_num()).abs().sum(-1) / truth.unit[:, None]
-        loss = masked_mean(error, _judged(roll, truth))
-        return loss, loss.detach()[None]
+        return {"flow": masked_mean(error, _judged(roll, truth))}
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> FlowScores:
         """EPE3D on the same windows at every call, beside zero flow."""
@@ -117,12 +123,11 @@ class StageTwo:
 
     def _answer(
         self, frames: FrameBatch, truth: WindowTruth, *, leaps: bool = False
-    ) -> tuple[Rollout, Float[Tensor, "B K 3"]]:
+    ) -> tuple[Answered, Float[Tensor, "B K 3"]]:
         with torch.no_grad():
-            roll = roll_out(self.network, frames, truth)
-            seen = roll.prediction
-            seen = replace(seen, point=leaping(seen.point)) if leaps else seen
-        return roll, self.network.displace(seen)
+            roll = self._answered(frames, truth)
+            point = leaping(roll.point) if leaps else roll.point
+        return roll, self.network.displace(roll.embedding, point)
 
 
 def leaping(point: Float[Tensor, "B T K 3"]) -> Float[Tensor, "B T K 3"]:
@@ -136,26 +141,29 @@ def leaping(point: Float[Tensor, "B T K 3"]) -> Float[Tensor, "B T K 3"]:
     return point + once + ever.cumsum(dim=1)
 
 
-def with_flow_head(network: QuestNetwork) -> QuestNetwork:
+N = TypeVar("N", bound=WindowNetwork[DecoderConfig])
+
+
+def with_flow_head(network: N) -> N:
     """The network with a flow head: its own, or a new one that says that nothing moves."""
     if network.flow is not None:
         return network
     return _rebuilt(network, flow=True)
 
 
-def without_flow_head(network: QuestNetwork) -> QuestNetwork:
+def without_flow_head(network: N) -> N:
     """The network as stage 1 trains it: a flow head would be left behind by a backbone that moves on."""
     return network if network.flow is None else _rebuilt(network, flow=False)
 
 
-def _rebuilt(network: QuestNetwork, *, flow: bool) -> QuestNetwork:
-    other = QuestNetwork(replace(network.config, flow=flow))
+def _rebuilt(network: N, *, flow: bool) -> N:
+    other = type(network)(replace(network.config, flow=flow))
     own = network.state_dict()
     other.load_state_dict({name: own.get(name, tensor) for name, tensor in other.state_dict().items()})
     return other.train(network.training)
 
 
-def _judged(roll: Rollout, truth: WindowTruth) -> Bool[Tensor, "B K"]:
+def _judged(roll: Answered, truth: WindowTruth) -> Bool[Tensor, "B K"]:
     return roll.mask[:, -1] & torch.isfinite(truth.flow).all(-1)
 
 

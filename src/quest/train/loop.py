@@ -17,7 +17,6 @@ from torch import Tensor, nn
 
 from quest.errors import ConfigError
 from quest.extras import require
-from quest.model.network import QuestNetwork
 from quest.model.weights import weights_digest
 from quest.train.batches import Batch, MicroBatch, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
@@ -29,6 +28,7 @@ from quest.train.devices import (
     part_ways,
     restore_generators,
 )
+from quest.train.losses import weighted_sum
 from quest.train.optimizer import RunningMean, make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
@@ -129,10 +129,13 @@ class _Step(nn.Module):
     def __init__(self, objective: Objective) -> None:
         super().__init__()
         self.network = objective.network
-        self._losses = objective.losses
+        self._objective = (objective.losses, objective.weights)
 
     def forward(self, batch: MicroBatch) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
-        return self._losses(batch.frames, batch.truth)
+        """The weighted sum of the losses, and each by itself, detached."""
+        losses, weights = self._objective
+        values = losses(batch.frames, batch.truth)
+        return weighted_sum(values, weights), torch.stack([values[name].detach() for name in weights])
 
 
 class _Learner:
@@ -154,7 +157,8 @@ class _Learner:
         network = self.objective.network
         begun = weights_digest(network)
         if self.config.compile:
-            _compile(network)
+            for part in network.busiest():
+                part.compile()
         # First to the devices: the optimiser's state is loaded to where the parameters are.
         self.module, self.fabric_optimizer = self.fabric.setup(_Step(self.objective), self.optimizer)
         start = Progress(0, math.inf, 0, 0, _state(rng), network.config.to_json(), self.objective.name, begun)
@@ -246,13 +250,6 @@ class _Learner:
         return total
 
 
-def _compile(network: QuestNetwork) -> None:
-    """Compile what does most of the work; binding and heads branch too much to gain by it."""
-    network.observer.compile()
-    for layer in network.layers:
-        layer.compile()
-
-
 def _schedule(step: int, config: TrainingConfig) -> float:
     if step <= config.warmup_steps:
         return step / config.warmup_steps
@@ -283,7 +280,7 @@ def _log(
     writer: SummaryWriter, objective: Objective, values: Float[Tensor, " N"], scores: Scores | None, step: int
 ) -> None:
     if step % _LOG_EVERY == 0 or step == 1:
-        for name, value in zip(("total", *objective.terms), values.tolist(), strict=True):
+        for name, value in zip(("total", *objective.weights), values.tolist(), strict=True):
             writer.add_scalar(f"loss/{name}", value, step)
     if scores is not None:
         for name, value in asdict(scores).items():  # type: ignore[call-overload]

@@ -2,22 +2,28 @@
 
 The names follow the design: L_aff, L_vel, L_acc, L_conf, L_bound, L_feat, L_manifold; a heatmap adds its cross-entropy
 and 3D offset, discovery its focal loss. Each is a function of predictions and truth that can be tested by itself.
+To add one, write its function here and its line in the table of the network that learns by it, :data:`LOSSES` of
+:mod:`quest.train.objective` or of :mod:`quest.paper.objective`: the line gives its name, its weight and what it is of.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from quest.errors import ConfigError
 from quest.model.affordance import AffordanceMap
 from quest.model.joint_head import JointBelief
 from quest.model.observation import grid_centres
 from quest.train.pooling import pooled
-from quest.types import LABELS
+from quest.types import GRIPS, LABELS
 
 FAR_WEIGHT = 0.2
 """Of offsets across a whole handle or link, beside those of the cells around an entity."""
@@ -25,8 +31,47 @@ FAR_WEIGHT = 0.2
 _NO_ERROR = 0.999
 """Target of a cell that may have any score."""
 
-_OUTLINED = torch.tensor([LABELS.index("handle"), LABELS.index("knob")])
-"""Labels of things with an outline of their own."""
+_OUTLINED = torch.tensor([LABELS.index(label) for label in GRIPS])
+
+
+R = TypeVar("R", contravariant=True)
+
+
+@dataclass(frozen=True)
+class Loss(Generic[R]):
+    """A term of an objective.
+
+    Attributes:
+        weight: in the sum; 0 turns it off.
+        of: its value for what a network answered on a batch. Means are taken by :func:`masked_mean`, so that a batch
+            can be divided.
+    """
+
+    weight: float
+    of: Callable[[R], Float[Tensor, ""]]
+
+
+def weights_of(table: Mapping[str, Loss[Any]], changes: Mapping[str, float]) -> dict[str, float]:
+    """The weight of every loss of a table.
+
+    Args:
+        table: losses by name.
+        changes: weights that are to differ.
+
+    Raises:
+        ConfigError: no such loss, or a weight below 0 or not finite.
+    """
+    for name, value in changes.items():
+        if name not in table:
+            raise ConfigError(f"losses: this network has no {name!r}; expected some of {', '.join(table)}")
+        if not 0 <= value < math.inf:
+            raise ConfigError(f"losses: expected {name} to be at least 0, got {value}; 0 turns it off")
+    return {name: float(changes.get(name, loss.weight)) for name, loss in table.items()}
+
+
+def weighted_sum(values: Mapping[str, Float[Tensor, ""]], weights: Mapping[str, float]) -> Float[Tensor, ""]:
+    """What a step lowers: every loss times its weight."""
+    return torch.stack([weight * values[name] for name, weight in weights.items()]).sum()
 
 
 def masked_mean(value: Float[Tensor, "*B"], mask: Float[Tensor, "*B"] | Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
@@ -105,11 +150,6 @@ def confidence_loss(
 ) -> Float[Tensor, ""]:
     """L_conf: binary cross-entropy."""
     return masked_mean(F.binary_cross_entropy_with_logits(logit, target.to(logit.dtype), reduction="none"), mask)
-
-
-def label_loss(logits: Float[Tensor, "*B L"], label: Int[Tensor, "*B"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:
-    """Cross-entropy of the label of learned queries, which take the place of a dense map."""
-    return masked_mean(-logits.log_softmax(-1).gather(-1, label.unsqueeze(-1)).squeeze(-1), mask)
 
 
 def bound_loss(uv: Float[Tensor, "*B 2"], mask: Bool[Tensor, "*B"]) -> Float[Tensor, ""]:

@@ -13,8 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from quest.errors import ConfigError
-from quest.model.config import PRESETS
+from quest.model.config import DEFAULT
 from quest.model.discovery import RADIUS_CELLS, find_peaks
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
@@ -60,10 +59,10 @@ class StageMap:
     """
 
     name = "stage-map"
-    terms: tuple[str, ...] = ("map",)
 
     def __init__(self, network: QuestNetwork) -> None:
         self.network = network
+        self.weights = {"map": 1.0}
 
     def trained(self) -> list[nn.Parameter]:
         """Trunk and head of the map."""
@@ -71,12 +70,11 @@ class StageMap:
         assert trunk is not None
         return [*trunk.parameters(), *self.network.affordance.parameters()]
 
-    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
         """Focal loss of the map, and its offsets."""
         found = self.network.afford(frames)
         visible = truth.visible & truth.exists[:, None]
-        loss = losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible, truth.owner)
-        return loss, loss.detach()[None]
+        return {"map": losses.affordance_loss(found, truth.uv, truth.label, truth.intent, visible, truth.owner)}
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> MapScores:
         """Average precision on the same frames at every call."""
@@ -118,15 +116,10 @@ def with_own_map(network: QuestNetwork) -> QuestNetwork:
     """The network with a map of its own trunk, which begins with what the network observes frames by.
 
     Intents are learned by the map too. A network that knew none keeps queries that take no notice of them.
-
-    Raises:
-        ConfigError: the network's queries are learned slots, which need no map.
     """
-    if network.config.queries != "anchored":
-        raise ConfigError(f"preset {network.config.preset!r}: learned queries have no affordance map to train")
     if network.affordance_trunk is not None:
         return network
-    layers = PRESETS["default"].map_layers
+    layers = DEFAULT.map_layers
     other = QuestNetwork(replace(network.config, map_layers=layers, intents=True))
     own, state = network.state_dict(), other.state_dict()
     begin = {f"affordance_trunk.{name}": tensor for name, tensor in network.state_dict().items()

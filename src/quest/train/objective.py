@@ -1,28 +1,22 @@
-"""From a batch of windows to the losses of stage 1, for anchored and for learned queries."""
+"""From a batch of windows to the losses of stage 1."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from quest.errors import ConfigError
-from quest.model.decoder import Anchor, HeatmapHead, Prediction
+from quest.model.decoder import Anchor, Prediction
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, Observation
 from quest.train import losses
-from quest.train.settings import LossWeights
-from quest.train.slots import (
-    CONFIDENT_PX,
-    SlotAnswers,
-    answer_slots,
-    at_window,
-    slot_confidence_loss,
-    slot_label_loss,
-)
+from quest.train.losses import Loss
 from quest.train.windows import WindowTruth
+
+RIGHT_PX = 8.0
+"""An answer this near to a seen entity is right, pixels of the input."""
 
 _OCCLUDED_WEIGHT = 0.3
 _MOVED_WEIGHT = 3.0
@@ -30,81 +24,102 @@ _RIGHT_DISTANCE = 0.1
 
 
 @dataclass(frozen=True)
-class LossTerms:
-    """One value per field of :class:`~quest.train.settings.LossWeights`, unweighted."""
+class Answered:
+    """Answers for the entities of a batch of windows, and the truth of the same frames.
 
-    aff: Tensor
-    heat: Tensor
-    point: Tensor
-    vel: Tensor
-    acc: Tensor
-    conf: Tensor
-    bound: Tensor
-    feat: Tensor
-    geo: Tensor
-    map: Tensor
-    joint: Tensor
+    Attributes:
+        embedding: of what answers for each entity.
+        uv: coordinates in [0, 1]^2 of the input.
+        point: positions in the reference frame; NaN where they cannot be lifted.
+        asked: entities that have an answer.
+        truth: what is true; index 0 of its time axis is the anchor frame.
+    """
 
-    def total(self, weights: LossWeights) -> Tensor:
-        """Weighted sum."""
-        parts = [getattr(weights, f.name) * getattr(self, f.name) for f in fields(self)]
-        return torch.stack(parts).sum()
+    embedding: Float[Tensor, "B T K D"]
+    uv: Float[Tensor, "B T K 2"]
+    point: Float[Tensor, "B T K 3"]
+    asked: Bool[Tensor, "B K"]
+    truth: WindowTruth
+
+    @property
+    def truth_uv(self) -> Float[Tensor, "B T K 2"]:
+        """True coordinates."""
+        return self.truth.uv[:, 1:]
+
+    @property
+    def truth_point(self) -> Float[Tensor, "B T K 3"]:
+        """True reference positions."""
+        return self.truth.point[:, 1:]
+
+    @property
+    def visible(self) -> Bool[Tensor, "B T K"]:
+        """Whether the entity is seen."""
+        return self.truth.visible[:, 1:]
+
+    @property
+    def mask(self) -> Bool[Tensor, "B T K"]:
+        """Which answers count at all: of entities that are asked for and inside the image."""
+        inside = ((self.truth_uv >= 0) & (self.truth_uv <= 1)).all(-1)
+        return self.asked[:, None].expand_as(inside) & inside
+
+    @property
+    def seen(self) -> Bool[Tensor, "B T K"]:
+        """Which answers count that are of entities in sight."""
+        return self.mask & self.visible
+
+    @property
+    def importance(self) -> Float[Tensor, "B T K"]:
+        """An entity that moved is what a tracker is asked about; most of them stand still in most windows."""
+        return torch.where(has_moved(self.truth), _MOVED_WEIGHT, 1.0)
 
 
 @dataclass(frozen=True)
-class Rollout:
-    """Predictions of a batch of windows and the truth of the same frames.
+class Rollout(Answered):
+    """What the network answers on a batch of windows, taken freely, as a tracker would.
 
     Attributes:
-        prediction: answers, taken freely (as a tracker would).
+        prediction: everything that it says, of which ``embedding``, ``uv`` and ``point`` are a part.
         taught: the same, refined around the true cell where the free peak is far from it.
-        truth_uv: true coordinates.
-        truth_point: true reference positions.
-        visible: whether the entity is seen.
-        mask: which answers count at all.
         observed: the window's observation.
         anchor_observed: the anchor frame's observation.
-        asked: entities that have a query: those that it was bound to, or that a slot was matched to.
-        slots: answers of all slots, for networks that have them.
+        frames: the anchor frame and the window.
+        network: that answered.
     """
 
     prediction: Prediction
     taught: Prediction
-    truth_uv: Float[Tensor, "B T K 2"]
-    truth_point: Float[Tensor, "B T K 3"]
-    visible: Bool[Tensor, "B T K"]
-    mask: Bool[Tensor, "B T K"]
     observed: Observation
     anchor_observed: Observation
-    asked: Bool[Tensor, "B K"]
-    slots: SlotAnswers | None = None
+    frames: FrameBatch
+    network: QuestNetwork
 
 
-def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth, *, whole: bool = False) -> Rollout:
-    """Bind at the anchor frame (index 0) and answer the frames after it.
+def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> Rollout:
+    """Bind queries at the anchor frame and answer in the window.
 
     Args:
         network: the network.
         frames: the anchor frame and the window.
         truth: what is true of them.
-        whole: whether learned slots are matched by the window too, to learn from it
-            (see :func:`~quest.train.slots.answer_slots`).
     """
     observed = network.observe(frames)
     first, window = observed.during(slice(0, 1)), observed.during(slice(1, None))
-    uv, point, visible = truth.uv[:, 1:], truth.point[:, 1:], truth.visible[:, 1:]
-    slots = None
-    if network.config.queries == "anchored":
-        anchor = bind_at(network, frames, first, truth)
-        prediction = network.decode(anchor, window, frames.during(slice(1, None)))
-        taught = _teach(network, anchor, prediction, window, uv)
-        asked = truth.bound
-    else:
-        slots = answer_slots(network, observed, frames, truth, whole=whole)
-        prediction = taught = at_window(slots.of_entities)
-        asked = slots.matched
-    mask = asked[:, None].expand_as(visible) & ((uv >= 0) & (uv <= 1)).all(-1)
-    return Rollout(prediction, taught, uv, point, visible, mask, window, first, asked, slots)
+    anchor = bind_at(network, frames, first, truth)
+    free = network.decode(anchor, window)
+    taught = _teach(network, anchor, free, window, truth.uv[:, 1:])
+    return Rollout(
+        embedding=free.embedding,
+        uv=free.uv,
+        point=free.point,
+        asked=truth.bound,
+        truth=truth,
+        prediction=free,
+        taught=taught,
+        observed=window,
+        anchor_observed=first,
+        frames=frames,
+        network=network,
+    )
 
 
 def bind_at(network: QuestNetwork, frames: FrameBatch, observed: Observation, truth: WindowTruth) -> Anchor:
@@ -113,50 +128,6 @@ def bind_at(network: QuestNetwork, frames: FrameBatch, observed: Observation, tr
     uv_px = truth.anchor_uv.unsqueeze(1) * network.config.encoder.image_size
     point = first.near_point_at(uv_px).squeeze(1)
     return network.bind(observed, truth.anchor_uv, point, truth.told, truth.bound, truth.told_intent)
-
-
-def stage_one(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> tuple[LossTerms, Rollout]:
-    """All losses of stage 1 on one batch."""
-    roll = roll_out(network, frames, truth, whole=True)
-    free, taught, mask = roll.prediction, roll.taught, roll.mask
-    seen = mask & roll.visible
-    # An entity that moved is what a tracker is asked about; most of them stand still in most windows.
-    importance = torch.where(has_moved(truth), _MOVED_WEIGHT, 1.0)
-    weight = mask * importance * torch.where(roll.visible, 1.0, _OCCLUDED_WEIGHT)
-    zero = free.uv.sum() * 0
-    heat = joint = zero
-    if roll.slots is None:
-        px = (free.uv - roll.truth_uv).norm(dim=-1) * network.config.encoder.image_size
-        heat = losses.heatmap_loss(free.logits, roll.truth_uv, weight, cells=network.config.cells)
-        conf = losses.confidence_loss(free.visible_logit, roll.visible, mask)
-        right, judged = is_right(free.point.detach(), truth, px.detach())
-        conf = conf + losses.confidence_loss(free.right_logit, right, mask & judged)
-        # A map with a trunk of its own has a stage of its own.
-        affordance = zero if network.config.map_layers else _affordance(network, frames, roll, truth)
-        belief = network.joint(free.embedding)
-        joint = losses.joint_loss(belief, roll.truth_point, truth.axis, truth.revolute, mask)
-        aff = losses.coordinate_loss(taught.uv, roll.truth_uv, seen * importance)
-        lifted = mask
-    else:
-        conf = slot_confidence_loss(roll.slots, truth, image_size=network.config.encoder.image_size)
-        affordance = slot_label_loss(roll.slots, truth)
-        aff = _slot_coordinates(roll.slots, truth, importance)
-        # A hidden entity's pixel shows what hides it: no coordinates lift it to where the entity is.
-        lifted = seen
-    terms = LossTerms(
-        aff=aff,
-        heat=heat,
-        point=losses.point_loss(taught.point, roll.truth_point, truth.unit, lifted * importance),
-        vel=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=1),
-        acc=losses.difference_loss(taught.point, roll.truth_point, truth.unit, seen, order=2),
-        conf=conf,
-        bound=losses.bound_loss(taught.uv, mask),
-        feat=losses.feature_loss(free.embedding, roll.asked) if free.embedding.shape[1] > 1 else zero,
-        geo=losses.manifold_loss(taught.point, truth.point[:, 0], truth.axis, truth.revolute, truth.unit, seen),
-        map=affordance,
-        joint=joint,
-    )
-    return terms, roll
 
 
 def has_moved(truth: WindowTruth) -> Bool[Tensor, "B T K"]:
@@ -181,13 +152,22 @@ def is_right(
     distance = distance.unflatten(0, point.shape[:2]) / truth.unit[:, None, None, None]
     own = distance.diagonal(dim1=-2, dim2=-1)
     right = (own <= distance.amin(-1) + 1e-6) & (own < _RIGHT_DISTANCE)
-    return torch.where(lifted, right, px < CONFIDENT_PX), torch.isfinite(px)
+    return torch.where(lifted, right, px < RIGHT_PX), torch.isfinite(px)
 
 
-def _affordance(network: QuestNetwork, frames: FrameBatch, roll: Rollout, truth: WindowTruth) -> Tensor:
+def _confidence(r: Rollout) -> Tensor:
+    px = (r.uv - r.truth_uv).norm(dim=-1) * r.network.config.encoder.image_size
+    right, judged = is_right(r.point.detach(), r.truth, px.detach())
+    seen = losses.confidence_loss(r.prediction.visible_logit, r.visible, r.mask)
+    return seen + losses.confidence_loss(r.prediction.right_logit, right, r.mask & judged)
+
+
+def _affordance(r: Rollout) -> Tensor:
+    if r.network.config.map_layers:  # a map with a trunk of its own has a stage of its own
+        return r.uv.sum() * 0
     # The anchor frame and the newest one: the frames between differ little from them.
-    ends = frames.ends()
-    found = network.afford(ends, Observation.stack([roll.anchor_observed, roll.observed.during(slice(-1, None))]))
+    seen = Observation.stack([r.anchor_observed, r.observed.during(slice(-1, None))])
+    truth, found = r.truth, r.network.afford(r.frames.ends(), seen)
     visible = (truth.visible & truth.exists[:, None])[:, [0, -1]]
     return losses.affordance_loss(found, truth.uv[:, [0, -1]], truth.label, truth.intent, visible)
 
@@ -196,8 +176,6 @@ def _teach(
     network: QuestNetwork, anchor: Anchor, prediction: Prediction, observed: Observation, uv: Tensor
 ) -> Prediction:
     head, side = network.head, network.config.cells
-    if not isinstance(head, HeatmapHead):
-        raise ConfigError("only a heatmap can be refined around a cell")
     place = (uv.nan_to_num(0.5) * side).long().clamp(0, side - 1)
     row, column = prediction.peak.div(side, rounding_mode="floor"), prediction.peak % side
     near = ((row - place[..., 1]).abs() <= 1) & ((column - place[..., 0]).abs() <= 1)
@@ -206,9 +184,35 @@ def _teach(
     return replace(prediction, peak=cell, uv=taught_uv, point=point)
 
 
-def _slot_coordinates(slots: SlotAnswers, truth: WindowTruth, importance: Float[Tensor, "B T K"]) -> Tensor:
-    """L_aff of matched slots, at the anchor frame too: there the tracker chooses them."""
-    inside = ((truth.uv >= 0) & (truth.uv <= 1)).all(-1)
-    seen = slots.matched[:, None] & truth.visible & inside
-    weight = seen * torch.cat((torch.ones_like(importance[:, :1]), importance), dim=1)
-    return losses.coordinate_loss(slots.of_entities.uv, truth.uv, weight)
+def _heatmap(r: Rollout) -> Tensor:
+    weight = r.mask * r.importance * torch.where(r.visible, 1.0, _OCCLUDED_WEIGHT)
+    return losses.heatmap_loss(r.prediction.logits, r.truth_uv, weight, cells=r.network.config.cells)
+
+
+def _difference(r: Rollout, order: int) -> Tensor:
+    return losses.difference_loss(r.taught.point, r.truth_point, r.truth.unit, r.seen, order=order)
+
+
+def _manifold(r: Rollout) -> Tensor:
+    truth = r.truth
+    return losses.manifold_loss(r.taught.point, truth.point[:, 0], truth.axis, truth.revolute, truth.unit, r.seen)
+
+
+def _joint(r: Rollout) -> Tensor:
+    return losses.joint_loss(r.network.joint(r.embedding), r.truth_point, r.truth.axis, r.truth.revolute, r.mask)
+
+
+LOSSES: dict[str, Loss[Rollout]] = {
+    "aff": Loss(20.0, lambda r: losses.coordinate_loss(r.taught.uv, r.truth_uv, r.seen * r.importance)),
+    "heat": Loss(1.0, _heatmap),
+    "point": Loss(2.0, lambda r: losses.point_loss(r.taught.point, r.truth_point, r.truth.unit, r.mask * r.importance)),
+    "vel": Loss(1.0, lambda r: _difference(r, 1)),
+    "acc": Loss(0.5, lambda r: _difference(r, 2)),
+    "conf": Loss(0.3, _confidence),
+    "bound": Loss(0.1, lambda r: losses.bound_loss(r.taught.uv, r.mask)),
+    "feat": Loss(0.02, lambda r: losses.feature_loss(r.embedding, r.asked)),
+    "geo": Loss(0.2, _manifold),
+    "map": Loss(1.0, _affordance),
+    "joint": Loss(0.1, _joint),
+}
+"""The losses of stage 1 by name (``docs/training.md`` says what each is of)."""

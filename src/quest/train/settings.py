@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, get_args
 
 from quest.errors import ConfigError
@@ -121,68 +121,3 @@ class WindowConfig:
         for name in ("first_frame_share", "label_share", "depth_drop_share", "query_drop_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"windows: expected {name} from 0 to 1, got {getattr(self, name)}")
-
-
-@dataclass(frozen=True)
-class LossWeights:
-    """Weight of every loss; 0 turns it off. The defaults are those of the preset ``default``.
-
-    Attributes:
-        aff: Huber loss of coordinates on visible entities.
-        heat: cross-entropy of the heatmap against the true cell.
-        point: Huber loss of the 3D point, normalised units.
-        vel: first differences of the 3D track.
-        acc: second differences of the 3D track.
-        conf: both confidences.
-        bound: raw coordinates outside [0, 1]^2.
-        feat: change of a query's embedding between neighbouring frames.
-        geo: distance of the point to its entity's own screw motion.
-        map: focal loss and offset of the dense affordance map.
-        joint: likelihood of the joint that the entity hangs on.
-    """
-
-    aff: float = 20.0
-    heat: float = 1.0
-    point: float = 2.0
-    vel: float = 1.0
-    acc: float = 0.5
-    conf: float = 0.3
-    bound: float = 0.1
-    feat: float = 0.02
-    geo: float = 0.2
-    map: float = 1.0
-    joint: float = 0.1
-
-    def __post_init__(self) -> None:
-        for name, value in asdict(self).items():
-            if not 0 <= value < math.inf:
-                raise ConfigError(f"losses: expected {name} to be at least 0, got {value}; 0 turns it off")
-
-
-LOSSES: dict[str, LossWeights] = {
-    "default": LossWeights(),
-    "paper": LossWeights(aff=1.0, heat=0.0, point=0.0, joint=0.0),
-}
-"""Weights by preset. Those of ``paper`` are as published: coordinates 1, first and second differences 1 and 0.5; the
-publication leaves the others open."""
-
-
-@dataclass(frozen=True)
-class LossChanges:
-    """Weights of losses that are to differ from the preset's; 0 turns one off (docs/training.md has them)."""
-
-    aff: float | None = None
-    heat: float | None = None
-    point: float | None = None
-    vel: float | None = None
-    acc: float | None = None
-    conf: float | None = None
-    bound: float | None = None
-    feat: float | None = None
-    geo: float | None = None
-    map: float | None = None
-    joint: float | None = None
-
-    def apply(self, preset: str) -> LossWeights:
-        """The preset's weights with the changes."""
-        return replace(LOSSES[preset], **{name: value for name, value in asdict(self).items() if value is not None})

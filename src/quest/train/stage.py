@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from quest.model.network import QuestNetwork
+from quest.model.config import DecoderConfig
+from quest.model.network import QuestNetwork, WindowNetwork
 from quest.model.observation import FrameBatch
-from quest.train.objective import LossTerms, stage_one
-from quest.train.settings import LossWeights
-from quest.train.validation import WindowScores, validate
+from quest.train.losses import weights_of
+from quest.train.objective import LOSSES, Answered, roll_out
+from quest.train.validation import WindowScores, score_windows
 from quest.train.windows import WindowSampler, WindowTruth
 
 
@@ -33,17 +34,20 @@ class Objective(Protocol):
 
     name: str
     """Tells runs of different stages apart."""
-    network: QuestNetwork
-    """The network of which something is trained."""
-    terms: tuple[str, ...]
-    """Names of the losses."""
+    weights: dict[str, float]
+    """Weight of every loss by its name."""
+
+    @property
+    def network(self) -> WindowNetwork[DecoderConfig]:
+        """The network of which something is trained."""
+        ...
 
     def trained(self) -> list[nn.Parameter]:
         """What is trained; every batch must give each of them a gradient."""
         ...
 
-    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
-        """The weighted sum of the losses on a batch, and each loss by itself, detached.
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
+        """Every loss of ``weights`` on a batch, unweighted.
 
         Means are taken by :func:`~quest.train.losses.masked_mean`, so that a batch can be divided.
         """
@@ -60,25 +64,28 @@ class StageOne:
     Args:
         network: the network; a flow head, and a map with a trunk of its own, stay as they are. The flow head should be
             trained again afterwards; the map does not stand on what changed.
-        weights: weight of every loss.
+        changes: weights of losses that are to differ; 0 turns one off.
     """
 
     name = "stage-1"
-    terms: tuple[str, ...] = tuple(f.name for f in fields(LossTerms))
 
-    def __init__(self, network: QuestNetwork, weights: LossWeights) -> None:
+    def __init__(self, network: QuestNetwork, changes: Mapping[str, float] | None = None) -> None:
         self.network = network
-        self.weights = weights
+        self.weights = weights_of(LOSSES, changes or {})
 
     def trained(self) -> list[nn.Parameter]:
         """All parameters outside the encoder, the flow head and a map with a trunk of its own."""
         return self.network.trainable()
 
-    def losses(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, ""], Float[Tensor, " N"]]:
-        """All losses of stage 1."""
-        terms, _ = stage_one(self.network, frames, truth)
-        return terms.total(self.weights), torch.stack([getattr(terms, name).detach() for name in self.terms])
+    def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
+        """Every loss of stage 1."""
+        answered = roll_out(self.network, frames, truth)
+        return {name: loss.of(answered) for name, loss in LOSSES.items()}
+
+    def answered(self, frames: FrameBatch, truth: WindowTruth) -> Answered:
+        """What entities are answered."""
+        return roll_out(self.network, frames, truth)
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> WindowScores:
         """Distance, identity and discovery on fixed windows."""
-        return validate(self.network, sampler, batches=batches, device=device)
+        return score_windows(self.network, self.answered, sampler, batches=batches, device=device)

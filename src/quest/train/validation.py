@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,10 +11,11 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from quest.model.config import DecoderConfig
 from quest.model.discovery import RADIUS_CELLS, Peaks, find_peaks, match_peaks
-from quest.model.network import QuestNetwork
+from quest.model.network import QuestNetwork, WindowNetwork
 from quest.model.observation import FrameBatch, Observation
-from quest.train.objective import Rollout, has_moved, is_right, roll_out
+from quest.train.objective import Answered, Rollout, has_moved, is_right
 from quest.train.windows import WindowSampler, WindowTruth
 
 _PEAK_LOGIT = -0.5
@@ -61,22 +63,38 @@ class WindowScores:
         )
 
 
-def validate(network: QuestNetwork, sampler: WindowSampler, *, batches: int, device: torch.device) -> WindowScores:
-    """Scores on the same windows at every call; the network is left in training mode."""
+def score_windows(
+    network: WindowNetwork[DecoderConfig],
+    answered: Callable[[FrameBatch, WindowTruth], Answered],
+    sampler: WindowSampler,
+    *,
+    batches: int,
+    device: torch.device,
+) -> WindowScores:
+    """Scores on the same windows at every call; the network is left in training mode.
+
+    Args:
+        network: what is judged.
+        answered: what it answers on a batch.
+        sampler: of windows.
+        batches: how many.
+        device: where the network is.
+    """
     rng = np.random.default_rng(0)
     network.eval()
     px, distance, right, moved = [], [], [], []
-    found = np.zeros(3)
-    reads_map = network.config.queries == "anchored" and network.config.map_layers == 0
+    found, reads_map = np.zeros(3), False
     with torch.no_grad():
         for _ in range(batches):
             frames, truth = sampler.draw(rng, disturb=False)
             frames, truth = frames.to(device), truth.to(device)
-            roll = roll_out(network, frames, truth)
-            for values, value in zip((px, distance, right, moved), _score(network, roll, truth), strict=True):
+            roll = answered(frames, truth)
+            scores = _score(roll, network.config.encoder.image_size)
+            for values, value in zip((px, distance, right, moved), scores, strict=True):
                 values.append(value)
-            if reads_map:
-                found += _discovery(network, frames.during(slice(0, 1)), roll.anchor_observed, truth)
+            if isinstance(roll, Rollout) and not roll.network.config.map_layers:
+                reads_map = True
+                found += _discovery(roll.network, frames.during(slice(0, 1)), roll.anchor_observed, truth)
     network.train()
     all_px, hits, proposed, present = torch.cat(px), *found
     all_distance, all_moved = torch.cat(distance), torch.cat(moved)
@@ -96,14 +114,14 @@ def mean_of(values: Float[Tensor, " N"]) -> float | None:
     return float(values.mean()) if len(values) else None
 
 
-def _score(network: QuestNetwork, roll: Rollout, truth: WindowTruth) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _score(roll: Answered, image_size: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Pixel distances of what is seen; distances, whether right and whether moved of all answers."""
-    px = (roll.prediction.uv - roll.truth_uv).norm(dim=-1).float() * network.config.encoder.image_size
-    distance = (roll.prediction.point - roll.truth_point).norm(dim=-1) / truth.unit[:, None, None]
-    right, _ = is_right(roll.prediction.point, truth, px)
+    px = (roll.uv - roll.truth_uv).norm(dim=-1).float() * image_size
+    distance = (roll.point - roll.truth_point).norm(dim=-1) / roll.truth.unit[:, None, None]
+    right, _ = is_right(roll.point, roll.truth, px)
     distance = distance.nan_to_num(1.0).clamp(max=1.0)
     counted = roll.mask
-    return px[counted & roll.visible], distance[counted].float(), right[counted].float(), has_moved(truth)[counted]
+    return px[roll.seen], distance[counted].float(), right[counted].float(), has_moved(roll.truth)[counted]
 
 
 def _discovery(network: QuestNetwork, frames: FrameBatch, observed: Observation, truth: WindowTruth) -> np.ndarray:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from quest.errors import ConfigError
 from quest.geometry import transform
-from quest.model.config import NetworkConfig
+from quest.model.config import DecoderConfig
 from quest.model.network import UNKNOWN_INTENT, UNKNOWN_LABEL
 from quest.model.observation import FrameBatch, reference_of
 from quest.train.feature_cache import DEPTH_UNIT_M, CachedView
@@ -80,7 +80,7 @@ class WindowSampler:
     """
 
     def __init__(
-        self, views: list[CachedView], network: NetworkConfig, config: WindowConfig, *, anchors_only: bool = False
+        self, views: list[CachedView], network: DecoderConfig, config: WindowConfig, *, anchors_only: bool = False
     ) -> None:
         self.network = network
         self.config = config

@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim.procedural.handles import SUNK_M, HandleKind, HandleStyle, handle_part, sample_any_style
-from quest.sim.procedural.model import HANDLE_ROLES, Link, Mesh, ObjectModel, Part, join
+from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import UP, box, lathe, prism_between
+from quest.types import GRIPS
 
 _MARGIN_M = 0.004
 _NARROWEST_M = 0.05
@@ -95,7 +96,7 @@ def _free_panels(model: ObjectModel, rng: np.random.Generator) -> list[_Panel]:
     body = np.concatenate([part.mesh.vertices for part in model.body])
     low, high = body.min(axis=0), body.max(axis=0)
     fronts = np.concatenate([
-        part.mesh.vertices + link.origin for link in model.links for part in link.parts if part.role not in HANDLE_ROLES
+        part.mesh.vertices + link.origin for link in model.links for part in link.parts if part.role not in GRIPS
     ])  # fmt: skip
     near, far = fronts.min(axis=0), fronts.max(axis=0)
     front = min(float(low[1]), float(near[1])) - float(rng.uniform(0.001, 0.015))

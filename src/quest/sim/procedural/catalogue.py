@@ -16,10 +16,11 @@ from quest.sim.procedural.clutter import with_clutter
 from quest.sim.procedural.furniture import STORAGE, TABLES
 from quest.sim.procedural.handles import with_long_handles
 from quest.sim.procedural.layouts import FURNITURE
-from quest.sim.procedural.model import HANDLE_ROLES, ObjectModel, write_object
+from quest.sim.procedural.model import ObjectModel, write_object
 from quest.sim.procedural.room_door import build_room_door
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
 from quest.sim.procedural.things import THINGS, build_laptop, build_trunk
+from quest.types import GRIPS
 
 _OFTEN_BARE = (
     "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
@@ -45,7 +46,7 @@ _OFTEN_DIALS = (
 def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
     model = _BUILDERS[category](rng)
-    links = [replace(link, parts=tuple(p for p in link.parts if p.role not in HANDLE_ROLES)) for link in model.links]
+    links = [replace(link, parts=tuple(p for p in link.parts if p.role not in GRIPS)) for link in model.links]
     return replace(model, links=tuple(links))
 
 

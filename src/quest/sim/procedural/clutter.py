@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.procedural.model import HANDLE_ROLES, Link, Mesh, ObjectModel, Part, join
+from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import UP, box, lathe
+from quest.types import GRIPS
 
 _SUNK_M = 0.001
 _MARGIN_M = 0.02
@@ -45,12 +46,12 @@ def with_clutter(model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
 
 def _decorated(link: Link, rng: np.random.Generator) -> Link:
     """The link with none to three things on its front, away from its handles."""
-    fronts = [part for part in link.parts if part.role not in HANDLE_ROLES]
+    fronts = [part for part in link.parts if part.role not in GRIPS]
     if not fronts:
         return link
     sizes = [np.ptp(part.mesh.bounds, axis=0) for part in fronts]
     low, high = fronts[int(np.argmax([size[0] * size[2] for size in sizes]))].mesh.bounds
-    taken = [_rect(part.mesh) for part in link.parts if part.role in HANDLE_ROLES]
+    taken = [_rect(part.mesh) for part in link.parts if part.role in GRIPS]
     added: list[Part] = []
     for _ in range(int(rng.integers(0, 4))):
         width, height = (high - low)[[0, 2]]

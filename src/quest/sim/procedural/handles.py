@@ -12,8 +12,9 @@ from typing import Literal, get_args
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.procedural.model import HANDLE_ROLES, Link, Mesh, ObjectModel, Part, join
+from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
 from quest.sim.procedural.shapes import box, centred_box, lathe, prism_between, tube
+from quest.types import GRIPS
 
 SUNK_M = 0.001
 """How deep feet reach into the front, so that no gap shows between them."""
@@ -319,8 +320,8 @@ def with_long_handles(model: ObjectModel, rng: np.random.Generator) -> ObjectMod
     share = float(rng.uniform(*_SHARE))
 
     def with_long(link: Link) -> Link:
-        old = [part for part in link.parts if part.role in HANDLE_ROLES]
-        others = tuple(part for part in link.parts if part.role not in HANDLE_ROLES)
+        old = [part for part in link.parts if part.role in GRIPS]
+        others = tuple(part for part in link.parts if part.role not in GRIPS)
         if not (old and others):
             return link
         bounds = np.stack([part.mesh.bounds for part in others])

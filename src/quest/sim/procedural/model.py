@@ -17,6 +17,8 @@ from xml.etree import ElementTree as ET
 import numpy as np
 from jaxtyping import Float, Int
 
+from quest.types import GRIPS
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -55,10 +57,6 @@ def join(meshes: list[Mesh]) -> Mesh:
         np.concatenate([m.normals for m in meshes]),
         np.concatenate([m.uv for m in meshes]),
     )
-
-
-HANDLE_ROLES = ("handle", "knob")
-"""Roles of parts that one takes hold of."""
 
 
 @dataclass(frozen=True)
@@ -106,7 +104,7 @@ class Link:
     @property
     def has_handle(self) -> bool:
         """Whether a handle or a knob is among the parts."""
-        return any(part.role in HANDLE_ROLES for part in self.parts)
+        return any(part.role in GRIPS for part in self.parts)
 
 
 @dataclass(frozen=True)

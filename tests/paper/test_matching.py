@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from quest.model.slots import COORDINATE_WEIGHT, assign_slots, slot_cost
+from quest.paper.matching import COORDINATE_WEIGHT, assign_slots, slot_cost
 
 B, T, Q, K = 3, 2, 5, 4
 

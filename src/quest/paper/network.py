@@ -1,0 +1,205 @@
+"""The published network: learned queries look at every frame of a window and answer with coordinates.
+
+    colours  B T 224 224 3          depth  B T 224 224
+        |                               |
+    encoder, frozen: 16 x 16 patches    |
+        |                               |
+    features  B T N=196 E               |
+        |                               |
+    project + code of place  N D        |
+            + code of time   T D        |
+        |                               |
+    tokens F_t  B T N D=384             |
+        |                               |
+        |     learned queries  K=8 D, the same in every frame
+        |        |                      |
+    decoder, 2 layers of 4 heads:       |
+        queries look at F_t             |
+        queries look at each other      |
+        a query looks at itself in earlier frames
+        MLP                             |
+        |                               |
+    embedding  B T K D                  |
+        |           |            |      |
+    MLP head      labels      flow head (stage 2)
+        |         B T K L      B K 3    |
+    (x, y)  B T K 2, confidence  B T K  |
+        |                               |
+        +------------ lifting ----------+
+                         |
+                  point  B T K 3, reference frame
+
+The publication does not say how queries know of the rest of the window but for the codes of time; here a query also
+looks at itself in the window's earlier frames, which keeps the answer for t causal. It has no labels either; the
+protocol that gives no point asks for them, so a linear layer tells them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from quest.errors import WeightsError
+from quest.model.config import DecoderConfig
+from quest.model.decoder import DecoderLayer
+from quest.model.encoder import load_exactly
+from quest.model.flow_head import FlowHead
+from quest.model.network import WindowNetwork
+from quest.model.observation import FrameBatch
+from quest.model.tensor_file import read_tensors, save_tensors
+from quest.types import LABELS
+
+FORMAT = "quest-paper-1"
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig(DecoderConfig):
+    """Shapes of the published network; the defaults are the published ones."""
+
+    width: int = 384
+    heads: int = 4
+    decoder_layers: int = 2
+    slots: int = 8
+
+
+@dataclass(frozen=True)
+class SlotAnswers:
+    """Answers of K slots in every frame of a window.
+
+    Attributes:
+        embedding: the queries after the decoder.
+        uv: coordinates in [0, 1]^2 of the input; raw, so they may leave it.
+        logit: confidence that there is an entity and that it is seen, log odds.
+        label_logits: what each takes its entity for, index into LABELS.
+        point: lifted position in the reference frame; NaN where there is no depth.
+    """
+
+    embedding: Float[Tensor, "B T K D"]
+    uv: Float[Tensor, "B T K 2"]
+    logit: Float[Tensor, "B T K"]
+    label_logits: Float[Tensor, "B T K L"]
+    point: Float[Tensor, "B T K 3"]
+
+    def then(self, later: SlotAnswers) -> SlotAnswers:
+        """These frames and later ones."""
+        return SlotAnswers(*(torch.cat((getattr(self, f.name), getattr(later, f.name)), dim=1) for f in fields(self)))
+
+    def of(self, slot: Int[Tensor, "B E"]) -> SlotAnswers:
+        """The answers of one slot per entity."""
+        return SlotAnswers(*(_gather(getattr(self, f.name), slot) for f in fields(self)))
+
+
+class PaperNetwork(WindowNetwork[PaperConfig]):
+    """Maps a window of T frames to the answers of K slots in each of them."""
+
+    def __init__(self, config: PaperConfig) -> None:
+        super().__init__(config)
+        d = config.width
+        self.project = nn.Linear(config.encoder.width, d)
+        self.place = nn.Parameter(0.02 * torch.randn(config.encoder.grid**2, d))
+        self.time = nn.Parameter(0.02 * torch.randn(config.window, d))
+        self.token_norm = nn.LayerNorm(d)
+        # As large as what they read from the tokens: small ones would drown in it and all answer alike.
+        self.queries = nn.Parameter(torch.randn(config.slots, d))
+        self.layers = nn.ModuleList(DecoderLayer(d, config.heads) for _ in range(config.decoder_layers))
+        self.norm = nn.LayerNorm(d)
+        self.head = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
+        self.label = nn.Linear(d, len(LABELS))
+        self.flow = FlowHead(d, window=config.window, points3d=False) if config.flow else None
+
+    def forward(self, frames: FrameBatch) -> SlotAnswers:
+        """Answers for every frame of a window; those for a frame do not depend on later ones."""
+        return self.answer(self.embed(frames.features), frames)
+
+    def embed(self, features: Float[Tensor, "B T N E"]) -> Float[Tensor, "B T K D"]:
+        """The queries after they looked at every frame of the window, oldest first.
+
+        Where a clip has fewer frames yet, they are taken for the first ones of a window: what a window answers for its
+        i-th frame, it has learned to answer from i frames.
+        """
+        b, t = features.shape[:2]
+        tokens = self.token_norm(self.project(features) + self.place) + self.time[:t, None]
+        x = self.queries.expand(b, t, -1, -1)
+        all_valid = torch.ones(b, x.shape[2], dtype=torch.bool, device=x.device)
+        for layer in self.layers:
+            x = layer(x, tokens, all_valid)
+        return self.norm(x)
+
+    def answer(self, x: Float[Tensor, "B T K D"], frames: FrameBatch) -> SlotAnswers:
+        """What queries say that looked at a window, for all its frames or some.
+
+        Args:
+            x: from :meth:`embed`.
+            frames: the frames that are asked for.
+        """
+        out = self.head(x).float()
+        uv = out[..., :2] + 0.5
+        uv_px = uv * self.config.encoder.image_size
+        point = frames.to_reference(uv_px, frames.depth_at(uv_px))
+        return SlotAnswers(x, uv, out[..., 2], self.label(x).float(), point)
+
+    def trainable(self) -> list[nn.Parameter]:
+        """Parameters of stage 1: all but the encoder and the flow head."""
+        return [p for name, p in self.named_parameters() if not name.startswith(("encoder.", "flow."))]
+
+    def busiest(self) -> list[nn.Module]:
+        """The decoder's layers."""
+        return list(self.layers)
+
+    def save(self, path: Path, *, about: str, licence: str = "") -> None:
+        """Write the network in half precision, atomically.
+
+        Args:
+            path: safetensors file to write.
+            about: where the weights come from, a line for people.
+            licence: under which the weights may be used; empty to say nothing.
+
+        Raises:
+            WeightsError: the file cannot be written.
+        """
+        tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in self.state_dict().items()}
+        words = {"format": FORMAT, "config": self.config.to_json(), "about": about, "licence": licence}
+        save_tensors(tensors, path, metadata=words)
+
+
+@dataclass(frozen=True)
+class LoadedPaper:
+    """A published network read from a file, in evaluation mode, with where its weights come from."""
+
+    network: PaperNetwork
+    about: str
+    licence: str
+
+
+def is_paper(path: Path) -> bool:
+    """Whether a file of weights holds a published network.
+
+    Raises:
+        WeightsError: it is no whole safetensors file.
+    """
+    return read_tensors(path, parts=())[0].get("format") == FORMAT
+
+
+def read_paper(path: Path) -> LoadedPaper:
+    """Read what :meth:`PaperNetwork.save` wrote.
+
+    Raises:
+        WeightsError: the file is corrupt, of another format, or of another shape.
+    """
+    metadata, state = read_tensors(path)
+    if metadata.get("format") != FORMAT:
+        raise WeightsError(f"{path}: expected weights of format {FORMAT!r}, got {metadata.get('format')!r}")
+    network = PaperNetwork(PaperConfig.from_json(metadata["config"]))
+    load_exactly(network, {name: tensor.float() for name, tensor in state.items()}, what=f"weights {path}")
+    return LoadedPaper(network.eval(), metadata["about"], metadata["licence"])
+
+
+def _gather(value: Tensor, slot: Int[Tensor, "B E"]) -> Tensor:
+    index = slot[:, None].expand(-1, value.shape[1], -1)
+    if value.ndim == 4:
+        index = index.unsqueeze(-1).expand(-1, -1, -1, value.shape[-1])
+    return value.gather(2, index)

@@ -1,0 +1,268 @@
+"""Tracking as published: every frame's window is decoded anew, and a query keeps the slot that it took.
+
+There are no anchors, no joints and no alarms. A slot's answer is the lifted pixel of its coordinates; what it is called
+is decided in the frame in which it is taken: whether there is an entity by its confidence, which label it has by its
+embedding.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from quest.errors import InputError
+from quest.geometry import invert, transform
+from quest.geometry.letterbox import Letterbox
+from quest.model.framing import Framer
+from quest.model.precision import fast_bfloat16
+from quest.model.weights import find_weights
+from quest.paper.matching import assign_slots, slot_cost
+from quest.paper.network import PaperNetwork, is_paper, read_paper
+from quest.track import Tracker
+from quest.track import load as load_tracker
+from quest.track.tracker import pick_device
+from quest.types import LABELS, Clip, Query, State, Tracks
+
+FOUND_ABOVE = 0.5
+"""Confidence above which discovery takes a slot."""
+PROMPT_ABOVE = 0.2
+"""Confidence above which a label takes a slot; lower, because the user says that it is there."""
+LOST_BELOW = 0.3
+"""Confidence below which a query is lost."""
+PATIENCE = 8
+"""Frames in which a label or slot looks for its entity."""
+
+
+class PaperTracker:
+    """Follows entities through clips with the published network.
+
+    Args:
+        network: trained network.
+        device: where it runs.
+        weights_hash: SHA-256 of the file that the network came from, for result files.
+        found_above: confidence above which discovery takes a slot.
+        prompt_above: the same of a label.
+    """
+
+    name = "quest"
+
+    def __init__(
+        self,
+        network: PaperNetwork,
+        *,
+        device: torch.device,
+        weights_hash: str | None = None,
+        found_above: float = FOUND_ABOVE,
+        prompt_above: float = PROMPT_ABOVE,
+    ) -> None:
+        self.network = network.to(device).eval()
+        self.device = device
+        self.weights_hash = weights_hash
+        self.found_above = found_above
+        self.prompt_above = prompt_above
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """Track a whole clip; the answer for a frame does not depend on later ones.
+
+        Args:
+            clip: the frames.
+            queries: what to follow; None discovers entities in the first frame.
+
+        Raises:
+            InputError: a point query lies outside the clip, asks for an intent, or two queries have one name.
+        """
+        _check(clip, queries)
+        slots = self._slots(clip)
+        if queries is None:
+            best = np.argsort(-slots.confidence[0], kind="stable")
+            found = [int(s) for s in best if slots.confidence[0, s] > self.found_above]
+            chosen = [_Choice(f"{slots.label(0, s)} {k}", slots.label(0, s), s, 0) for k, s in enumerate(found)]
+        else:
+            chosen = self._choose(slots, queries, Letterbox(clip.camera, self.network.config.encoder.image_size))
+        return _tracks(clip, slots, chosen)
+
+    def _slots(self, clip: Clip) -> _Slots:
+        """What all slots answer in every frame, each seen in a window of the newest T frames."""
+        size = self.network.config.encoder.image_size
+        box = Letterbox(clip.camera, size)
+        framer, reference = Framer(self.network, box.camera, device=self.device), None
+        ring: deque[Tensor] = deque(maxlen=self.network.config.window)
+        rows: list[list[np.ndarray]] = []
+        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, fast_bfloat16(self.device)):
+            for t in range(len(clip)):
+                frame = clip.frame(t)
+                depth = framer.depth(None if frame.depth_m is None else box.depth(frame.depth_m))
+                pose = torch.from_numpy(np.asarray(frame.cam_from_world, np.float64))
+                reference = framer.reference(depth, pose) if reference is None else reference
+                frames = framer.frame(box.rgb(frame.rgb), depth, pose, reference)
+                ring.append(frames.features)
+                x = self.network.embed(torch.cat(list(ring), dim=1))[:, -1:]
+                answers = self.network.answer(x, frames)
+                metric = answers.point[0, 0].cpu().double() * reference.scale.cpu() + reference.center.cpu()
+                parts = (
+                    box.to_source(answers.uv[0, 0].cpu().numpy() * size),
+                    transform(invert(reference.cam_from_world)[None], metric).numpy(),
+                    answers.logit[0, 0].sigmoid().cpu().numpy(),
+                    answers.label_logits[0, 0].softmax(-1).cpu().numpy(),
+                    np.array(bool((frames.depth_m > 0).any())),
+                )
+                rows.append([np.asarray(part) for part in parts])
+        return _Slots(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+    def _choose(self, slots: _Slots, queries: Sequence[Query], box: Letterbox) -> list[_Choice]:
+        """The slot that each query takes, and the frame from which on; labels take theirs before points do."""
+        chosen: dict[int, _Choice] = {}
+        for t in range(len(slots.confidence)):
+            for k, query in enumerate(queries):
+                if k in chosen or query.kind == "point" or t >= PATIENCE:
+                    continue
+                taken = {choice.slot for choice in chosen.values()}
+                fits = [
+                    int(s)
+                    for s in np.argsort(-slots.confidence[t], kind="stable")
+                    if s not in taken and query.label in (None, slots.label(t, int(s)))
+                ]
+                if fits and slots.confidence[t, fits[0]] > self.prompt_above:
+                    label = slots.label(t, fits[0])
+                    chosen[k] = _Choice(query.name or f"{label} {k}", label, fits[0], t)
+            due = [k for k, query in enumerate(queries) if query.kind == "point" and query.frame == t]
+            if due:
+                taken = {choice.slot for choice in chosen.values() if choice.slot is not None}
+                found = _slots_at(slots, t, [queries[k] for k in due], sorted(taken), box)
+                chosen |= {
+                    k: _Choice(queries[k].name or f"point {k}", queries[k].label, slot, t)
+                    for k, slot in zip(due, found, strict=True)
+                }
+        unfound = [_Choice(query.name or query.label or query.kind, query.label, None, 0) for query in queries]
+        return [chosen.get(k, unfound[k]) for k in range(len(queries))]
+
+
+@dataclass(frozen=True)
+class _Slots:
+    """What K slots answer in every frame of a clip: source pixels, world points in metres, probabilities."""
+
+    uv_px: Float[np.ndarray, "T K 2"]
+    point_world: Float[np.ndarray, "T K 3"]
+    confidence: Float[np.ndarray, "T K"]
+    label_p: Float[np.ndarray, "T K L"]
+    has_depth: Bool[np.ndarray, " T"]
+
+    def label(self, frame: int, slot: int) -> str:
+        return LABELS[int(self.label_p[frame, slot].argmax())]
+
+
+@dataclass(frozen=True)
+class _Choice:
+    """The slot that a query follows from a frame on; None where it found no entity."""
+
+    name: str
+    label: str | None
+    slot: int | None
+    frame: int
+
+
+def load(name: str | Path = "quest-s16", *, device: str = "auto", monitor: bool = True) -> Tracker | PaperTracker:
+    """The tracker of any weights: ours (see :func:`quest.track.load`), or the published one where they are its.
+
+    Args:
+        name: as for :func:`quest.track.load`.
+        device: as for :func:`quest.track.load`.
+        monitor: whether to read our monitor's calibration.
+
+    Raises:
+        WeightsError: no such weights, or they cannot be read.
+        ConfigError: no such device.
+    """
+    path = find_weights(name)
+    if not is_paper(path):
+        return load_tracker(name, device=device, monitor=monitor)
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    return PaperTracker(read_paper(path).network, device=pick_device(device), weights_hash=sha256)
+
+
+def _check(clip: Clip, queries: Sequence[Query] | None) -> None:
+    names = [query.name for query in queries or () if query.name]
+    if len(set(names)) < len(names):
+        raise InputError(f"queries: expected a name each, got {', '.join(names)}; choose other names")
+    for query in queries or ():
+        if query.intent is not None:
+            raise InputError(
+                f"query {query.name or query.kind!r}: the published network cannot tell what to {query.intent}; omit "
+                "the intent or use weights of the default preset"
+            )
+        if query.frame >= len(clip):
+            raise InputError(f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames")
+        x, y = query.uv_px or (0, 0)
+        if not (0 <= x <= clip.camera.width and 0 <= y <= clip.camera.height):
+            raise InputError(
+                f"query {query.name!r}: expected a pixel within {clip.camera.width} x {clip.camera.height}, "
+                f"got ({x:.1f}, {y:.1f})"
+            )
+
+
+def _slots_at(slots: _Slots, t: int, queries: Sequence[Query], taken: Sequence[int], box: Letterbox) -> list[int]:
+    """The slots that answer for points in a frame, at the cost that training matches them by; no two share one.
+
+    Slots that answer for something already are taken again where there are not enough others.
+    """
+    label_p = torch.from_numpy(slots.label_p[t])
+    alike = [torch.ones(len(label_p)) if q.label is None else label_p[:, LABELS.index(q.label)] for q in queries]
+    probability = torch.from_numpy(slots.confidence[t])[:, None] * torch.stack(alike, dim=-1)
+    target, uv = (
+        torch.from_numpy(box.to_canvas(uv_px) / box.size).float()[None, None]
+        for uv_px in (np.array([q.uv_px for q in queries], np.float32), slots.uv_px[t])
+    )
+    wanted = torch.ones(1, len(queries), dtype=torch.bool)
+    cost = slot_cost(uv, probability[None, None], target, wanted[None])
+    # More than all that is free can cost together, so that what is taken comes last.
+    cost[..., list(taken)] += 2 * len(queries) * (1 + float(cost.abs().max()))
+    slot, found = assign_slots(cost, wanted)
+    return torch.where(found, slot, cost.argmin(dim=-1))[0].tolist()
+
+
+def _tracks(clip: Clip, slots: _Slots, chosen: Sequence[_Choice]) -> Tracks:
+    """The answers of the chosen slots.
+
+    Where a frame has depth, but not at a slot's pixel, its last point is held and it does not count as seen.
+    """
+    t, k = len(clip), len(chosen)
+    uv = np.full((t, k, 2), np.nan, np.float32)
+    point = np.full((t, k, 3), np.nan, np.float32)
+    confidence, visible = np.zeros((t, k), np.float32), np.zeros((t, k), bool)
+    state = np.full((t, k), State.LOST.value, dtype="<U8")
+    for i, choice in enumerate(chosen):
+        if choice.slot is None:
+            continue
+        last = np.full(3, np.nan)
+        for frame in range(choice.frame, t):
+            place, sure = slots.point_world[frame, choice.slot], slots.confidence[frame, choice.slot]
+            known = bool(np.isfinite(place).all())
+            held = not known and bool(np.isfinite(last).all()) and bool(slots.has_depth[frame])
+            last = place if known else last
+            uv[frame, i], confidence[frame, i] = slots.uv_px[frame, choice.slot], sure
+            point[frame, i] = last if held else place
+            inside = (uv[frame, i] >= 0).all() and (uv[frame, i] <= (clip.camera.width, clip.camera.height)).all()
+            visible[frame, i] = sure > 0.5 and inside and not held
+            seen = State.TRACKING if visible[frame, i] else State.HELD
+            state[frame, i] = (State.LOST if sure < LOST_BELOW else seen).value
+    flags = [] if slots.has_depth.all() else ["depth missing in some frames: world points there are NaN"]
+    flags += [f"query {c.name!r} found no entity: lost in every frame" for c in chosen if c.slot is None]
+    return Tracks(
+        names=tuple(choice.name for choice in chosen),
+        labels=tuple(choice.label for choice in chosen),
+        uv_px=uv,
+        point_world=point,
+        confidence=confidence,
+        visible=visible,
+        state=state,
+        stamp_s=clip.stamp_s,
+        frame_flags=tuple(flags),
+    )
