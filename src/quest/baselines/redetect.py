@@ -28,19 +28,16 @@ NOTHING_FOUND = "nothing was detected in the first frame"
 
 @dataclass(frozen=True)
 class Detections:
-    """What the affordance map shows in one frame, best first.
-
-    Attributes:
-        uv_px: pixels of the source image.
-        point_world: lifted points, metres; NaN without depth.
-        label: one of :data:`quest.types.LABELS` each.
-        confidence: probability by the map's own score.
-    """
+    """What the affordance map shows in one frame, best first."""
 
     uv_px: Float32[np.ndarray, "N 2"]
+    """Pixels of the source image."""
     point_world: Float32[np.ndarray, "N 3"]
+    """Lifted points, metres; NaN without depth."""
     label: tuple[str, ...]
+    """One of :data:`quest.types.LABELS` each."""
     confidence: Float32[np.ndarray, " N"]
+    """Probability by the map's own score."""
 
 
 class Detector:

@@ -12,27 +12,24 @@ from quest.model.encoder import EncoderConfig
 
 @dataclass(frozen=True, kw_only=True)
 class DecoderConfig:
-    """Queries that look at windows of frames.
-
-    Attributes:
-        encoder: the image encoder.
-        window: T, frames that the decoder sees together.
-        cell_px: side of a cell, whose depth is known and which a heatmap scores, pixels of the network's input.
-        width: channels inside the decoder.
-        heads: attention heads of the decoder.
-        decoder_layers: layers of the decoder.
-        slots: K, most entities that are discovered.
-        flow: whether there is a flow head, which stage 2 trains.
-    """
+    """Queries that look at windows of frames."""
 
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """The image encoder."""
     window: int = 4
+    """T, frames that the decoder sees together."""
     cell_px: int = 8
+    """Side of a cell, whose depth is known and which a heatmap scores, pixels of the network's input."""
     width: int = 256
+    """Channels inside the decoder."""
     heads: int = 8
+    """Attention heads of the decoder."""
     decoder_layers: int = 3
+    """Layers of the decoder."""
     slots: int = 32
+    """K, most entities that are discovered."""
     flow: bool = False
+    """Whether there is a flow head, which stage 2 trains."""
 
     def __post_init__(self) -> None:
         if self.width % self.heads:
@@ -73,24 +70,21 @@ class DecoderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class NetworkConfig(DecoderConfig):
-    """Everything that determines the shapes of the network.
-
-    Attributes:
-        preset: name of the preset that this started from.
-        token_layers: transformer layers over the tokens of one frame before the decoder looks at them.
-        points3d: whether tokens and queries carry the position code of their 3D point, and details of depth.
-        intents: whether queries and the affordance map tell entities to open from entities to lift.
-        map_layers: transformer layers of the affordance map's own trunk, over tokens of the image at twice its size;
-            0 reads the map off what the decoder looks at.
-        pieces: whether discovery ranks what stands out of planes, which `quest weights pieces` teaches.
-    """
+    """Everything that determines the shapes of the network."""
 
     preset: str = "default"
+    """Name of the preset that this started from."""
     token_layers: int = 1
+    """Transformer layers over the tokens of one frame before the decoder looks at them."""
     points3d: bool = True
+    """Whether tokens and queries carry the position code of their 3D point, and details of depth."""
     intents: bool = False
+    """Whether queries and the affordance map tell entities to open from entities to lift."""
     map_layers: int = 0
+    """Transformer layers of the affordance map's own trunk, over tokens of the image at twice its size; 0 reads the map
+    off what the decoder looks at."""
     pieces: bool = False
+    """Whether discovery ranks what stands out of planes, which `quest weights pieces` teaches."""
 
     @classmethod
     def from_json(cls, text: str) -> Self:

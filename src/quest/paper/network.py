@@ -68,21 +68,18 @@ class PaperConfig(DecoderConfig):
 
 @dataclass(frozen=True)
 class SlotAnswers:
-    """Answers of K slots in every frame of a window.
-
-    Attributes:
-        embedding: the queries after the decoder.
-        uv: coordinates in [0, 1]^2 of the input; raw, so they may leave it.
-        logit: confidence that there is an entity and that it is seen, log odds.
-        label_logits: what each takes its entity for, index into LABELS.
-        point: lifted position in the reference frame; NaN where there is no depth.
-    """
+    """Answers of K slots in every frame of a window."""
 
     embedding: Float[Tensor, "B T K D"]
+    """The queries after the decoder."""
     uv: Float[Tensor, "B T K 2"]
+    """Coordinates in [0, 1]^2 of the input; raw, so they may leave it."""
     logit: Float[Tensor, "B T K"]
+    """Confidence that there is an entity and that it is seen, log odds."""
     label_logits: Float[Tensor, "B T K L"]
+    """What each takes its entity for, index into LABELS."""
     point: Float[Tensor, "B T K 3"]
+    """Lifted position in the reference frame; NaN where there is no depth."""
 
     def then(self, later: SlotAnswers) -> SlotAnswers:
         """These frames and later ones."""

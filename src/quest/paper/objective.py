@@ -25,17 +25,14 @@ from quest.train.windows import WindowSampler, WindowTruth
 
 @dataclass(frozen=True)
 class SlotRollout(Answered):
-    """Answers of all slots on a batch of windows, and which of them are whose.
-
-    Attributes:
-        slots: of all slots; index 0 of the time axis is the anchor frame.
-        slot: the slot of every entity; ``asked`` says which entities have one.
-        image_size: side of the input, pixels.
-    """
+    """Answers of all slots on a batch of windows, and which of them are whose."""
 
     slots: SlotAnswers
+    """Of all slots; index 0 of the time axis is the anchor frame."""
     slot: Int[Tensor, "B E"]
+    """The slot of every entity; ``asked`` says which entities have one."""
     image_size: int
+    """Side of the input, pixels."""
 
     @property
     def of_entities(self) -> SlotAnswers:

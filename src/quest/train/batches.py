@@ -31,15 +31,12 @@ class MicroBatch:
 
 @dataclass(frozen=True)
 class Batch:
-    """What one process learns from in one step.
-
-    Attributes:
-        parts: micro-batches.
-        rng: state of the generator after this batch was drawn and before the next one was, as JSON.
-    """
+    """What one process learns from in one step."""
 
     parts: tuple[MicroBatch, ...]
+    """Micro-batches."""
     rng: str
+    """State of the generator after this batch was drawn and before the next one was, as JSON."""
 
 
 def stream_batches(

@@ -27,27 +27,24 @@ _GENERATOR = "generator."
 
 @dataclass(frozen=True)
 class Progress:
-    """Where a training run stands.
-
-    Attributes:
-        step: optimiser steps done.
-        best: best validation score so far, of the kind that the objective is judged by; less is better.
-        best_step: step of the best score.
-        stale: validations since the best.
-        rng: state of the generator that draws windows, as JSON.
-        network: the network's configuration, as JSON.
-        objective: name of what is learned.
-        begun: hash of the weights that the run began with; empty in checkpoints from before it was kept.
-    """
+    """Where a training run stands."""
 
     step: int
+    """Optimiser steps done."""
     best: float
+    """Best validation score so far, of the kind that the objective is judged by; less is better."""
     best_step: int
+    """Step of the best score."""
     stale: int
+    """Validations since the best."""
     rng: str
+    """State of the generator that draws windows, as JSON."""
     network: str
+    """The network's configuration, as JSON."""
     objective: str = "stage-1"
+    """Name of what is learned."""
     begun: str = ""
+    """Hash of the weights that the run began with; empty in checkpoints from before it was kept."""
 
 
 def save_checkpoint(

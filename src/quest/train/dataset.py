@@ -24,19 +24,16 @@ PARTNET_TERMS = "research use only for the PartNet-Mobility objects that taught"
 
 @dataclass(frozen=True)
 class Dataset:
-    """Windows to learn from and windows to choose by.
-
-    Attributes:
-        training: of training objects.
-        validation: of validation objects.
-        training_takes: how many takes teach.
-        training_sources: of the takes that teach.
-    """
+    """Windows to learn from and windows to choose by."""
 
     training: WindowSampler
+    """Of training objects."""
     validation: WindowSampler
+    """Of validation objects."""
     training_takes: int
+    """How many takes teach."""
     training_sources: frozenset[str]
+    """Of the takes that teach."""
 
 
 @dataclass(frozen=True)

@@ -46,34 +46,32 @@ class CachedView:
     What is large is opened as a memory map at every access, so that a view costs no open file: a day's rendering has
     more views than a process may have files.
 
-    Attributes:
-        folder: where its arrays are.
-        object_id: the object in it.
-        camera: intrinsics of the letterboxed input.
-        half_diagonal_m: metres per normalised unit.
-        cam_from_world: pose of each frame.
-        uv_px: true pixel of the letterboxed input, per tracked entity.
-        visible: whether the entity is seen.
-        point_world: true world point, metres.
-        label: index into LABELS.
-        revolute: whether the entity's joint turns.
-        axis_world: origin and direction of the joint's axis at rest; zero for what is fixed in the base.
-
     Raises:
         ConfigError: another run has put another number of frames in its place.
     """
 
     folder: Path
+    """Where its arrays are."""
     object_id: str
+    """The object in it."""
     camera: Camera
+    """Intrinsics of the letterboxed input."""
     half_diagonal_m: float
+    """Metres per normalised unit."""
     cam_from_world: Float32[np.ndarray, "T 4 4"]
+    """Pose of each frame."""
     uv_px: Float32[np.ndarray, "T K 2"]
+    """True pixel of the letterboxed input, per tracked entity."""
     visible: Bool[np.ndarray, "T K"]
+    """Whether the entity is seen."""
     point_world: Float32[np.ndarray, "T K 3"]
+    """True world point, metres."""
     label: Int8[np.ndarray, " K"]
+    """Index into LABELS."""
     revolute: Bool[np.ndarray, " K"]
+    """Whether the entity's joint turns."""
     axis_world: Float32[np.ndarray, "K 6"]
+    """Origin and direction of the joint's axis at rest; zero for what is fixed in the base."""
 
     def __len__(self) -> int:
         return len(self.visible)

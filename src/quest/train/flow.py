@@ -37,23 +37,20 @@ _MOVING = 0.005
 
 @dataclass(frozen=True)
 class FlowScores:
-    """EPE3D on fixed windows, normalised units per step of the window.
-
-    Attributes:
-        epe: mean 3D distance of the predicted from the true displacement.
-        epe_moving: the same where the true displacement is above 0.005.
-        zero: of saying that nothing moves.
-        zero_moving: the same where something does.
-        answers: how many displacements were judged.
-        moving: how many of them move.
-    """
+    """EPE3D on fixed windows, normalised units per step of the window."""
 
     epe: float
+    """Mean 3D distance of the predicted from the true displacement."""
     epe_moving: float
+    """The same where the true displacement is above 0.005."""
     zero: float
+    """Of saying that nothing moves."""
     zero_moving: float
+    """The same where something does."""
     answers: int
+    """How many displacements were judged."""
     moving: int
+    """How many of them move."""
 
     @property
     def score(self) -> float:

@@ -44,19 +44,16 @@ _LOG_EVERY = 10
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a caller is told after every step.
-
-    Attributes:
-        step: steps done.
-        loss: weighted sum of the losses.
-        scores: validation scores, at the steps where there are any.
-        best: best validation score so far.
-    """
+    """What a caller is told after every step."""
 
     step: int
+    """Steps done."""
     loss: float
+    """Weighted sum of the losses."""
     scores: Scores | None
+    """Validation scores, at the steps where there are any."""
     best: float
+    """Best validation score so far."""
 
 
 def fit(

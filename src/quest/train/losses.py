@@ -39,16 +39,13 @@ R = TypeVar("R", contravariant=True)
 
 @dataclass(frozen=True)
 class Loss(Generic[R]):
-    """A term of an objective.
-
-    Attributes:
-        weight: in the sum; 0 turns it off.
-        of: its value for what a network answered on a batch. Means are taken by :func:`masked_mean`, so that a batch
-            can be divided.
-    """
+    """A term of an objective."""
 
     weight: float
+    """In the sum; 0 turns it off."""
     of: Callable[[R], Float[Tensor, ""]]
+    """Its value for what a network answered on a batch. Means are taken by :func:`masked_mean`, so that a batch can be
+    divided."""
 
 
 def weights_of(table: Mapping[str, Loss[Any]], changes: Mapping[str, float]) -> dict[str, float]:

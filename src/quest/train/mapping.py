@@ -25,19 +25,16 @@ from quest.types import INTENTS, LABELS
 
 @dataclass(frozen=True)
 class MapScores:
-    """Discovery in fixed frames: a peak is right if an entity of its label, not yet taken, is within 0.1 in 3D.
-
-    Attributes:
-        precision: average precision over all peaks, the best first.
-        recall: share of seen entities that any peak is right about.
-        intent: share of those of which it is known rightly whether one opens or lifts by them.
-        present: how many entities are seen.
-    """
+    """Discovery in fixed frames: a peak is right if an entity of its label, not yet taken, is within 0.1 in 3D."""
 
     precision: float
+    """Average precision over all peaks, the best first."""
     recall: float
+    """Share of seen entities that any peak is right about."""
     intent: float
+    """Share of those of which it is known rightly whether one opens or lifts by them."""
     present: int
+    """How many entities are seen."""
 
     @property
     def score(self) -> float:

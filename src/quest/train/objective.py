@@ -25,21 +25,18 @@ _RIGHT_DISTANCE = 0.1
 
 @dataclass(frozen=True)
 class Answered:
-    """Answers for the entities of a batch of windows, and the truth of the same frames.
-
-    Attributes:
-        embedding: of what answers for each entity.
-        uv: coordinates in [0, 1]^2 of the input.
-        point: positions in the reference frame; NaN where they cannot be lifted.
-        asked: entities that have an answer.
-        truth: what is true; index 0 of its time axis is the anchor frame.
-    """
+    """Answers for the entities of a batch of windows, and the truth of the same frames."""
 
     embedding: Float[Tensor, "B T K D"]
+    """Of what answers for each entity."""
     uv: Float[Tensor, "B T K 2"]
+    """Coordinates in [0, 1]^2 of the input."""
     point: Float[Tensor, "B T K 3"]
+    """Positions in the reference frame; NaN where they cannot be lifted."""
     asked: Bool[Tensor, "B K"]
+    """Entities that have an answer."""
     truth: WindowTruth
+    """What is true; index 0 of its time axis is the anchor frame."""
 
     @property
     def truth_uv(self) -> Float[Tensor, "B T K 2"]:
@@ -75,23 +72,20 @@ class Answered:
 
 @dataclass(frozen=True)
 class Rollout(Answered):
-    """What the network answers on a batch of windows, taken freely, as a tracker would.
-
-    Attributes:
-        prediction: everything that it says, of which ``embedding``, ``uv`` and ``point`` are a part.
-        taught: the same, refined around the true cell where the free peak is far from it.
-        observed: the window's observation.
-        anchor_observed: the anchor frame's observation.
-        frames: the anchor frame and the window.
-        network: that answered.
-    """
+    """What the network answers on a batch of windows, taken freely, as a tracker would."""
 
     prediction: Prediction
+    """Everything that it says, of which ``embedding``, ``uv`` and ``point`` are a part."""
     taught: Prediction
+    """The same, refined around the true cell where the free peak is far from it."""
     observed: Observation
+    """The window's observation."""
     anchor_observed: Observation
+    """The anchor frame's observation."""
     frames: FrameBatch
+    """The anchor frame and the window."""
     network: QuestNetwork
+    """That answered."""
 
 
 def roll_out(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> Rollout:

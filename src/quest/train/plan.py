@@ -20,40 +20,34 @@ Pick = tuple[CachedView, list[int]]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """What is random about windows beyond the choice of frames.
-
-    Attributes:
-        no_depth: windows that lose all depth.
-        gain: factor of each colour channel.
-        untold: queries that are not told their label.
-        untold_intent: queries that are not told their intent.
-        noise_px: displacement of the anchors, pixels of the input.
-        left_out: queries that are not asked for.
-    """
+    """What is random about windows beyond the choice of frames."""
 
     no_depth: Bool[np.ndarray, " B"]
+    """Windows that lose all depth."""
     gain: Float32[np.ndarray, "B 1 1 1 3"]
+    """Factor of each colour channel."""
     untold: Bool[np.ndarray, "B K"]
+    """Queries that are not told their label."""
     untold_intent: Bool[np.ndarray, "B K"]
+    """Queries that are not told their intent."""
     noise_px: Float32[np.ndarray, "B K 2"]
+    """Displacement of the anchors, pixels of the input."""
     left_out: Bool[np.ndarray, "B K"]
+    """Queries that are not asked for."""
 
 
 @dataclass(frozen=True)
 class WindowPlan:
-    """Windows to be read.
-
-    Attributes:
-        picks: a view and its frames, per window.
-        following: the frame after the window at the step of its newest frames; -1 where the view has none.
-        entities: entities of the fullest view of the whole batch, to which all windows are padded.
-        disturbance: None for windows as they are.
-    """
+    """Windows to be read."""
 
     picks: tuple[Pick, ...]
+    """A view and its frames, per window."""
     following: tuple[int, ...]
+    """The frame after the window at the step of its newest frames; -1 where the view has none."""
     entities: int
+    """Entities of the fullest view of the whole batch, to which all windows are padded."""
     disturbance: Disturbance | None
+    """None for windows as they are."""
 
     def __len__(self) -> int:
         return len(self.picks)

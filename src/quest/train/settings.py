@@ -16,51 +16,48 @@ _SEEDS = 2**64
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How a network is trained.
-
-    Attributes:
-        steps: optimiser steps at most.
-        optimizer: ``muon`` for the matrices inside the network and AdamW for all else, or ``adamw`` for everything, as
-            published.
-        learning_rate: peak of the schedule (linear warm-up, then cosine to a twentieth).
-        weight_decay: a step takes this times the learning rate off every weight, as a share of it.
-        warmup_steps: steps of the warm-up.
-        clip_norm: largest norm of the gradient.
-        average_decay: share of the running mean of the weights that a step keeps; the mean is what is validated and
-            becomes the best checkpoint. 0: the weights themselves.
-        validate_every: steps between validations.
-        checkpoint_every: steps between checkpoints, beside those at validations: what a kill can cost.
-        validation_batches: fixed batches per validation.
-        patience: validations without a better score before training stops.
-        seed: seed of windows and of initial weights.
-        precision: ``bf16-mixed`` or ``32-true``.
-        accelerator: ``cpu``, ``cuda``, ``mps``, or ``auto`` for the best there is.
-        devices: processes on this machine, each with a device of its own, or ``auto`` for as many as there are GPUs.
-            Under ``torchrun`` its number of processes counts, and this does not.
-        accumulate: micro-batches that a step is divided into, to save memory. The batch stays what it is, and so does
-            the gradient; that takes an additional forward pass.
-        compile: whether to compile the parts of the network that do most of the work, which takes minutes at first.
-        deterministic: whether to use deterministic algorithms alone, with a warning where there is none.
-    """
+    """How a network is trained."""
 
     steps: int = 3000
+    """Optimiser steps at most."""
     optimizer: Literal["muon", "adamw"] = "muon"
+    """``muon`` for the matrices inside the network and AdamW for all else, or ``adamw`` for everything, as
+    published."""
     learning_rate: float = 2e-3
+    """Peak of the schedule (linear warm-up, then cosine to a twentieth)."""
     weight_decay: float = 0.01
+    """A step takes this times the learning rate off every weight, as a share of it."""
     warmup_steps: int = 100
+    """Steps of the warm-up."""
     clip_norm: float = 1.0
+    """Largest norm of the gradient."""
     average_decay: float = 0.995
+    """Share of the running mean of the weights that a step keeps; the mean is what is validated and becomes the best
+    checkpoint. 0: the weights themselves."""
     validate_every: int = 250
+    """Steps between validations."""
     checkpoint_every: int = 100
+    """Steps between checkpoints, beside those at validations: what a kill can cost."""
     validation_batches: int = 12
+    """Fixed batches per validation."""
     patience: int = 15
+    """Validations without a better score before training stops."""
     seed: int = 0
+    """Seed of windows and of initial weights."""
     precision: str = "bf16-mixed"
+    """``bf16-mixed`` or ``32-true``."""
     accelerator: Accelerator = "auto"
+    """``cpu``, ``cuda``, ``mps``, or ``auto`` for the best there is."""
     devices: int | Literal["auto"] = 1
+    """Processes on this machine, each with a device of its own, or ``auto`` for as many as there are GPUs. Under
+    ``torchrun`` its number of processes counts, and this does not."""
     accumulate: int = 1
+    """Micro-batches that a step is divided into, to save memory. The batch stays what it is, and so does the gradient;
+    that takes an additional forward pass."""
     compile: bool = False
+    """Whether to compile the parts of the network that do most of the work, which takes minutes at first."""
     deterministic: bool = False
+    """Whether to use deterministic algorithms alone, with a warning where there is none."""
 
     def __post_init__(self) -> None:
         counts = ("steps", "validate_every", "checkpoint_every", "validation_batches", "patience", "accumulate")
@@ -90,27 +87,24 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class WindowConfig:
-    """How windows are drawn and disturbed.
-
-    Attributes:
-        batch: windows per step, of all processes and micro-batches together.
-        max_stride: largest step between the frames of a window, in stored frames (0 repeats one frame).
-        first_frame_share: how often the anchor is the first frame in which most entities are seen.
-        point_jitter_px: standard deviation of the anchor's pixel, pixels of the input.
-        label_share: how often a query is told its label.
-        depth_drop_share: how often a window loses all depth.
-        query_drop_share: how often a query is left out of a window.
-        colour_jitter: largest relative change of brightness per channel, seen by the detail stem only.
-    """
+    """How windows are drawn and disturbed."""
 
     batch: int = 16
+    """Windows per step, of all processes and micro-batches together."""
     max_stride: int = 3
+    """Largest step between the frames of a window, in stored frames (0 repeats one frame)."""
     first_frame_share: float = 0.6
+    """How often the anchor is the first frame in which most entities are seen."""
     point_jitter_px: float = 1.0
+    """Standard deviation of the anchor's pixel, pixels of the input."""
     label_share: float = 0.4
+    """How often a query is told its label."""
     depth_drop_share: float = 0.08
+    """How often a window loses all depth."""
     query_drop_share: float = 0.2
+    """How often a query is left out of a window."""
     colour_jitter: float = 0.2
+    """Largest relative change of brightness per channel, seen by the detail stem only."""
 
     def __post_init__(self) -> None:
         if self.batch < 1:

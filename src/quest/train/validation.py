@@ -23,26 +23,23 @@ _PEAK_LOGIT = -0.5
 
 @dataclass(frozen=True)
 class WindowScores:
-    """Quality on fixed windows.
-
-    Attributes:
-        median_px: median distance of visible answers, pixels of the input.
-        mean_distance: mean 3D distance of all answers, normalised units, at most 1 each.
-        moved_distance: the same of entities that have left the place where they were asked for; None if none has.
-        still_distance: the same of the others.
-        right: share of answers with the right identity.
-        discovery_f1: F1 of discovered slots against visible entities, same label and within 0.1; None for networks
-            whose map has a stage of its own.
-        answers: how many answers were judged.
-    """
+    """Quality on fixed windows."""
 
     median_px: float
+    """Median distance of visible answers, pixels of the input."""
     mean_distance: float
+    """Mean 3D distance of all answers, normalised units, at most 1 each."""
     moved_distance: float | None
+    """The same of entities that have left the place where they were asked for; None if none has."""
     still_distance: float | None
+    """The same of the others."""
     right: float
+    """Share of answers with the right identity."""
     discovery_f1: float | None
+    """F1 of discovered slots against visible entities, same label and within 0.1; None for networks whose map has a
+    stage of its own."""
     answers: int
+    """How many answers were judged."""
 
     @property
     def score(self) -> float:

@@ -21,43 +21,40 @@ from quest.train.settings import WindowConfig
 
 @dataclass(frozen=True)
 class WindowTruth:
-    """What is true of a batch of windows; index 0 of the time axis is the anchor frame.
-
-    Attributes:
-        uv: true coordinates in [0, 1]^2 of the input, also where occluded; NaN behind the camera.
-        visible: whether the entity is seen.
-        point: true position in the reference frame.
-        exists: False for padding.
-        bound: entities that were seen at the anchor frame and are asked for.
-        label: index into LABELS.
-        told: label given to the query, or ``len(LABELS)``.
-        intent: index into INTENTS.
-        told_intent: intent given to the query, or ``len(INTENTS)``.
-        anchor_uv: disturbed coordinates of the anchor.
-        unit: reference units per normalised unit.
-        revolute: whether the entity's joint turns.
-        axis: origin and direction of its joint's axis in the reference frame.
-        flow: true displacement from the newest frame to the one after it, reference units. After it means at the
-            window's own step between frames, back in time for a window that runs backwards; NaN where the view ends.
-        owner: the entity that each cell is a part of, -1 for none; None but for anchor frames alone, of which the
-            affordance map is learned.
-    """
+    """What is true of a batch of windows; index 0 of the time axis is the anchor frame."""
 
     uv: Float[Tensor, "B S K 2"]
+    """True coordinates in [0, 1]^2 of the input, also where occluded; NaN behind the camera."""
     visible: Bool[Tensor, "B S K"]
+    """Whether the entity is seen."""
     point: Float[Tensor, "B S K 3"]
+    """True position in the reference frame."""
     exists: Bool[Tensor, "B K"]
+    """False for padding."""
     bound: Bool[Tensor, "B K"]
+    """Entities that were seen at the anchor frame and are asked for."""
     label: Int[Tensor, "B K"]
+    """Index into LABELS."""
     told: Int[Tensor, "B K"]
+    """Label given to the query, or ``len(LABELS)``."""
     intent: Int[Tensor, "B K"]
+    """Index into INTENTS."""
     told_intent: Int[Tensor, "B K"]
+    """Intent given to the query, or ``len(INTENTS)``."""
     anchor_uv: Float[Tensor, "B K 2"]
+    """Disturbed coordinates of the anchor."""
     unit: Float[Tensor, " B"]
+    """Reference units per normalised unit."""
     revolute: Bool[Tensor, "B K"]
+    """Whether the entity's joint turns."""
     axis: Float[Tensor, "B K 6"]
+    """Origin and direction of its joint's axis in the reference frame."""
     flow: Float[Tensor, "B K 3"]
+    """True displacement from the newest frame to the one after it, reference units. After it means at the window's own
+    step between frames, back in time for a window that runs backwards; NaN where the view ends."""
     owner: Int[Tensor, "B S C"] | None = None
+    """The entity that each cell is a part of, -1 for none; None but for anchor frames alone, of which the affordance
+    map is learned."""
 
     def to(self, device: torch.device) -> WindowTruth:
         """The same on a device."""

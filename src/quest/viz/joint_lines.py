@@ -16,17 +16,14 @@ _SHORTEST_AXIS_M = 0.05
 
 @dataclass(frozen=True)
 class JointLines:
-    """Where a joint can bring an entity, metres in the world.
-
-    Attributes:
-        path: from the smallest to the largest coordinate that was seen.
-        axis: ends of a piece of the axis of turning, level with the path; None for sliding, where the path says it.
-        arms: from the axis to both ends of the path; empty for sliding.
-    """
+    """Where a joint can bring an entity, metres in the world."""
 
     path: Float[np.ndarray, "N 3"]
+    """From the smallest to the largest coordinate that was seen."""
     axis: Float[np.ndarray, "2 3"] | None
+    """Ends of a piece of the axis of turning, level with the path; None for sliding, where the path says it."""
     arms: tuple[Float[np.ndarray, "2 3"], ...] = ()
+    """From the axis to both ends of the path; empty for sliding."""
 
 
 def joint_lines(tracks: Tracks) -> tuple[JointLines | None, ...]:
