@@ -122,12 +122,11 @@ class Record:
                     run = key(weights, stride)
                     tracks, signals = follow(tracker, clip, queries, stride)
                     answers |= {f"{run}/{name}": value for name, value in arrays_of(tracks, signals).items()}
-                    if truth is not None:
-                        rows[run] = {name: asdict(row) for name, row in judge(tracks, truth, stride).items()}
-                        sys.stdout.write(f"{golden.name} {run} {json.dumps(rows[run])}\n")
+                    rows[run] = {name: asdict(row) for name, row in judge(tracks, truth, stride).items()}
+                    sys.stdout.write(f"{golden.name} {run} {json.dumps(rows[run])}\n")
             golden.folder.mkdir(exist_ok=True)
             np.savez_compressed(golden.folder / "answers.npz", **answers)
-            if self.figures and rows:
+            if self.figures:
                 (golden.folder / "figures.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         return 0
 

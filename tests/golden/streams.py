@@ -1,8 +1,7 @@
 """Clips whose answers are known: what the tracker says of them with the weights that ship, and how good it is.
 
-A clip is one line of :data:`CLIPS`. A simulated one has its truth beside it; of every clip the answers and signals that
-were recorded lie in ``NAME/answers.npz``, how far off they were in ``NAME/figures.json``. ``python -m tests.golden``
-makes all of these files.
+A clip is one line of :data:`CLIPS`, with its truth beside it. The answers and signals that were recorded lie in
+``NAME/answers.npz``, how far off they were in ``NAME/figures.json``. ``python -m tests.golden`` makes these files.
 """
 
 from __future__ import annotations
@@ -15,6 +14,7 @@ import numpy as np
 
 import quest
 from quest import Clip, Query, Tracker, Tracks
+from quest.data.sample import sample_folder
 from quest.track.tracker import collect
 
 HERE = Path(__file__).parent
@@ -26,8 +26,6 @@ class GoldenClip:
     """A clip and how it is followed."""
 
     name: str
-    length: int | None = None
-    """How many of its frames; None for all."""
     strides: tuple[int, ...] = (1, 2, 3)
     """Every so many of them: answers must not hang on the frame rate."""
     take: tuple[str, int] | None = None
@@ -43,18 +41,16 @@ class GoldenClip:
     def read(self) -> Clip:
         """All its frames."""
         if self.take is None:
-            clip = quest.read(self.name)
-        else:
-            clip = replace(quest.read(self.folder), depth_m=read_depth(self.folder))
-        return cut(clip, slice(self.length))
+            return quest.read(self.name)
+        return replace(quest.read(self.folder), depth_m=read_depth(self.folder))
 
-    def truth(self) -> Truth | None:
-        """What is true of it; None of a packaged clip."""
-        return Truth.read(self.folder) if self.take is not None else None
+    def truth(self) -> Truth:
+        """What is true of it."""
+        return Truth.of_sample(self.name) if self.take is None else Truth.read(self.folder)
 
-    def queries(self, truth: Truth | None) -> list[Query] | None:
+    def queries(self, truth: Truth) -> list[Query] | None:
         """The entities by their pixels in the first frame; None to follow what is found."""
-        if truth is None:
+        if not self.entities:
             return None
         at = {name: truth.uv_px[0, truth.index(name)].tolist() for name in self.entities}
         return [Query.point(0, x, y, name=name) for name, (x, y) in at.items()]
@@ -85,6 +81,26 @@ class Truth:
         with np.load(folder / "truth.npz") as arrays:
             return cls(**arrays)
 
+    @classmethod
+    def of_sample(cls, name: str) -> Truth:
+        """The truth of a packaged clip."""
+        known = json.loads((sample_folder(name) / "truth.json").read_text(encoding="utf-8"))
+        entities = known["entities"]
+        uv_px = np.array([entity["uv_px"] for entity in entities], np.float32).swapaxes(0, 1)
+        visible = np.zeros(uv_px.shape[:2], bool)
+        for e, entity in enumerate(entities):
+            for first, end in entity["visible_frames"]:
+                visible[first:end, e] = True
+        return cls(
+            name=np.array([entity["name"] for entity in entities], dtype=np.str_),
+            uv_px=uv_px,
+            visible=visible,
+            point_world=np.array([entity["point_world_m"] for entity in entities], np.float32).swapaxes(0, 1),
+            joint=np.array([entity["joint"]["kind"] if entity["moves"] else "static" for entity in entities], np.str_),
+            axis=np.array([entity["joint"]["axis"] for entity in entities], np.float32),
+            half_diagonal_m=np.array(known["half_diagonal_m"], np.float32),
+        )
+
     def write(self, folder: Path) -> None:
         """Put it beside a clip."""
         np.savez_compressed(folder / "truth.npz", **asdict(self))
@@ -92,6 +108,11 @@ class Truth:
     def index(self, name: str) -> int:
         """Which of the entities has a name."""
         return list(self.name).index(name)
+
+    def followed(self, tracks: Tracks) -> list[int]:
+        """Which entity each query is to follow: the nearest one in the first frame that has an answer."""
+        first = np.isfinite(tracks.uv_px).all(axis=-1).argmax(axis=0)
+        return [int(np.linalg.norm(self.uv_px[0] - tracks.uv_px[t, k], axis=-1).argmin()) for k, t in enumerate(first)]
 
 
 @dataclass(frozen=True)
@@ -113,7 +134,8 @@ class Figures:
 
 
 CLIPS = (
-    GoldenClip("sample", length=60, strides=(3,)),
+    GoldenClip("sample", strides=(1, 2)),
+    GoldenClip("sample-alarm", strides=(1, 3)),
     GoldenClip("drawer", take=("night_stand-104010", 1), entities=("link_1/knob", "link_0/knob")),
     GoldenClip("door", take=("sideboard-104012", 1), entities=("link_0/knob", "link_1/knob")),
 )
@@ -156,14 +178,14 @@ def judge(tracks: Tracks, truth: Truth, stride: int) -> dict[str, Figures]:
     """How good the answers to all queries are."""
     assert tracks.joints is not None
     figures = {}
-    for k, name in enumerate(tracks.names):
-        e, kind, axis = truth.index(name), tracks.joints.kind[k], None
+    for k, e in enumerate(truth.followed(tracks)):
+        kind, axis = tracks.joints.kind[k], None
         off_px = np.linalg.norm(tracks.uv_px[:, k] - truth.uv_px[::stride, e], axis=-1)
         off_m = np.linalg.norm(tracks.point_world[:, k, None] - truth.point_world[::stride], axis=-1)
         if kind == truth.joint[e] and kind != "static":
             cosine = abs(float(tracks.joints.axis[k] @ truth.axis[e]))
             axis = round(float(np.degrees(np.arccos(min(cosine, 1.0)))), 2)
-        figures[name] = Figures(
+        figures[f"{tracks.names[k]} on {truth.name[e]}"] = Figures(
             median_px=round(float(np.median(off_px[truth.visible[::stride, e]])), 3),
             median_mm=round(1e3 * float(np.median(off_m[:, e])), 2),
             end_mm=round(1e3 * float(off_m[-1, e]), 2),
