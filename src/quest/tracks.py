@@ -390,7 +390,7 @@ def _joints_to_json(joints: Joints, *, digits: int | None = None) -> list[dict[s
     ]
 
 
-def _plain(values: np.ndarray, digits: int | None = None) -> Any:
+def _plain(values: np.ndarray | np.generic, digits: int | None = None) -> Any:
     """Nested lists of numbers, null where they are NaN, as JSON has none; one null where all of several are.
 
     Args:
@@ -400,7 +400,9 @@ def _plain(values: np.ndarray, digits: int | None = None) -> Any:
     if values.ndim == 0:
         number = float(values) if digits is None else float(f"{values:.{digits}g}")
         return number if np.isfinite(number) else None
-    return [_plain(value, digits) for value in values] if np.isfinite(values).any() or not values.size else None
+    if values.size and not np.isfinite(values).any():
+        return None
+    return [_plain(value, digits) for value in np.asarray(values)]
 
 
 def _joints_from_json(rows: list[dict[str, Any]], q: np.ndarray) -> Joints:

@@ -97,6 +97,7 @@ def test_cameras_of_arrays(clip: Clip):
             Clip.from_arrays(clip.rgb, **how)
 
 
+@pytest.mark.plain  # the shape checks raise first
 def test_shapes_that_contradict_each_other(clip: Clip):
     assert clip.depth_m is not None
     wrong: list[tuple[dict[str, Any], str]] = [

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from typing import Self
+from typing import TypeVar
 
 from quest.errors import ConfigError
 from quest.model.encoder import EncoderConfig
+
+
+_Config = TypeVar("_Config", bound="DecoderConfig")
+_Network = TypeVar("_Network", bound="NetworkConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +59,7 @@ class DecoderConfig:
         return json.dumps(asdict(self), sort_keys=True)
 
     @classmethod
-    def from_json(cls, text: str) -> Self:
+    def from_json(cls: type[_Config], text: str) -> _Config:
         """Read what :meth:`to_json` wrote.
 
         Raises:
@@ -87,7 +91,7 @@ class NetworkConfig(DecoderConfig):
     """Whether discovery ranks what stands out of planes, which `quest weights pieces` teaches."""
 
     @classmethod
-    def from_json(cls, text: str) -> Self:
+    def from_json(cls: type[_Network], text: str) -> _Network:
         """Read what :meth:`to_json` wrote; files of earlier versions also say how their queries and head work.
 
         Raises:
