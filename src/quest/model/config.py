@@ -9,7 +9,6 @@ from typing import TypeVar
 from quest.errors import ConfigError
 from quest.model.encoder import EncoderConfig
 
-
 _Config = TypeVar("_Config", bound="DecoderConfig")
 _Network = TypeVar("_Network", bound="NetworkConfig")
 
