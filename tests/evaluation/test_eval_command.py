@@ -109,6 +109,7 @@ def test_progress_counts_every_frame(store: TakeStore) -> None:
     assert sum(seen) == 2 * 20
 
 
+@pytest.mark.plain  # the tracker is not of the class that is declared
 def test_command_writes_what_it_prints(
     store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

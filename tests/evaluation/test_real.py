@@ -398,7 +398,7 @@ def test_command_writes_what_it_prints(
         ({"level": (1,)}, "--level is for --takes"),
         ({"same_objects": True}, "--same-objects is for --takes"),
         ({"out": Path("results.json")}, "folder"),
-        ({"trackers": ("raft",)}, "expected one of quest"),
+        pytest.param({"trackers": ("raft",)}, "expected one of quest", marks=pytest.mark.plain),
     ],
 )
 def test_command_errors(clips: Path, changes: dict, match: str) -> None:

@@ -6,7 +6,7 @@ import json
 from collections import deque
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from types import NoneType
+from types import GenericAlias, NoneType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -35,7 +35,7 @@ def save(tree: object) -> bytes:
     return save_tensors(tensors, metadata={_KEY: json.dumps(header, sort_keys=True)})
 
 
-def load(data: bytes, kind: type[_T], *, device: torch.device | str = "cpu") -> _T:
+def load(data: bytes, kind: type[_T] | GenericAlias, *, device: torch.device | str = "cpu") -> _T:
     """The tree that :func:`save` was given.
 
     Args:
