@@ -14,9 +14,10 @@ import torch
 from PIL import Image
 
 import quest
-from quest.baselines import line_up
+from quest.baselines import TRACKERS, line_up
 from quest.baselines.hold_still import HoldStill
 from quest.cli.evaluate import Eval
+from quest.cli.main import main
 from quest.data.recording import write_recording
 from quest.errors import ConfigError, InputError, QuestError
 from quest.evaluation.real.measures import Answers, discovery_measures, score_clip, score_picture, track_measures
@@ -404,6 +405,16 @@ def test_command_writes_what_it_prints(
 def test_command_errors(clips: Path, changes: dict, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         dataclasses.replace(Eval(real=(clips,), trackers=("lk",)), **changes).run()
+
+
+def test_command_names_the_trackers(capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        main(["eval", "--real", "set", "--trackers", "raft"])
+    refused = capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["eval", "--help"])
+    explained = capsys.readouterr().out
+    assert all(name in refused and name in explained for name in TRACKERS)
 
 
 def test_two_sets_of_one_name_and_noise_without_units(clips: Path, monkeypatch: pytest.MonkeyPatch) -> None:

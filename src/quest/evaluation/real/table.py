@@ -38,7 +38,8 @@ COLUMNS = (
 )
 """What is shown of a row, in this order; the result file has everything."""
 
-FULL_WIDTH = 190
+FULL_WIDTH = 220
+"""Enough for every column; for output that goes to a file."""
 LEGEND = (
     "below each number the 95 % bootstrap interval over clips (pictures). n: clips/tracks/labels after the first, or "
     "pictures/handles/answers. Medians below 3 px rank nobody: labels are no better"
