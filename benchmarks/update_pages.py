@@ -12,6 +12,7 @@ import json
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -379,8 +380,8 @@ def summary(folder: Path, weights: str = "") -> str:
 
 def real(folder: Path) -> Iterable[str]:
     """Lines of the summary about real recordings."""
-    for file, place, inputs in REAL:
-        rows = [row for row in read_report(folder / file).get("rows", []) if row["of"] in ("tracks", "pictures")]
+    for (file, place, inputs), of in product(REAL, ("tracks", "pictures")):
+        rows = [row for row in read_report(folder / file).get("rows", []) if row["of"] == of]
         asked = {row["tracker"]: row for row in rows if row["tracker"] != "quest" or row["inputs"] == inputs}
         for measure, where in REAL_MEASURES:
             if "quest" in asked and cell(asked["quest"], where):
