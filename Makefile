@@ -12,7 +12,8 @@ BASE := $(VENV)/.installed-base
 ALL := $(VENV)/.installed-all
 CHECK_RENDERER := $(BIN)/python -c "from quest.render_device import prepare_renderer; prepare_renderer()"
 
-PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
+# One thread a worker: two workers with two threads each wait for each other.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgroup
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 

@@ -82,6 +82,7 @@ def test_links_lead_somewhere():
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what the pages speak of."""
     import quest
+    from quest.data.lerobot_export import Episode, export_lerobot
     from quest.data.mcap_export import export_mcap
     from quest.data.recording import write_recording
     from quest.data.store import TakeStore
@@ -102,6 +103,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_recording(clip, folder / name)
     for name in ("drawer.mcap", "drive.mcap"):
         export_mcap(clip, folder / name)
+    export_lerobot([Episode({"front": clip}, "open a drawer")] * 4, folder / "datasets/drawers")
+    shutil.copy(folder / "sample" / "camera.json", folder / "camera.json")
     for store in ("takes/try", "takes/mine"):
         take = make_take(frames=FRAMES, views=1, entities=2, name="44817-L1-s000000")
         TakeStore(folder / store).write(take)

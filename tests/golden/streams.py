@@ -134,8 +134,8 @@ class Figures:
 
 
 CLIPS = (
-    GoldenClip("sample", strides=(1, 2)),
-    GoldenClip("sample-alarm", strides=(1, 3)),
+    GoldenClip("sample", strides=(2,)),
+    GoldenClip("sample-alarm", strides=(1,)),
     GoldenClip("drawer", take=("night_stand-104010", 1), entities=("link_1/knob", "link_0/knob")),
     GoldenClip("door", take=("sideboard-104012", 1), entities=("link_0/knob", "link_1/knob")),
 )
