@@ -39,13 +39,11 @@ format: $(ALL)
 	$(BIN)/ruff format
 
 types: $(ALL)
-	$(BIN)/pyright --threads $(WORKERS) --pythonpath $(BIN)/python
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
-# Twice: with every annotated shape checked, and without, because the checks raise before our own errors do. What is
-# dear runs once: slow tests and those of commands and documents (plain) without the checks, pictures with them.
+# With every annotated shape checked, but in the tests that tests/conftest.py names.
 pytest: $(ALL) render-deps
-	$(PYTEST) --jaxtyping-packages=quest,beartype.beartype -m "not slow and not plain"
-	$(PYTEST) -m "not render or slow or plain"
+	$(PYTEST) --jaxtyping-packages=quest,beartype.beartype
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \
@@ -64,11 +62,11 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(BASE): pyproject.toml constraints.txt | $(BIN)/python
-	$(PIP) --editable .
+	$(PIP) --no-compile --editable .
 	@touch $@
 
 $(ALL): pyproject.toml constraints.txt $(BASE)
-	$(PIP) --editable ".[sim,train,viz,ros,scale,dev]"
+	$(PIP) --no-compile --editable ".[sim,train,viz,ros,scale,dev]"
 	@touch $@
 
 clean:

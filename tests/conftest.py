@@ -6,6 +6,7 @@ Nothing of quest is imported at module level: the jaxtyping hook must come first
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import beartype
@@ -27,8 +28,28 @@ PLAIN = ("cli", "test_api_surface.py", "test_cli.py", "test_documented_names.py"
 """Tests of commands and documents: they pass no arrays themselves, so the shape checks have nothing to say to them."""
 
 
+def is_unchecked(item: pytest.Item) -> bool:
+    """Whether a test runs without the shape checks: it is dear, or plain, or expects our own errors.
+
+    The checks raise before our own errors do.
+    """
+    code = getattr(getattr(item, "function", None), "__code__", None)
+    expects_errors = code is not None and "raises" in code.co_names
+    return expects_errors or any(item.get_closest_marker(name) for name in ("slow", "plain"))
+
+
+@pytest.fixture(autouse=True)
+def _shape_checks(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Every annotated shape is checked (``--jaxtyping-packages``), but in tests that :func:`is_unchecked` names."""
+    import jaxtyping
+
+    jaxtyping.config.update("jaxtyping_disable", is_unchecked(request.node))
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what runs once; keep on one worker what is dear to set up; skip what this machine cannot do.
+    """Mark what is plain; keep on one worker what is dear to set up; skip what this machine cannot do.
 
     The first picture of a process compiles shaders for half a minute of processor time.
     """

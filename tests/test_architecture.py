@@ -247,9 +247,10 @@ def test_a_wrong_shape_fails_under_the_hook(pytestconfig):
     if not pytestconfig.getoption("--jaxtyping-packages"):
         pytest.skip("needs --jaxtyping-packages=quest,beartype.beartype")
     import numpy as np
-    from jaxtyping import TypeCheckError
+    from jaxtyping import TypeCheckError, config
 
     from quest.types import Camera
 
+    config.update("jaxtyping_disable", False)  # as it is in tests that expect no errors
     with pytest.raises(TypeCheckError):
         Camera.from_opencv(np.eye(4), width=4, height=4)

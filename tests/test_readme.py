@@ -104,7 +104,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in ("drawer.mcap", "drive.mcap"):
         export_mcap(clip, folder / name)
     export_lerobot([Episode({"front": clip}, "open a drawer")] * 4, folder / "datasets/drawers")
-    shutil.copy(folder / "sample" / "camera.json", folder / "camera.json")
+    shutil.copy(folder / "sample" / "camera.json", folder / "front.json")
     for store in ("takes/try", "takes/mine"):
         take = make_take(frames=FRAMES, views=1, entities=2, name="44817-L1-s000000")
         TakeStore(folder / store).write(take)

@@ -1,4 +1,4 @@
-"""Networks and frames small enough for every test, and errors that may come from the shape checks instead."""
+"""Networks and frames small enough for every test."""
 
 from __future__ import annotations
 
@@ -6,16 +6,11 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import torch
-from jaxtyping import TypeCheckError
 
-from quest.errors import InputError
 from quest.model.config import DecoderConfig, NetworkConfig
 from quest.model.encoder import EncoderConfig
 from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch, cell_depth, reference_of
-
-BAD_INPUT = (InputError, TypeCheckError)
-"""A wrong array: our error, or with the shape checks on, theirs, which come first."""
 
 DEFAULT = NetworkConfig(
     encoder=EncoderConfig(image_size=64, patch_size=16, width=32, depth=1, heads=2),

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from jaxtyping import TypeCheckError
 
 import quest
 from quest.data.frame_source import Parts
@@ -97,7 +96,6 @@ def test_cameras_of_arrays(clip: Clip):
             Clip.from_arrays(clip.rgb, **how)
 
 
-@pytest.mark.plain  # the shape checks raise first
 def test_shapes_that_contradict_each_other(clip: Clip):
     assert clip.depth_m is not None
     wrong: list[tuple[dict[str, Any], str]] = [
@@ -110,19 +108,16 @@ def test_shapes_that_contradict_each_other(clip: Clip):
         ({"fps": 0}, "fps > 0"),
     ]
     for how, what in wrong:
-        with pytest.raises((InputError, TypeCheckError), match=what):
+        with pytest.raises(InputError, match=what):
             Clip.from_arrays(clip.rgb, **how)
 
 
 def test_intrinsics_of_numpy_are_numbers(clip: Clip, tmp_path: Path):
     fx, cx, cy = np.array([50, 32, 24], dtype=np.float32)
-    try:
-        camera = Camera(fx, fx, cx, cy, np.int64(64), np.int64(48))  # type: ignore[arg-type]
-    except TypeCheckError:
-        pytest.skip("types are checked, and these are not those that are asked for")
+    camera = Camera(fx, fx, cx, cy, np.int64(64), np.int64(48))  # type: ignore[arg-type]
     write_recording(replace(clip, camera=camera), tmp_path / "again")
     assert read_recording(tmp_path / "again").camera == camera
-    with pytest.raises((InputError, TypeCheckError), match=r"whole pixels|int"):
+    with pytest.raises(InputError, match=r"whole pixels|int"):
         Camera(50.0, 50.0, 32.0, 24.0, 64.5, 48)  # type: ignore[arg-type]
 
 

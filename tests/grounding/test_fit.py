@@ -14,7 +14,6 @@ from scipy.spatial.transform import Rotation
 from quest.errors import InputError
 from quest.grounding import JointKind, JointPrior, fit_joint, joint_from_prior
 from tests.grounding.tracks import angle_deg, make_track
-from tests.tiny import BAD_INPUT
 
 PRISMATIC, REVOLUTE = JointKind.PRISMATIC, JointKind.REVOLUTE
 REAL = Path(__file__).parents[3] / "shared" / "data" / "articulation-tracks"
@@ -160,7 +159,7 @@ def test_one_and_two_points_are_static():
     ],
 )
 def test_what_cannot_be_fitted_is_refused(points: np.ndarray, sigma: float | np.ndarray):
-    with pytest.raises(BAD_INPUT, match=r"joint: expected|points"):
+    with pytest.raises(InputError, match=r"joint: expected|points"):
         fit_joint(points, sigma)
 
 

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from quest.errors import ConfigError
 from quest.monitor.conformal import Budget, threshold
 from tests.monitor.calibrations import share
-from tests.tiny import BAD_INPUT
 
 
 @pytest.mark.parametrize(
@@ -91,7 +90,7 @@ def test_no_budget(alpha: float, frames: int | None):
 
 @pytest.mark.parametrize("frames", [1800.0, math.nan, math.inf])
 def test_frames_are_whole(frames: Any):
-    with pytest.raises((ConfigError, *BAD_INPUT), match="frames"):
+    with pytest.raises(ConfigError, match="frames"):
         Budget(0.1, frames)
 
 

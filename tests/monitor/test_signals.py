@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from quest.errors import InputError
 from quest.monitor import SIGNALS, Signals
-from tests.tiny import BAD_INPUT
 
 
 def test_signals_by_name():
@@ -19,5 +19,5 @@ def test_signals_by_name():
 
 @pytest.mark.parametrize("shape", [(2, len(SIGNALS) + 1), (len(SIGNALS),)])
 def test_another_number_of_signals(shape: tuple[int, ...]):
-    with pytest.raises(BAD_INPUT):
+    with pytest.raises(InputError):
         Signals(np.zeros(shape, np.float32))

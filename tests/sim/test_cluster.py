@@ -201,14 +201,12 @@ def test_an_interrupted_production_leaves_whole_takes(tmp_path: Path) -> None:
 
 @pytest.mark.render
 @pytest.mark.timeout(900)
-def test_workers_render_what_one_process_renders(cluster: str, tmp_path: Path, renderer: Renderer) -> None:
+def test_a_worker_renders_what_one_process_renders(cluster: str, tmp_path: Path, renderer: Renderer) -> None:
     write_cabinet(tmp_path / "objects" / "cabinet")
     settings = TakeSettings(views=1, size=48, every=8, frames_per_joint=24)
-    specs = [TakeSpec("partnet", "cabinet", 1, seed, settings) for seed in range(4)]
+    spec = TakeSpec("partnet", "cabinet", 1, 0, settings)
     store = TakeStore(tmp_path / "takes")
-    events: list[Event] = []
-    produce_on_cluster(specs, store, StudioSettings(tmp_path / "objects"), ONE_CORE, report=events.append)
-    assert len({event.node for event in events if isinstance(event, TakeMade)}) == 2
+    produce_on_cluster([spec], store, StudioSettings(tmp_path / "objects"), ONE_CORE, report=lambda event: None)
     with ObjectShelf(tmp_path / "objects") as shelf:
-        alone = {spec.name: hash_take(make_take(spec, renderer=renderer, shelf=shelf)[0]) for spec in specs}
+        alone = {spec.name: hash_take(make_take(spec, renderer=renderer, shelf=shelf)[0])}
     assert hashes(store) == alone

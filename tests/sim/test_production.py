@@ -200,14 +200,15 @@ def place(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_killed_at_twenty_random_moments(place: str) -> None:
+def test_killed_at_random_moments(place: str) -> None:
     """Every take is whole or absent, and in the end they are those of a run that nobody disturbed."""
     count, rng = 400, random.Random(4)
     # Forks of a process that has imported everything and done nothing yet: they start at once.
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["tests.sim.stub_studio"])
     store, specs, seen = TakeStore(place), plan(count), 0
-    for _ in range(20):
+    kills = 20 if store.is_folder else 4  # seconds each where a server answers
+    for _ in range(kills):
         running = processes.Process(target=produce_missing, args=(place, count, dict(os.environ)))
         running.start()
         # Some way into the first, second or third take that it makes, however fast this machine is now.
@@ -221,7 +222,7 @@ def test_killed_at_twenty_random_moments(place: str) -> None:
         there = store.names()
         assert seen <= len(there) < count
         seen = len(there)
-    assert seen >= 10
+    assert seen >= kills // 2
     for name in store.names():
         store.verify(name)
     produce_missing(place, seen + 5, {})

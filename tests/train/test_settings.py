@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from jaxtyping import TypeCheckError
 
 from quest.cli.train import Train
 from quest.errors import ConfigError
@@ -36,7 +35,7 @@ def test_settings_out_of_range_are_refused_before_anything_is_prepared(
 
 
 def test_an_unknown_accelerator_is_refused() -> None:
-    with pytest.raises((ConfigError, TypeCheckError), match="abacus"):
+    with pytest.raises(ConfigError, match="abacus"):
         TrainingConfig(accelerator="abacus")  # type: ignore[arg-type]
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from quest.errors import ConfigError
 from quest.extras import require
+from quest.model.precision import fast_bfloat16
 from quest.train.settings import TrainingConfig
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ def launch(config: TrainingConfig) -> Fabric:
             devices=devices,
             num_nodes=nodes,
             strategy=strategy,
-            precision=config.precision,
+            precision=_precision(config),
         )
     except (RuntimeError, ValueError, MisconfigurationException) as error:
         raise ConfigError(
@@ -58,6 +59,16 @@ def launch(config: TrainingConfig) -> Fabric:
         ) from error
     fabric.launch()
     return fabric
+
+
+def _precision(config: TrainingConfig) -> str:
+    """In which precision the device computes that Fabric will choose."""
+    if config.precision != "auto":
+        return config.precision
+    kinds = ("cuda", "mps") if config.accelerator == "auto" else (config.accelerator,)
+    there = {"cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    device = torch.device(next((kind for kind in kinds if there.get(kind)), "cpu"))
+    return "bf16-mixed" if fast_bfloat16(device) else "32-true"
 
 
 def _processes(config: TrainingConfig) -> tuple[int, int]:

@@ -44,8 +44,8 @@ class TrainingConfig:
     """Validations without a better score before training stops."""
     seed: int = 0
     """Seed of windows and of initial weights."""
-    precision: str = "bf16-mixed"
-    """``bf16-mixed`` or ``32-true``."""
+    precision: str = "auto"
+    """``bf16-mixed``, ``32-true``, or ``auto`` for bfloat16 where it is fast."""
     accelerator: Accelerator = "auto"
     """``cpu``, ``cuda``, ``mps``, or ``auto`` for the best there is."""
     devices: int | Literal["auto"] = 1
@@ -81,8 +81,8 @@ class TrainingConfig:
             raise ConfigError(f"training: expected average_decay from 0 to below 1, got {self.average_decay}")
         if self.devices != "auto" and self.devices < 1:
             raise ConfigError(f"training: expected at least one device or 'auto', got devices {self.devices}")
-        if self.precision not in ("bf16-mixed", "32-true"):
-            raise ConfigError(f"training: expected precision bf16-mixed or 32-true, got {self.precision!r}")
+        if self.precision not in ("auto", "bf16-mixed", "32-true"):
+            raise ConfigError(f"training: expected precision auto, bf16-mixed or 32-true, got {self.precision!r}")
 
 
 @dataclass(frozen=True)
