@@ -3,6 +3,7 @@
 import json
 import re
 import xml.etree.ElementTree as ET
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,14 +12,15 @@ import trimesh
 
 from quest.errors import ConfigError
 from quest.sim.objects import load_object
-from quest.sim.procedural import CATEGORIES, MIXES, category_for_seed, make_object
+from quest.sim.procedural import CATEGORIES, MIXES, catalogue, category_for_seed, make_object
 from quest.sim.procedural.appliances import with_dials
-from quest.sim.procedural.catalogue import build_model
 from quest.sim.procedural.clutter import with_clutter
 from quest.sim.procedural.handles import HANDLE_KINDS, HandleStyle, handle_part
 from quest.sim.procedural.model import Link, Mesh, ObjectModel
 
 pytest.importorskip("scene_synthesizer", reason="scene-synthesizer is not installed")
+
+build_model = cache(catalogue.build_model)
 
 HANDLES = ("handle", "knob")
 ALL = [(category, seed) for category in CATEGORIES for seed in (0, 1, 2)]

@@ -108,7 +108,7 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
         header_style="dim",
         title_justify="left",
     )
-    for column in ("entity", "label", "seen", "moved", "joint", "confidence", "at the end"):
+    for column in ("entity", "label", "seen", "moved", "joint", "conf.", "at the end"):
         left = column in ("entity", "label", "joint")
         table.add_column(column, justify="left" if left else "right", no_wrap=column == "joint")
     for k, (name, label) in enumerate(zip(tracks.names, tracks.labels, strict=True)):

@@ -76,7 +76,7 @@ def _movement(tracks: Tracks, k: int) -> list[str]:
     away = np.flatnonzero(np.abs(gone - end) > _STILL * abs(most))
     stopped = min(int(away[-1]) + 1, len(gone) - 1)
     first_s, last_s = (tracks.stamp_s[known[i]] for i in (started, stopped))
-    back = f" and back to {way.words(end)}" if abs(most - end) > 2 * _STILL * abs(most) else ""
+    back = f" and came back to {way.words(end)}" if abs(most - end) > 2 * _STILL * abs(most) else ""
     return [f"{way.verb} {way.words(most)}{back} from {first_s:.1f} s to {last_s:.1f} s"]
 
 
@@ -115,14 +115,14 @@ def _out_of_sight(tracks: Tracks, k: int, bound: Bool[np.ndarray, " T"]) -> list
 
 
 def _alarms(tracks: Tracks) -> list[str]:
-    if tracks.alarm is None:
-        return []
+    if tracks.alarm is None or tracks.lost_p is None or not np.isfinite(tracks.lost_p).any():
+        return []  # nothing was monitored
     opened = [(start, end, k) for k in range(len(tracks.names)) for start, end in _runs(tracks.alarm[:, k])]
     if not opened:
         return ["No alarm was raised."]
     told = []
     for start, end, k in sorted(opened):
-        p = math.nan if tracks.lost_p is None else float(np.max(tracks.lost_p[start:end, k]))
+        p = float(np.max(tracks.lost_p[start:end, k]))
         why = "" if math.isnan(p) else f" (P(lost) up to {p:.2f})"
         until = f"cleared at {tracks.stamp_s[end]:.1f} s" if end < len(tracks) else "was still open at the end"
         told.append(f"An alarm for {tracks.names[k]} opened at {tracks.stamp_s[start]:.1f} s{why} and {until}.")
