@@ -12,9 +12,8 @@ from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
-import quest
-
-PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
+_QUEST = "quest-tracker"
+PACKAGES = (_QUEST, "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
 
 
 _BUT_RESULTS = (":(top)", ":(top,exclude)benchmarks/results")
@@ -34,7 +33,7 @@ def code_commit() -> str:
             return commit + ("+dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pass  # no git or no checkout: a released version says as much
-    return f"version {quest.__version__}"
+    return f"version {metadata.version(_QUEST)}"
 
 
 def command_line() -> str:
