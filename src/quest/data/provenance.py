@@ -48,7 +48,7 @@ def command_line() -> str:
 
 def code_hash() -> str:
     """SHA-256 over the package's code and its object split; what was changed without a commit differs too."""
-    folder = Path(quest.__file__).resolve().parent
+    folder = Path(__file__).resolve().parents[1]
     digest = hashlib.sha256()
     for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.json")]):
         data = path.read_bytes()
