@@ -113,7 +113,7 @@ def test_what_is_not_known_is_not_told() -> None:
         "handle 1 stayed where it was, in sight.",
     ]
     tracks.point_world[:] = np.nan
-    assert "alarm" not in narrate(replace(tracks, lost_p=np.full(tracks.visible.shape, np.nan)))[-1]
+    assert "alarm" not in narrate(replace(tracks, lost_p=np.full(tracks.visible.shape, np.nan, np.float32)))[-1]
     assert narrate(tracks)[0] == "handle 0 moved 31 px in the picture from 0.0 s to 1.6 s."
 
 

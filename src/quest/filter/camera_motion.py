@@ -1,0 +1,74 @@
+"""Evidence of camera motion: the pose that takes the points of the still world to where they are seen.
+
+Poses are not chained: points keep the world point of their birth, and a pose is fitted to all that are in view.
+
+Reference: Lepetit et al., EPnP, IJCV 2009; Fischler and Bolles, Random sample consensus, 1981.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+INLIER_PX = 2.5
+LEAST = 12
+"""Fewer points that agree are no pose."""
+
+
+@dataclass(frozen=True)
+class CameraEstimate:
+    """A pose and what speaks for it."""
+
+    cam_from_world: Float[np.ndarray, "4 4"]
+    inlier: Bool[np.ndarray, " N"]
+    """Points that agree with it."""
+
+
+def estimate_pose(
+    point_world: Float[np.ndarray, "N 3"],
+    uv_px: Float[np.ndarray, "N 2"],
+    matrix: Float[np.ndarray, "3 3"],
+    expected: Float[np.ndarray, "4 4"],
+) -> CameraEstimate | None:
+    """The camera's pose from where points of the still world are seen.
+
+    Args:
+        point_world: metres.
+        uv_px: pixels, centres at half-integers.
+        matrix: intrinsics.
+        expected: ``cam_from_world`` to begin with.
+
+    Returns:
+        None where fewer than :data:`LEAST` points agree.
+    """
+    if len(point_world) < LEAST:
+        return None
+    turn, shift = cv2.Rodrigues(expected[:3, :3])[0], expected[:3, 3:].copy()
+    done, turn, shift, inliers = cv2.solvePnPRansac(
+        point_world, uv_px, matrix, None, turn, shift, True, 300, INLIER_PX, 0.999, flags=cv2.SOLVEPNP_ITERATIVE
+    )
+    if not done or inliers is None or len(inliers) < LEAST:
+        return None
+    agree = np.asarray(inliers, dtype=np.int64)[:, 0]
+    turn, shift = cv2.solvePnPRefineLM(point_world[agree], uv_px[agree], matrix, None, turn, shift)
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
+    inlier = np.zeros(len(point_world), dtype=bool)
+    inlier[agree] = True
+    return CameraEstimate(pose, inlier)
+
+
+def picture_motion(from_px: Float[np.ndarray, "N 2"], to_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "3 3"]:
+    """The homography that most points agree on, where no depth says more; the identity where too few do.
+
+    Args:
+        from_px: pixels in one frame.
+        to_px: pixels of the same points in the next one.
+    """
+    if len(from_px) < LEAST:
+        return np.eye(3)
+    motion, _ = cv2.findHomography(from_px, to_px, cv2.RANSAC, INLIER_PX)
+    return np.eye(3) if motion is None else np.asarray(motion, dtype=np.float64)

@@ -1,0 +1,113 @@
+"""Evidence of local motion: where small patches of one frame are in the next one.
+
+Each point is followed by pyramidal Lucas-Kanade and followed back again. Its covariance is that of least squares on the
+patch, the noise of a grey value squared times the inverse structure tensor, plus the squared forward-backward error.
+
+Reference: Lucas and Kanade, An iterative image registration technique, 1981; Bouguet, Pyramidal implementation of the
+Lucas Kanade feature tracker, 2001; Kalal et al., Forward-backward error, ICPR 2010; Shi and Tomasi, Good features to
+track, CVPR 1994.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from quest.filter.view import in_image
+
+WINDOW_PX = 21
+_LEVELS = 4
+_BACK_PX = 1.5
+_GREY_NOISE = 4.0
+"""Standard deviation of a grey value against that of the same place in the next frame."""
+
+
+@dataclass(frozen=True)
+class LocalMotion:
+    """Where N points went."""
+
+    uv_px: Float[np.ndarray, "N 2"]
+    """Pixels in the new frame; where nothing was found, those of the guess."""
+    found: Bool[np.ndarray, " N"]
+    """Whether a point came back to where it began when followed backwards, and is in the image."""
+    covariance: Float[np.ndarray, "N 2 2"]
+    """Of ``uv_px``, pixels squared."""
+
+
+def follow(
+    previous: UInt8[np.ndarray, "H W"],
+    grey: UInt8[np.ndarray, "H W"],
+    uv_px: Float[np.ndarray, "N 2"],
+    guess_px: Float[np.ndarray, "N 2"],
+) -> LocalMotion:
+    """Follow points from one frame to the next.
+
+    Args:
+        previous: grey values of the frame in which the points are.
+        grey: those of the next one.
+        uv_px: pixels in ``previous``, centres at half-integers.
+        guess_px: where they are expected in ``grey``.
+    """
+    if not len(uv_px):
+        return LocalMotion(guess_px, np.zeros(0, dtype=bool), np.zeros((0, 2, 2)))
+    there, found = _flow(previous, grey, uv_px, guess_px)
+    back, found_back = _flow(grey, previous, there, uv_px)
+    error_px = np.linalg.norm(back - uv_px, axis=-1)
+    height, width = grey.shape
+    found &= found_back & (error_px < _BACK_PX) & in_image(there, (width, height))
+    covariance = _covariance(previous, uv_px) + (error_px**2)[:, None, None] * np.eye(2)
+    return LocalMotion(np.where(found[:, None], there, guess_px), found, covariance)
+
+
+def _flow(
+    previous: UInt8[np.ndarray, "H W"],
+    grey: UInt8[np.ndarray, "H W"],
+    uv_px: Float[np.ndarray, "N 2"],
+    guess_px: Float[np.ndarray, "N 2"],
+) -> tuple[Float[np.ndarray, "N 2"], Bool[np.ndarray, " N"]]:
+    start, guess = ((x - 0.5).astype(np.float32).reshape(-1, 1, 2) for x in (uv_px, guess_px))
+    there, status, _ = cv2.calcOpticalFlowPyrLK(
+        previous,
+        grey,
+        start,
+        guess,
+        winSize=(WINDOW_PX, WINDOW_PX),
+        maxLevel=_LEVELS,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    end = np.asarray(there, dtype=np.float64)[:, 0] + 0.5
+    found = (np.asarray(status)[:, 0] == 1) & np.isfinite(end).all(axis=-1)
+    return np.where(found[:, None], end, guess_px), found
+
+
+def _covariance(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
+    """Noise over structure: the inverse of the summed products of gradients in the window."""
+    dx, dy = (cv2.Scharr(grey, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
+    products = (dx * dx, dx * dy, dy * dy)
+    sums = [cv2.boxFilter(each, -1, (WINDOW_PX, WINDOW_PX), normalize=False) for each in products]
+    height, width = grey.shape
+    column, row = np.floor(uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
+    xx, xy, yy = (each[row, column].astype(np.float64) for each in sums)
+    xx, yy = xx + 1.0, yy + 1.0  # a flat patch is nowhere, not at infinity
+    inverse = np.stack([np.stack([yy, -xy], axis=-1), np.stack([-xy, xx], axis=-1)], axis=-2)
+    return _GREY_NOISE**2 * inverse / (xx * yy - xy**2)[:, None, None]
+
+
+def corners(
+    grey: UInt8[np.ndarray, "H W"], allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
+) -> Float[np.ndarray, "N 2"]:
+    """The best corners of a frame, at most ``count``, no two nearer than a cell is wide.
+
+    Args:
+        grey: the frame.
+        allowed: where corners are wanted.
+        cell_px: least distance.
+        count: how many at most.
+    """
+    if count < 1:
+        return np.zeros((0, 2))
+    found = cv2.goodFeaturesToTrack(grey, count, 0.003, cell_px, mask=allowed.astype(np.uint8))
+    return np.zeros((0, 2)) if found is None else np.asarray(found, dtype=np.float64)[:, 0] + 0.5

@@ -1,0 +1,41 @@
+"""The filter's noise parameters: each has a unit, and rates are per second."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How far each kind of evidence is off. Pixels are those of the source image."""
+
+    chain_px2_s: float = 4.0
+    """Variance that a patch gathers which is followed from frame to frame, pixels squared per second."""
+    blind_px2_s: float = 400.0
+    """The same while the patch is not found."""
+    anchor_px: float = 3.0
+    """Error of the anchor's patch found again under another view, pixels."""
+    like_anchor: float = 0.7
+    """Normalised cross-correlation with the anchor's patch below which a place found by it does not count."""
+    world_px: float = 10.0
+    """Error of where an entity that rests is seen: of the camera's pose and of the depth, pixels."""
+    moved_px: float = 60.0
+    """How far from there an entity that moves is seen, pixels."""
+    likeness: float = 0.4
+    """By how much the correlation of one entity with its anchor falls short of 1."""
+    correlated_s: float = 0.3
+    """For how long evidence repeats itself, seconds."""
+    rests_log_odds: float = 3.0
+    """That an entity rests, before anything is seen."""
+    depth: float = 0.01
+    """Error of a depth, as a share of it."""
+    depth_m: float = 0.015
+    """Its least error, metres."""
+    relief_m: float = 0.04
+    """How far the surface around an entity stands out or falls back, metres."""
+    speed_m_s: float = 1.0
+    """How fast an entity comes nearer, metres per second."""
+    depths_m: float = 0.5
+    """Over how wide a range the depth of another surface is spread, metres."""
+    stray: float = 0.05
+    """Share of depths that are of something else: edges, thin handles, flying pixels."""

@@ -1,0 +1,94 @@
+"""Evidence of a query's own patch: the motion that most of what is near the query agrees on.
+
+A patch at a seam has two layers. Points near the query count more, and the heaviest motion is taken, not the mean.
+
+Reference: Comaniciu and Meer, Mean shift, PAMI 2002.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from quest.filter.local_motion import follow
+
+_SIDE = 5
+_WIDTH_PX = 24.0
+_NEAR_PX = 5.0
+_ANCHOR_PX = 12
+_LEAST_SUPPORT = 0.15
+_KERNEL_PX2 = 1.0
+
+_LINE = np.linspace(-_WIDTH_PX / 2, _WIDTH_PX / 2, _SIDE)
+GRID_PX: Float[np.ndarray, "P 2"] = np.stack(np.meshgrid(_LINE, _LINE), axis=-1).reshape(-1, 2)
+"""Where the points of a patch are, from its middle."""
+_WEIGHT = np.exp(-(GRID_PX**2).sum(axis=1) / (2 * _NEAR_PX**2))
+_WEIGHT /= _WEIGHT.sum()
+
+
+@dataclass(frozen=True)
+class PatchMotion:
+    """How the patches around K places moved."""
+
+    step_px: Float[np.ndarray, "K 2"]
+    """Pixels; 0 where not found."""
+    variance: Float[np.ndarray, " K"]
+    """Of it, pixels squared; infinite where not found."""
+
+
+def patch_motion(
+    previous: UInt8[np.ndarray, "H W"],
+    grey: UInt8[np.ndarray, "H W"],
+    uv_px: Float[np.ndarray, "K 2"],
+    guess_px: Float[np.ndarray, "K 2"],
+    share: Float[np.ndarray, "K P"] | None = None,
+) -> PatchMotion:
+    """Follow the patch around each place.
+
+    Args:
+        previous: grey values of the frame in which the places are.
+        grey: those of the frame they are looked for in.
+        uv_px: places in ``previous``.
+        guess_px: where they are expected in ``grey``.
+        share: how far each point of :data:`GRID_PX` belongs to what is followed, 0 to 1; all do by default.
+    """
+    start, guess = ((each[:, None] + GRID_PX).reshape(-1, 2) for each in (uv_px, guess_px))
+    motion = follow(previous, grey, start, guess)
+    step = (motion.uv_px - start).reshape(len(uv_px), -1, 2)
+    weight = _WEIGHT * motion.found.reshape(len(uv_px), -1)
+    weight = weight if share is None else weight * share
+    variance = np.trace(motion.covariance, axis1=1, axis2=2).reshape(weight.shape) / 2
+    return _heaviest(step, weight, variance)
+
+
+def _heaviest(
+    step: Float[np.ndarray, "K P 2"], weight: Float[np.ndarray, "K P"], variance: Float[np.ndarray, "K P"]
+) -> PatchMotion:
+    """The mode of the weighted steps, by mean shift from the step that most others support."""
+    apart = ((step[:, :, None] - step[:, None]) ** 2).sum(axis=-1)
+    both = variance[:, :, None] + variance[:, None] + _KERNEL_PX2
+    support = (weight[:, None] * np.exp(-apart / (2 * both))).sum(axis=-1) * (weight > 0)
+    best = np.take_along_axis(step, support.argmax(axis=1)[:, None, None], axis=1)[:, 0]
+    spread = variance + _KERNEL_PX2
+    agreed = precise = np.zeros_like(weight)
+    for _ in range(4):
+        agreed = weight * np.exp(-((step - best[:, None]) ** 2).sum(axis=-1) / (2 * spread))
+        precise = agreed / spread
+        best = (precise[..., None] * step).sum(axis=1) / np.maximum(precise.sum(axis=1), 1e-12)[:, None]
+    found = agreed.sum(axis=1) > _LEAST_SUPPORT
+    return PatchMotion(
+        np.where(found[:, None], best, 0.0), np.where(found, 1 / np.maximum(precise.sum(axis=1), 1e-12), np.inf)
+    )
+
+
+def look(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K S"]:
+    """Grey values around each place, of mean 0 and length 1: their products are normalised cross-correlations."""
+    side = 2 * _ANCHOR_PX + 1
+    image = grey.astype(np.float32)
+    around = [cv2.getRectSubPix(image, (side, side), (float(x) - 0.5, float(y) - 0.5)).ravel() for x, y in uv_px]
+    values = np.array(around, dtype=np.float64).reshape(len(uv_px), side * side)
+    values -= values.mean(axis=1, keepdims=True)
+    return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)
