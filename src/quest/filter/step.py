@@ -2,8 +2,8 @@
 
 A query *rests* in the world, where the camera's motion alone moves it in the picture, or it goes with its *own* patch.
 Both are kept until they part; then how probable the distance is, and how like the anchor both places are, weigh them.
-A hypothesis below odds of 1 : 150 begins anew at
-the other one. Without depth nothing is known to rest, and the own patch, guided by the camera's motion, is the answer.
+A hypothesis below odds of 1 : 150 begins anew at the other one. Without depth nothing is known to rest, and the own
+patch, guided by the camera's motion, is the answer.
 """
 
 from __future__ import annotations
