@@ -97,6 +97,7 @@ TRACKERS: dict[str, Entry] = {
     "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),
     "dis": Entry("dense optical flow, chained", "dense_flow:DenseFlow"),
+    "xfeat": Entry("every frame matched to the query's by dense features", "dense_match:DenseMatch"),
     "world-pnp": Entry("still in the world, camera by LK and PnP", "still_world:StillWorld", inputs=("depth",)),
     "world-given": Entry(
         "still in the world, given poses", "hold_still:HoldStill", {"name": "world-given"}, inputs=("depth and poses",)
