@@ -52,13 +52,13 @@ class Filtered:
             grey, frame = grey_of(clip.rgb[i]), clip.frame(i)
             if state is None:
                 view = View(clip.camera.matrix.astype(np.float64), frame.cam_from_world, frame.depth_m)
-                state = begin(grey, view, frame.stamp_s)
+                state = begin(grey, view, frame.stamp_s, self.noise)
             else:
                 pose = frame.cam_from_world if posed else None
                 state = step(state, grey, frame.depth_m, frame.stamp_s, pose, self.noise)
             asked = np.flatnonzero(first == i)
             if len(asked):
-                state = ask(state, uv_first[np.sort(asked)].astype(np.float64))
+                state = ask(state, uv_first[np.sort(asked)].astype(np.float64), self.noise)
             known, answer = order[: len(state.queries)], read_off(state, self.noise)
             uv_px[i, known], point[i, known], visible[i, known] = answer.uv_px, answer.point_world, answer.visible
         asked_at = np.arange(t)[:, None] >= first

@@ -13,9 +13,13 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from quest.filter.view import View
+
 INLIER_PX = 2.5
 LEAST = 12
 """Fewer points that agree are no pose."""
+_LEAST_PX = 0.7
+"""Error of points that drift together, under which a camera is not said to move."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,26 @@ def estimate_pose(
     inlier = np.zeros(len(point_world), dtype=bool)
     inlier[agree] = True
     return CameraEstimate(pose, inlier)
+
+
+def stands_still(
+    point_world: Float[np.ndarray, "N 3"],
+    uv_px: Float[np.ndarray, "N 2"],
+    before: View,
+    after: View,
+) -> bool:
+    """Whether a new pose explains points no better than the old one: by less than six parameters may (Schwarz, 1978).
+
+    Args:
+        point_world: metres.
+        uv_px: pixels where they are seen.
+        before: view under the old pose.
+        after: view under the new one.
+    """
+    off = [((view.project(point_world)[0] - uv_px) ** 2).sum(axis=-1) for view in (before, after)]
+    kept = [np.nan_to_num(each, nan=np.inf).clip(max=INLIER_PX**2) for each in off]
+    variance = max(float(np.median(kept[1])) / np.log(4), _LEAST_PX**2)
+    return bool((kept[0].sum() - kept[1].sum()) / variance < 6 * np.log(len(uv_px)))
 
 
 def picture_motion(from_px: Float[np.ndarray, "N 2"], to_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "3 3"]:

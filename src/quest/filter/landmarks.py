@@ -1,6 +1,7 @@
-"""Points of the still world, from which the camera's motion is told.
+"""Points all over the picture, and the bodies that carry them: the still world first, and what moves against it.
 
-Each keeps the world point of its birth as long as it is followed; where they run out new ones are sown.
+Each point keeps its place on every body since its birth, so that the bodies' poses are fitted from then to now. What
+no body explains founds a new one, or is dropped; where points run out new ones are sown.
 """
 
 from __future__ import annotations
@@ -9,31 +10,86 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 
-from quest.filter.camera_motion import estimate_pose, picture_motion
+from quest.filter.bodies import Bodies, about, go_on, on_joint, update
+from quest.filter.camera_motion import estimate_pose, picture_motion, stands_still
 from quest.filter.local_motion import corners, follow
-from quest.filter.view import View
+from quest.filter.noise import Noise
+from quest.filter.rigid_motion import GATE, Seen, Surface, common_motion, fit, misfit_unsure
+from quest.filter.surfaces import Surfaces, depth_error, measure, sow_surfaces
+from quest.filter.view import View, move, move_back
 
 _CELL_PX = 20
 _COUNT = 400
+_FINE_PX = 5
+_NEAR_PX = 18
+_NEAR_COUNT = 25
+_MOST_BODIES = 16
+_SURE = float(np.log(150.0))
+_NEIGHBOURS = 5
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """N points of the newest frame."""
+    """N points of the newest frame, and B bodies; body 0 is the world."""
 
     uv_px: Float[np.ndarray, "N 2"]
-    point_world: Float[np.ndarray, "N 3"]
-    """Metres; NaN without depth."""
+    covariance: Float[np.ndarray, "N 2 2"]
+    """Pixels squared, gathered since birth."""
+    place: Float[np.ndarray, "N B 3"]
+    """On each body, metres; NaN without depth."""
+    error: Float[np.ndarray, "N 3"]
+    """Standard deviation of the place, along the ray of its birth, metres in the world."""
+    log_weight: Float[np.ndarray, "N B"]
+    """Log-odds of being carried by each body, against being on none of them."""
+    surfaces: Surfaces
+    bodies: Bodies
 
     @classmethod
     def none(cls) -> Landmarks:
         """Before the first frame."""
-        return cls(np.zeros((0, 2)), np.zeros((0, 3)))
+        return cls(
+            np.zeros((0, 2)),
+            np.zeros((0, 2, 2)),
+            np.zeros((0, 1, 3)),
+            np.zeros((0, 3)),
+            np.zeros((0, 1)),
+            Surfaces.none(),
+            Bodies.world(),
+        )
 
-    def _kept(self, which: np.ndarray) -> Landmarks:
-        return Landmarks(self.uv_px[which], self.point_world[which])
+    @property
+    def pose(self) -> Float[np.ndarray, "B 4 4"]:
+        """``world_from_body``."""
+        return self.bodies.pose
+
+    def only(self, which: np.ndarray) -> Landmarks:
+        """Some of the points, on all bodies."""
+        own = ("uv_px", "covariance", "place", "error", "log_weight")
+        return replace(self, **{name: getattr(self, name)[which] for name in own})
+
+    @property
+    def body(self) -> Int[np.ndarray, " N"]:
+        """The most probable carrier of each point."""
+        return np.asarray(self.log_weight.argmax(axis=1))
+
+    @property
+    def point_world(self) -> Float[np.ndarray, "N 3"]:
+        """Where each is, if its most probable body carries it."""
+        return move(self.pose[self.body], self.place[np.arange(len(self.body)), self.body])
+
+    def share(self, point_world: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K B"]:
+        """Share of each body in the points near some places of the world."""
+        apart = ((point_world[:, None] - self.point_world) ** 2).sum(axis=-1)
+        apart = np.where(np.isfinite(apart), apart, np.inf)
+        if apart.shape[1] <= _NEIGHBOURS:
+            return np.full((len(point_world), len(self.pose)), 1 / len(self.pose))
+        width = np.partition(apart, _NEIGHBOURS, axis=1)[:, _NEIGHBOURS, None]
+        near = np.where(np.isfinite(width), np.exp(-apart / (2 * np.where(np.isfinite(width), width, 1.0))), 1.0)
+        member = np.eye(len(self.pose))[self.body] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
+        total = near @ member + 1e-9
+        return total / total.sum(axis=1, keepdims=True)
 
 
 @dataclass(frozen=True)
@@ -46,47 +102,204 @@ class CameraMotion:
     """Homography of the picture, for places without depth."""
 
 
-def observe_camera(
+def observe(
     landmarks: Landmarks,
     previous: UInt8[np.ndarray, "H W"],
     grey: UInt8[np.ndarray, "H W"],
     old: View,
+    depth_m: Float[np.ndarray, "H W"] | None,
     given: Float[np.ndarray, "4 4"] | None,
+    dt_s: float,
+    noise: Noise,
 ) -> tuple[Landmarks, CameraMotion]:
-    """Follow the landmarks into a new frame, and tell the camera's motion from them.
+    """Follow the landmarks into a new frame, and tell the motion of the camera and of the bodies from them.
 
     Args:
         landmarks: of the previous frame.
         previous: its grey values.
         grey: those of the new one.
         old: view of the previous frame.
-        given: the new pose, where it is known.
+        depth_m: of the new one, metres; None without depth.
+        given: the new pose of the camera, where it is known.
+        dt_s: time between both, seconds.
+        noise: parameters.
     """
     expected = old if given is None else replace(old, cam_from_world=given)
+    landmarks = replace(landmarks, bodies=go_on(landmarks.bodies, dt_s, noise))
     guess, _ = expected.project(landmarks.point_world)
     guess = np.where(np.isfinite(guess), guess, landmarks.uv_px)
     motion = follow(previous, grey, landmarks.uv_px, guess)
     picture = picture_motion(landmarks.uv_px[motion.found], motion.uv_px[motion.found])
-    moved = replace(landmarks, uv_px=motion.uv_px)._kept(motion.found)
+    covariance = landmarks.covariance + motion.covariance
+    moved = replace(landmarks, uv_px=motion.uv_px, covariance=covariance).only(motion.found)
     pose = old.cam_from_world if given is None else given
-    known = np.asarray(np.isfinite(moved.point_world).all(axis=-1))
-    if given is None and known.any():
-        moved = moved._kept(known)
-        estimate = estimate_pose(moved.point_world, moved.uv_px, old.matrix, pose)
+    known = True
+    if given is None and np.isfinite(moved.place).any():
+        rests = (moved.body == 0) & (moved.log_weight[:, 0] > -1) & np.isfinite(moved.place[:, 0]).all(axis=-1)
+        estimate = estimate_pose(moved.place[rests, 0], moved.uv_px[rests], old.matrix, pose)
         if estimate is None:
-            return Landmarks.none(), CameraMotion(pose, picture)
-        moved, pose = moved._kept(estimate.inlier), estimate.cam_from_world
+            return landmarks.only(np.zeros(len(covariance), dtype=bool)), CameraMotion(pose, picture)
+        after = replace(old, cam_from_world=estimate.cam_from_world)
+        known = stands_still(moved.place[rests, 0], moved.uv_px[rests], old, after)
+        if not known:
+            pose = estimate.cam_from_world
+            refuted = rests.copy()
+            refuted[rests] = ~estimate.inlier
+            moved = moved.only(~refuted)
+    view = View(old.matrix, pose, depth_m)
+    if depth_m is not None:
+        moved = _observe_bodies(moved, view, known, dt_s, noise)
     return moved, CameraMotion(pose, picture)
 
 
-def sow(landmarks: Landmarks, grey: UInt8[np.ndarray, "H W"], view: View) -> Landmarks:
-    """Add corners where there are none; with depth only where it has no edge."""
-    free = np.ones(grey.shape, dtype=np.uint8)
-    for x, y in landmarks.uv_px:
-        cv2.circle(free, (int(x), int(y)), _CELL_PX, 0, -1)
-    new = corners(grey, free > 0, cell_px=_CELL_PX, count=_COUNT - len(landmarks.uv_px))
-    depth_m, flat = view.depth_at(new)
+def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
+    """The pose of each moving body, and which of them carries each point."""
+    depth_m, flat = view.depth_at(landmarks.uv_px)
+    # Poses, lenses and stamps err too: the world's points say by how much they do here (median of chi-square: ln 4).
+    rests, _ = view.project(landmarks.place[landmarks.body == 0, 0])
+    off = ((rests - landmarks.uv_px[landmarks.body == 0]) ** 2).sum(axis=-1)
+    spread = max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) if len(off) else noise.point_px**2
+    seen = Seen(
+        landmarks.uv_px,
+        np.where(flat, depth_m, np.nan),
+        landmarks.covariance + spread * np.eye(2),
+        depth_error(depth_m, noise),
+    )
+    told = (GATE - np.minimum(_misfits(landmarks, seen, view), 3 * GATE)) / 2
+    told += np.log(landmarks.share(landmarks.point_world) + noise.stray)
+    weight = landmarks.log_weight + (told - landmarks.log_weight) * min(dt_s / noise.points_s, 1.0)
+    body = np.where(told.max(axis=1) > 0, weight.argmax(axis=1), -1)
+    near = landmarks.share(landmarks.surfaces.point_world(landmarks.pose))
+    surfaces = measure(landmarks.surfaces, landmarks.pose, near, view, dt_s, noise)
+    bodies = landmarks.bodies
+    for b in range(1, len(bodies)):
+        bodies = _refit(bodies, b, landmarks.place[:, b], body == b, seen, surfaces, view, dt_s, noise)
+    landmarks = replace(landmarks, bodies=bodies, surfaces=surfaces)
+    off = _misfits(landmarks, seen, view)
+    odd = (off.min(axis=1) > GATE) & np.isfinite(seen.depth_m)
+    free = np.flatnonzero(odd & _surrounded(landmarks.point_world, odd))
+    new = None
+    if known and len(bodies) < _MOST_BODIES:
+        new = common_motion(landmarks.place[free, 0], seen.only(free), view, noise)
+    if new is not None:
+        motion, inlier = new
+        middle = move(motion, landmarks.place[free[inlier], 0]).mean(axis=0)
+        landmarks = replace(
+            landmarks,
+            bodies=bodies.with_one(motion, middle, noise),
+            surfaces=surfaces.with_one(),
+            place=np.concatenate([landmarks.place, landmarks.place[:, :1]], axis=1),
+        )
+        joins = np.full(len(weight), -_SURE)
+        joins[free[inlier]] = _SURE
+        weight = np.concatenate([weight, joins[:, None]], axis=1)
+    return replace(landmarks, log_weight=weight).only(weight.max(axis=1) > -_SURE)
+
+
+def _surrounded(point: Float[np.ndarray, "N 3"], odd: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+    """Whether most points near each are odd as well: bodies are connected, and errors are scattered."""
+    if len(point) <= _NEIGHBOURS:
+        return odd
+    apart = ((point[:, None] - point) ** 2).sum(axis=-1)
+    near = np.argpartition(np.where(np.isfinite(apart), apart, np.inf), _NEIGHBOURS, axis=1)[:, : _NEIGHBOURS + 1]
+    return odd[near].mean(axis=1) > 0.5
+
+
+def _misfits(landmarks: Landmarks, seen: Seen, view: View) -> Float[np.ndarray, "N B"]:
+    bodies = landmarks.bodies
+    return np.stack(
+        [
+            misfit_unsure(
+                move(pose, landmarks.place[:, b]),
+                middle,
+                covariance[:6, :6],
+                landmarks.error @ pose[:3, :3].T,
+                seen,
+                view,
+            )
+            for b, (pose, middle, covariance) in enumerate(
+                zip(bodies.pose, bodies.middle, bodies.covariance, strict=True)
+            )
+        ],
+        axis=1,
+    )
+
+
+def _refit(
+    bodies: Bodies,
+    index: int,
+    place: Float[np.ndarray, "N 3"],
+    mine: Bool[np.ndarray, " N"],
+    seen: Seen,
+    surfaces: Surfaces,
+    view: View,
+    dt_s: float,
+    noise: Noise,
+) -> Bodies:
+    covered = surfaces.body == index
+    surface = Surface(surfaces.place[covered, index], surfaces.normal[covered, index])
+    point = move(bodies.pose[index], np.concatenate([place[mine], surface.place]))
+    if not len(point):
+        return bodies
+    bodies = about(bodies, index, point.mean(axis=0))
+    middle = bodies.middle[index]
+    known = np.linalg.inv(bodies.covariance[index][:6, :6])
+    joint = on_joint(bodies, index, noise)
+    fitted = fit(place[mine], seen.only(mine), surface, view, bodies.pose[index], middle, known, joint, noise)
+    return update(bodies, index, fitted.pose, fitted.information, dt_s, noise)
+
+
+def sow(
+    landmarks: Landmarks,
+    grey: UInt8[np.ndarray, "H W"],
+    view: View,
+    around_px: Float[np.ndarray, "K 2"],
+    noise: Noise,
+) -> Landmarks:
+    """Add corners where there are none, closer together around some places; with depth only where it has no edge.
+
+    Args:
+        landmarks: of this frame.
+        grey: the frame.
+        view: of it.
+        around_px: where queries are.
+        noise: parameters.
+    """
+    near = np.zeros(grey.shape, dtype=np.uint8)
+    for x, y in around_px[np.isfinite(around_px).all(axis=-1)]:
+        cv2.circle(near, (int(x), int(y)), _NEAR_PX, 1, -1)
+    new = [np.zeros((0, 2))]
+    for cell_px, allowed, count in ((_FINE_PX, near, _NEAR_COUNT * len(around_px)), (_CELL_PX, None, _COUNT)):
+        free = np.ones(grey.shape, dtype=np.uint8) if allowed is None else allowed.copy()
+        for x, y in np.concatenate([landmarks.uv_px, *new]):
+            cv2.circle(free, (int(x), int(y)), cell_px, 0, -1)
+        there = (
+            len(landmarks.uv_px)
+            if allowed is None
+            else int(
+                near[tuple(np.floor(landmarks.uv_px).astype(int).clip(0, np.array(near.shape[::-1]) - 1).T[::-1])].sum()
+            )
+        )
+        new.append(corners(grey, free > 0, cell_px=cell_px, count=count - there))
+    landmarks = replace(landmarks, surfaces=sow_surfaces(landmarks.surfaces, landmarks.pose, view))
+    return _born(landmarks, np.concatenate(new), view, noise)
+
+
+def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noise: Noise) -> Landmarks:
+    depth_m, flat = view.depth_at(uv_px)
     if view.depth_m is not None:
-        new, depth_m = new[flat], depth_m[flat]
-    point = view.lift(new, depth_m)
-    return Landmarks(np.concatenate([landmarks.uv_px, new]), np.concatenate([landmarks.point_world, point]))
+        uv_px, depth_m = uv_px[flat], depth_m[flat]
+    point = view.lift(uv_px, depth_m)
+    ray = point - view.centre
+    error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * depth_error(depth_m, noise)[:, None]
+    bodies = len(landmarks.pose)
+    share = landmarks.share(point) if len(landmarks.uv_px) else np.full((len(uv_px), bodies), 1 / bodies)
+    place = move_back(landmarks.pose, np.repeat(point[:, None], bodies, axis=1))
+    return replace(
+        landmarks,
+        uv_px=np.concatenate([landmarks.uv_px, uv_px]),
+        covariance=np.concatenate([landmarks.covariance, np.zeros((len(uv_px), 2, 2))]),
+        place=np.concatenate([landmarks.place, place]),
+        error=np.concatenate([landmarks.error, error]),
+        log_weight=np.concatenate([landmarks.log_weight, np.log(np.maximum(share, 1e-2))]),
+    )

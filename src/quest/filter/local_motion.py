@@ -21,6 +21,8 @@ from quest.filter.view import in_image
 WINDOW_PX = 21
 _LEVELS = 4
 _BACK_PX = 1.5
+_LEAST_LIKE = 0.3
+"""Correlation of the patch in both frames below which it is noise that was followed."""
 _GREY_NOISE = 4.0
 """Standard deviation of a grey value against that of the same place in the next frame."""
 
@@ -53,8 +55,9 @@ def follow(
     """
     if not len(uv_px):
         return LocalMotion(guess_px, np.zeros(0, dtype=bool), np.zeros((0, 2, 2)))
-    there, found = _flow(previous, grey, uv_px, guess_px)
-    back, found_back = _flow(grey, previous, there, uv_px)
+    there, found, off = _flow(previous, grey, uv_px, guess_px)
+    back, found_back, _ = _flow(grey, previous, there, uv_px)
+    found &= (off / 0.8) ** 2 < 2 * (1 - _LEAST_LIKE) * _variance(previous, uv_px)
     error_px = np.linalg.norm(back - uv_px, axis=-1)
     height, width = grey.shape
     found &= found_back & (error_px < _BACK_PX) & in_image(there, (width, height))
@@ -67,9 +70,9 @@ def _flow(
     grey: UInt8[np.ndarray, "H W"],
     uv_px: Float[np.ndarray, "N 2"],
     guess_px: Float[np.ndarray, "N 2"],
-) -> tuple[Float[np.ndarray, "N 2"], Bool[np.ndarray, " N"]]:
+) -> tuple[Float[np.ndarray, "N 2"], Bool[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     start, guess = ((x - 0.5).astype(np.float32).reshape(-1, 1, 2) for x in (uv_px, guess_px))
-    there, status, _ = cv2.calcOpticalFlowPyrLK(
+    there, status, off = cv2.calcOpticalFlowPyrLK(
         previous,
         grey,
         start,
@@ -80,7 +83,17 @@ def _flow(
     )
     end = np.asarray(there, dtype=np.float64)[:, 0] + 0.5
     found = (np.asarray(status)[:, 0] == 1) & np.isfinite(end).all(axis=-1)
-    return np.where(found[:, None], end, guess_px), found
+    differ = np.where(found, np.asarray(off)[:, 0], np.float32(0))  # undefined where the point was not found
+    return np.where(found[:, None], end, guess_px), found, differ.astype(np.float64)
+
+
+def _variance(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
+    """Of the grey values in the window around each point."""
+    image = grey.astype(np.float32)
+    mean, square = (cv2.boxFilter(each, -1, (WINDOW_PX, WINDOW_PX)) for each in (image, image * image))
+    height, width = grey.shape
+    column, row = np.floor(uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
+    return (square[row, column] - mean[row, column] ** 2).astype(np.float64)
 
 
 def _covariance(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
@@ -110,4 +123,7 @@ def corners(
     if count < 1:
         return np.zeros((0, 2))
     found = cv2.goodFeaturesToTrack(grey, count, 0.003, cell_px, mask=allowed.astype(np.uint8))
-    return np.zeros((0, 2)) if found is None else np.asarray(found, dtype=np.float64)[:, 0] + 0.5
+    if found is None:
+        return np.zeros((0, 2))
+    uv_px = np.asarray(found, dtype=np.float64)[:, 0] + 0.5
+    return uv_px[_variance(grey, uv_px) > _GREY_NOISE**2]

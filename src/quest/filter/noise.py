@@ -39,3 +39,17 @@ class Noise:
     """Over how wide a range the depth of another surface is spread, metres."""
     stray: float = 0.05
     """Share of depths that are of something else: edges, thin handles, flying pixels."""
+    point_px: float = 0.7
+    """Least error of a landmark that is followed, besides what its patch says, pixels."""
+    points_s: float = 0.1
+    """For how long the evidence repeats itself that a body carries a landmark, seconds."""
+    turn_rad_s: float = 2.0
+    """How fast a body turns, radians per second."""
+    stops_s: float = 0.3
+    """For how long a body keeps its velocity, seconds."""
+    surface: float = 0.1
+    """How much of a surface point's evidence is new: depths beside each other err alike."""
+    joint_m: float = 0.01
+    """How far off its joint's screw a body is, metres."""
+    arm_m: float = 0.3
+    """Lever at which a turn counts as much as a shift, metres."""
