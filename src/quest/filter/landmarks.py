@@ -184,15 +184,16 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
     if new is not None:
         motion, inlier = new
         middle = move(motion, landmarks.place[free[inlier], 0]).mean(axis=0)
+        joins = np.full(len(weight), -_SURE)
+        joins[free[inlier]] = _SURE
+        weight = np.concatenate([weight, joins[:, None]], axis=1)
         landmarks = replace(
             landmarks,
             bodies=bodies.with_one(motion, middle, noise),
             surfaces=surfaces.with_one(),
             place=np.concatenate([landmarks.place, landmarks.place[:, :1]], axis=1),
+            log_weight=weight,
         )
-        joins = np.full(len(weight), -_SURE)
-        joins[free[inlier]] = _SURE
-        weight = np.concatenate([weight, joins[:, None]], axis=1)
     return replace(landmarks, log_weight=weight).only(weight.max(axis=1) > -_SURE)
 
 

@@ -70,12 +70,12 @@ def in_image(uv_px: Float[np.ndarray, "N 2"], size: tuple[int, int]) -> Bool[np.
     return np.asarray(((uv_px >= 0) & (uv_px <= size)).all(axis=-1))
 
 
-def move(pose: Float[np.ndarray, "*B 4 4"], point: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+def move(pose: Float[np.ndarray, "*#B 4 4"], point: Float[np.ndarray, "*#B 3"]) -> Float[np.ndarray, "*B 3"]:
     """Points of a body in the world; leading axes broadcast."""
     return np.einsum("...ij,...j->...i", pose[..., :3, :3], point) + pose[..., :3, 3]
 
 
-def move_back(pose: Float[np.ndarray, "*B 4 4"], point: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+def move_back(pose: Float[np.ndarray, "*#B 4 4"], point: Float[np.ndarray, "*#B 3"]) -> Float[np.ndarray, "*B 3"]:
     """Points of the world on a body."""
     return np.einsum("...ji,...j->...i", pose[..., :3, :3], point - pose[..., :3, 3])
 
