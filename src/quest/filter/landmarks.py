@@ -269,19 +269,14 @@ def sow(
     near = np.zeros(grey.shape, dtype=np.uint8)
     for x, y in around_px[np.isfinite(around_px).all(axis=-1)]:
         cv2.circle(near, (int(x), int(y)), _NEAR_PX, 1, -1)
+    height, width = grey.shape
+    column, row = np.floor(landmarks.uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
+    fine, all_over = _NEAR_COUNT * len(around_px) - int(near[row, column].sum()), _COUNT - len(landmarks.uv_px)
     new = [np.zeros((0, 2))]
-    for cell_px, allowed, count in ((_FINE_PX, near, _NEAR_COUNT * len(around_px)), (_CELL_PX, None, _COUNT)):
-        free = np.ones(grey.shape, dtype=np.uint8) if allowed is None else allowed.copy()
+    for cell_px, allowed, count in ((_FINE_PX, near, fine), (_CELL_PX, np.ones_like(near), all_over)):
         for x, y in np.concatenate([landmarks.uv_px, *new]):
-            cv2.circle(free, (int(x), int(y)), cell_px, 0, -1)
-        there = (
-            len(landmarks.uv_px)
-            if allowed is None
-            else int(
-                near[tuple(np.floor(landmarks.uv_px).astype(int).clip(0, np.array(near.shape[::-1]) - 1).T[::-1])].sum()
-            )
-        )
-        new.append(corners(grey, free > 0, cell_px=cell_px, count=count - there))
+            cv2.circle(allowed, (int(x), int(y)), cell_px, 0, -1)
+        new.append(corners(grey, allowed > 0, cell_px=cell_px, count=count))
     landmarks = replace(landmarks, surfaces=sow_surfaces(landmarks.surfaces, landmarks.pose, view))
     return _born(landmarks, np.concatenate(new), view, noise)
 

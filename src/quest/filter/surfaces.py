@@ -20,6 +20,8 @@ from quest.filter.view import View, in_image, move, move_back
 
 _CELL_PX = 12
 _REACH_PX = 3
+_MOST = 4000
+"""Points beyond that are forgotten, the oldest first."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +134,10 @@ def sow_surfaces(surfaces: Surfaces, pose: Float[np.ndarray, "B 4 4"], view: Vie
     turned[:, :3, 3] = 0
     new = Surfaces(move_back(pose, point), move_back(turned, normal), np.ones((int(good.sum()), len(pose))))
     return Surfaces(
-        *(np.concatenate([getattr(surfaces, name), getattr(new, name)]) for name in ("place", "normal", "log_weight"))
+        *(
+            np.concatenate([getattr(surfaces, name), getattr(new, name)])[-_MOST:]
+            for name in ("place", "normal", "log_weight")
+        )
     )
 
 
