@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from quest.filter.picture import Picture
 from quest.types import Camera, Clip
 
 SIZE = (160, 120)
@@ -26,6 +27,11 @@ def shifted(image: np.ndarray, x: float, y: float) -> np.ndarray:
     """The part of a larger picture that is seen from (x, y) on."""
     move = np.array([[1, 0, -x], [0, 1, -y]], np.float32)
     return cv2.warpAffine(image, move, SIZE)  # type: ignore[call-overload]
+
+
+def plain(grey: np.ndarray) -> Picture:
+    """A picture without descriptors."""
+    return Picture(grey, np.ones((1, 1, 1), np.float32))
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,9 @@ import pytest
 
 from quest.filter.camera_motion import LEAST, estimate_pose, picture_motion
 from quest.filter.local_motion import corners, follow
-from quest.filter.patches import GRID_PX, look, patch_motion
+from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
 from quest.filter.view import View
-from tests.filter.scenes import SIZE, shifted, texture
+from tests.filter.scenes import SIZE, plain, shifted, texture
 
 WIDE = texture(3 * SIZE[0], 3 * SIZE[1], seed=1)
 PLACES = np.array([[40.0, 40.0], [80.5, 60.5], [120.0, 90.0]])
@@ -17,14 +17,14 @@ PLACES = np.array([[40.0, 40.0], [80.5, 60.5], [120.0, 90.0]])
 
 def test_points_are_followed_to_a_tenth_of_a_pixel() -> None:
     one, other = shifted(WIDE, 100, 100), shifted(WIDE, 103.3, 97.9)
-    motion = follow(one, other, PLACES, PLACES)
+    motion = follow(plain(one), plain(other), PLACES, PLACES)
     assert motion.found.all()
     np.testing.assert_allclose(motion.uv_px - PLACES, np.tile([-3.3, 2.1], (3, 1)), atol=0.1)
 
 
 def test_what_leaves_the_picture_is_not_found_and_stays_where_it_is_expected() -> None:
     one, other = shifted(WIDE, 100, 100), shifted(WIDE, 150, 100)
-    motion = follow(one, other, PLACES, PLACES - [50, 0])
+    motion = follow(plain(one), plain(other), PLACES, PLACES - [50, 0])
     assert motion.found.tolist() == [False, True, True]
     np.testing.assert_array_equal(motion.uv_px[0], PLACES[0] - [50, 0])
 
@@ -32,19 +32,20 @@ def test_what_leaves_the_picture_is_not_found_and_stays_where_it_is_expected() -
 def test_a_plain_patch_says_less_than_a_textured_one() -> None:
     grey = shifted(WIDE, 100, 100)
     grey[:, 80:] = 128
-    covariance = follow(grey, grey, np.array([[40.0, 60.0], [130.0, 60.0]]), PLACES[:2]).covariance
+    picture = plain(grey)
+    covariance = follow(picture, picture, np.array([[40.0, 60.0], [130.0, 60.0]]), PLACES[:2]).covariance
     assert np.trace(covariance[1]) > 100 * np.trace(covariance[0])
 
 
 def test_corners_keep_apart_and_stay_where_they_are_wanted() -> None:
-    grey, allowed = shifted(WIDE, 100, 100), np.zeros(SIZE[::-1], bool)
+    picture, allowed = plain(shifted(WIDE, 100, 100)), np.zeros(SIZE[::-1], bool)
     allowed[:, :80] = True
-    found = corners(grey, allowed, cell_px=15, count=20)
+    found = corners(picture, allowed, cell_px=15, count=20)
     assert 5 < len(found) <= 20
     assert (found[:, 0] <= 80).all()
     apart = np.linalg.norm(found[:, None] - found, axis=-1) + 1e3 * np.eye(len(found))
     assert apart.min() >= 14
-    assert corners(grey, allowed, cell_px=15, count=0).shape == (0, 2)
+    assert corners(picture, allowed, cell_px=15, count=0).shape == (0, 2)
 
 
 def test_a_pose_is_found_among_outliers() -> None:
@@ -76,7 +77,7 @@ def test_at_a_seam_the_layer_under_the_query_counts(side: int) -> None:
     other = one.copy()
     other[:, 4:84] = one[:, :80]
     at = np.array([[80.0 + 18 * side, 60.0]])
-    motion = patch_motion(one, other, at, at)
+    motion = patch_motion(plain(one), plain(other), at, at)
     assert np.isfinite(motion.variance).all()
     np.testing.assert_allclose(motion.step_px, [[4.0 if side < 0 else 0.0, 0.0]], atol=0.3)
 
@@ -87,14 +88,25 @@ def test_points_that_do_not_belong_to_it_do_not_move_it() -> None:
     other[:, 4:84] = one[:, :80]
     at = np.array([[90.0, 60.0]])
     right = (GRID_PX[:, 0] > 4).astype(float)[None]
+    one, other = plain(one), plain(other)
     np.testing.assert_allclose(patch_motion(one, other, at, at, right).step_px, [[0, 0]], atol=0.3)
     assert np.isinf(patch_motion(one, other, at, at, 0 * right).variance).all()
 
 
 def test_looks_correlate() -> None:
     grey = shifted(WIDE, 100, 100)
-    one, other = look(grey, PLACES[:1]), look(grey, PLACES[1:2])
+    one, other = (look(tiles(plain(grey), PLACES[i : i + 1])) for i in range(2))
     assert (one * one).sum() == pytest.approx(1)
     assert abs((one * other).sum()) < 0.5
     brighter = (0.5 * grey + 20).astype(np.uint8)
-    assert (one * look(brighter, PLACES[:1])).sum() > 0.99
+    assert (one * look(tiles(plain(brighter), PLACES[:1]))).sum() > 0.99
+
+
+def test_tiles_are_found_again_each_by_itself() -> None:
+    """Two queries of two frames, each moved its own way."""
+    here, there = np.array([[60.0, 60.0], [90.0, 50.0]]), np.array([[63.0, 58.0], [86.5, 51.5]])
+    now = plain(shifted(WIDE, 100, 100))
+    tile = np.concatenate(
+        [tiles(plain(shifted(WIDE, 100 + dx, 100 + dy)), here[i : i + 1]) for i, (dx, dy) in enumerate(there - here)]
+    )
+    np.testing.assert_allclose(tile_motion(tile, now, here).step_px, there - here, atol=0.1)

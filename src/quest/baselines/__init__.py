@@ -92,7 +92,7 @@ TRACKERS: dict[str, Entry] = {
     "flow-chain-0.01": _of_weights("the same with noise", "flow_chain", noise=0.01),
     "flow-chain-0.02": _of_weights("the same with noise", "flow_chain", noise=0.02),
     "flow-chain-0.05": _of_weights("the same with noise", "flow_chain", noise=0.05),
-    "quest-filter": Entry("the filter by itself, without a network", "filtered:Filtered", inputs=EVERYTHING),
+    "quest-filter": Entry("the filter by itself, with XFeat's features", "filtered:Filtered", inputs=EVERYTHING),
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
     "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),

@@ -10,12 +10,14 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int, UInt8
+from jaxtyping import Bool, Float, Int
+from scipy.spatial import KDTree
 
 from quest.filter.bodies import Bodies, about, go_on, on_joint, update
 from quest.filter.camera_motion import estimate_pose, picture_motion, stands_still
 from quest.filter.local_motion import corners, follow
 from quest.filter.noise import Noise
+from quest.filter.picture import Picture
 from quest.filter.rigid_motion import GATE, Seen, Surface, common_motion, fit, misfit_unsure
 from quest.filter.surfaces import Surfaces, depth_error, measure, sow_surfaces
 from quest.filter.view import View, move, move_back
@@ -81,14 +83,15 @@ class Landmarks:
 
     def share(self, point_world: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K B"]:
         """Share of each body in the points near some places of the world."""
-        apart = ((point_world[:, None] - self.point_world) ** 2).sum(axis=-1)
-        apart = np.where(np.isfinite(apart), apart, np.inf)
-        if apart.shape[1] <= _NEIGHBOURS:
+        known = np.flatnonzero(np.isfinite(self.point_world).all(axis=-1))
+        if len(known) <= _NEIGHBOURS:
             return np.full((len(point_world), len(self.pose)), 1 / len(self.pose))
-        width = np.partition(apart, _NEIGHBOURS, axis=1)[:, _NEIGHBOURS, None]
-        near = np.where(np.isfinite(width), np.exp(-apart / (2 * np.where(np.isfinite(width), width, 1.0))), 1.0)
+        asked = np.asarray(np.isfinite(point_world).all(axis=-1))
+        tree = KDTree(self.point_world[known])
+        apart, index = tree.query(np.where(asked[:, None], point_world, 0.0), _NEIGHBOURS + 1)
+        near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
         member = np.eye(len(self.pose))[self.body] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
-        total = near @ member + 1e-9
+        total = np.einsum("mn,mnb->mb", near, member[known][index]) * asked[:, None] + 1e-9
         return total / total.sum(axis=1, keepdims=True)
 
 
@@ -104,8 +107,8 @@ class CameraMotion:
 
 def observe(
     landmarks: Landmarks,
-    previous: UInt8[np.ndarray, "H W"],
-    grey: UInt8[np.ndarray, "H W"],
+    previous: Picture,
+    picture: Picture,
     old: View,
     depth_m: Float[np.ndarray, "H W"] | None,
     given: Float[np.ndarray, "4 4"] | None,
@@ -116,8 +119,8 @@ def observe(
 
     Args:
         landmarks: of the previous frame.
-        previous: its grey values.
-        grey: those of the new one.
+        previous: its picture.
+        picture: that of the new one.
         old: view of the previous frame.
         depth_m: of the new one, metres; None without depth.
         given: the new pose of the camera, where it is known.
@@ -128,8 +131,8 @@ def observe(
     landmarks = replace(landmarks, bodies=go_on(landmarks.bodies, dt_s, noise))
     guess, _ = expected.project(landmarks.point_world)
     guess = np.where(np.isfinite(guess), guess, landmarks.uv_px)
-    motion = follow(previous, grey, landmarks.uv_px, guess)
-    picture = picture_motion(landmarks.uv_px[motion.found], motion.uv_px[motion.found])
+    motion = follow(previous, picture, landmarks.uv_px, guess)
+    warp = picture_motion(landmarks.uv_px[motion.found], motion.uv_px[motion.found])
     covariance = landmarks.covariance + motion.covariance
     moved = replace(landmarks, uv_px=motion.uv_px, covariance=covariance).only(motion.found)
     pose = old.cam_from_world if given is None else given
@@ -138,7 +141,7 @@ def observe(
         rests = (moved.body == 0) & (moved.log_weight[:, 0] > -1) & np.isfinite(moved.place[:, 0]).all(axis=-1)
         estimate = estimate_pose(moved.place[rests, 0], moved.uv_px[rests], old.matrix, pose)
         if estimate is None:
-            return landmarks.only(np.zeros(len(covariance), dtype=bool)), CameraMotion(pose, picture)
+            return landmarks.only(np.zeros(len(covariance), dtype=bool)), CameraMotion(pose, warp)
         after = replace(old, cam_from_world=estimate.cam_from_world)
         known = stands_still(moved.place[rests, 0], moved.uv_px[rests], old, after)
         if not known:
@@ -149,7 +152,7 @@ def observe(
     view = View(old.matrix, pose, depth_m)
     if depth_m is not None:
         moved = _observe_bodies(moved, view, known, dt_s, noise)
-    return moved, CameraMotion(pose, picture)
+    return moved, CameraMotion(pose, warp)
 
 
 def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
@@ -199,11 +202,13 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
 
 def _surrounded(point: Float[np.ndarray, "N 3"], odd: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     """Whether most points near each are odd as well: bodies are connected, and errors are scattered."""
-    if len(point) <= _NEIGHBOURS:
+    known = np.flatnonzero(np.isfinite(point).all(axis=-1))
+    if len(known) <= _NEIGHBOURS:
         return odd
-    apart = ((point[:, None] - point) ** 2).sum(axis=-1)
-    near = np.argpartition(np.where(np.isfinite(apart), apart, np.inf), _NEIGHBOURS, axis=1)[:, : _NEIGHBOURS + 1]
-    return odd[near].mean(axis=1) > 0.5
+    _, near = KDTree(point[known]).query(point[known], _NEIGHBOURS + 1)
+    most = np.zeros(len(point), dtype=bool)
+    most[known] = odd[known][near].mean(axis=1) > 0.5
+    return most
 
 
 def _misfits(landmarks: Landmarks, seen: Seen, view: View) -> Float[np.ndarray, "N B"]:
@@ -252,7 +257,7 @@ def _refit(
 
 def sow(
     landmarks: Landmarks,
-    grey: UInt8[np.ndarray, "H W"],
+    picture: Picture,
     view: View,
     around_px: Float[np.ndarray, "K 2"],
     noise: Noise,
@@ -261,22 +266,22 @@ def sow(
 
     Args:
         landmarks: of this frame.
-        grey: the frame.
+        picture: the frame.
         view: of it.
         around_px: where queries are.
         noise: parameters.
     """
-    near = np.zeros(grey.shape, dtype=np.uint8)
+    near = np.zeros(picture.grey.shape, dtype=np.uint8)
     for x, y in around_px[np.isfinite(around_px).all(axis=-1)]:
         cv2.circle(near, (int(x), int(y)), _NEAR_PX, 1, -1)
-    height, width = grey.shape
+    width, height = picture.size
     column, row = np.floor(landmarks.uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
     fine, all_over = _NEAR_COUNT * len(around_px) - int(near[row, column].sum()), _COUNT - len(landmarks.uv_px)
     new = [np.zeros((0, 2))]
     for cell_px, allowed, count in ((_FINE_PX, near, fine), (_CELL_PX, np.ones_like(near), all_over)):
         for x, y in np.concatenate([landmarks.uv_px, *new]):
             cv2.circle(allowed, (int(x), int(y)), cell_px, 0, -1)
-        new.append(corners(grey, allowed > 0, cell_px=cell_px, count=count))
+        new.append(corners(picture, allowed > 0, cell_px=cell_px, count=count))
     landmarks = replace(landmarks, surfaces=sow_surfaces(landmarks.surfaces, landmarks.pose, view))
     return _born(landmarks, np.concatenate(new), view, noise)
 

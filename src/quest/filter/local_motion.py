@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from quest.filter.picture import WINDOW_PX, Picture
 from quest.filter.view import in_image
 
-WINDOW_PX = 21
 _LEVELS = 4
 _BACK_PX = 1.5
 _LEAST_LIKE = 0.3
@@ -40,27 +40,26 @@ class LocalMotion:
 
 
 def follow(
-    previous: UInt8[np.ndarray, "H W"],
-    grey: UInt8[np.ndarray, "H W"],
+    previous: Picture,
+    picture: Picture,
     uv_px: Float[np.ndarray, "N 2"],
     guess_px: Float[np.ndarray, "N 2"],
 ) -> LocalMotion:
     """Follow points from one frame to the next.
 
     Args:
-        previous: grey values of the frame in which the points are.
-        grey: those of the next one.
+        previous: the frame in which the points are.
+        picture: the next one.
         uv_px: pixels in ``previous``, centres at half-integers.
-        guess_px: where they are expected in ``grey``.
+        guess_px: where they are expected in ``picture``.
     """
     if not len(uv_px):
         return LocalMotion(guess_px, np.zeros(0, dtype=bool), np.zeros((0, 2, 2)))
-    there, found, off = _flow(previous, grey, uv_px, guess_px)
-    back, found_back, _ = _flow(grey, previous, there, uv_px)
-    found &= (off / 0.8) ** 2 < 2 * (1 - _LEAST_LIKE) * _variance(previous, uv_px)
+    there, found, off = _flow(previous.grey, picture.grey, uv_px, guess_px)
+    back, found_back, _ = _flow(picture.grey, previous.grey, there, uv_px)
+    found &= (off / 0.8) ** 2 < 2 * (1 - _LEAST_LIKE) * previous.variance(uv_px)
     error_px = np.linalg.norm(back - uv_px, axis=-1)
-    height, width = grey.shape
-    found &= found_back & (error_px < _BACK_PX) & in_image(there, (width, height))
+    found &= found_back & (error_px < _BACK_PX) & in_image(there, picture.size)
     covariance = _covariance(previous, uv_px) + (error_px**2)[:, None, None] * np.eye(2)
     return LocalMotion(np.where(found[:, None], there, guess_px), found, covariance)
 
@@ -87,43 +86,29 @@ def _flow(
     return np.where(found[:, None], end, guess_px), found, differ.astype(np.float64)
 
 
-def _variance(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, " N"]:
-    """Of the grey values in the window around each point."""
-    image = grey.astype(np.float32)
-    mean, square = (cv2.boxFilter(each, -1, (WINDOW_PX, WINDOW_PX)) for each in (image, image * image))
-    height, width = grey.shape
-    column, row = np.floor(uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
-    return (square[row, column] - mean[row, column] ** 2).astype(np.float64)
-
-
-def _covariance(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
+def _covariance(picture: Picture, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
     """Noise over structure: the inverse of the summed products of gradients in the window."""
-    dx, dy = (cv2.Scharr(grey, cv2.CV_32F, *order) / 32 for order in ((1, 0), (0, 1)))
-    products = (dx * dx, dx * dy, dy * dy)
-    sums = [cv2.boxFilter(each, -1, (WINDOW_PX, WINDOW_PX), normalize=False) for each in products]
-    height, width = grey.shape
-    column, row = np.floor(uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
-    xx, xy, yy = (each[row, column].astype(np.float64) for each in sums)
+    xx, xy, yy = picture.structure(uv_px).T
     xx, yy = xx + 1.0, yy + 1.0  # a flat patch is nowhere, not at infinity
     inverse = np.stack([np.stack([yy, -xy], axis=-1), np.stack([-xy, xx], axis=-1)], axis=-2)
     return _GREY_NOISE**2 * inverse / (xx * yy - xy**2)[:, None, None]
 
 
 def corners(
-    grey: UInt8[np.ndarray, "H W"], allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
+    picture: Picture, allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
 ) -> Float[np.ndarray, "N 2"]:
     """The best corners of a frame, at most ``count``, no two nearer than a cell is wide.
 
     Args:
-        grey: the frame.
+        picture: the frame.
         allowed: where corners are wanted.
         cell_px: least distance.
         count: how many at most.
     """
     if count < 1:
         return np.zeros((0, 2))
-    found = cv2.goodFeaturesToTrack(grey, count, 0.003, cell_px, mask=allowed.astype(np.uint8))
+    found = cv2.goodFeaturesToTrack(picture.grey, count, 0.003, cell_px, mask=allowed.astype(np.uint8))
     if found is None:
         return np.zeros((0, 2))
     uv_px = np.asarray(found, dtype=np.float64)[:, 0] + 0.5
-    return uv_px[_variance(grey, uv_px) > _GREY_NOISE**2]
+    return uv_px[picture.variance(uv_px) > _GREY_NOISE**2]

@@ -21,8 +21,16 @@ class Noise:
     """Error of where an entity that rests is seen: of the camera's pose and of the depth, pixels."""
     moved_px: float = 60.0
     """How far from there an entity that moves is seen, pixels."""
-    likeness: float = 0.4
-    """By how much the correlation of one entity with its anchor falls short of 1."""
+    look_wide: float = 3.13
+    """Weight of the likeness of descriptors."""
+    look_near: float = 0.52
+    """Weight of the likeness of the grey values close by."""
+    look_bias: float = -5.2
+    """Log-odds of a place where an entity is followed, were it as unlike its anchor as can be."""
+    jump_log_odds: float = -2.4
+    """The same elsewhere, less :attr:`look_bias`."""
+    hidden_s: float = 1.0
+    """For how long an entity stays occluded where it is, seconds."""
     correlated_s: float = 0.3
     """For how long evidence repeats itself, seconds."""
     rests_log_odds: float = 3.0

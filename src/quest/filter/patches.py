@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from quest.filter.local_motion import follow
+from quest.filter.picture import Picture
 
 _SIDE = 5
 _WIDTH_PX = 24.0
 _NEAR_PX = 5.0
-_ANCHOR_PX = 12
+_TILE_PX = 97
+_LOOK_PX = 25
 _LEAST_SUPPORT = 0.15
 _KERNEL_PX2 = 1.0
 
@@ -40,8 +41,8 @@ class PatchMotion:
 
 
 def patch_motion(
-    previous: UInt8[np.ndarray, "H W"],
-    grey: UInt8[np.ndarray, "H W"],
+    previous: Picture,
+    picture: Picture,
     uv_px: Float[np.ndarray, "K 2"],
     guess_px: Float[np.ndarray, "K 2"],
     share: Float[np.ndarray, "K P"] | None = None,
@@ -49,14 +50,14 @@ def patch_motion(
     """Follow the patch around each place.
 
     Args:
-        previous: grey values of the frame in which the places are.
-        grey: those of the frame they are looked for in.
+        previous: the frame in which the places are.
+        picture: the frame in which they are looked for.
         uv_px: places in ``previous``.
-        guess_px: where they are expected in ``grey``.
+        guess_px: where they are expected in ``picture``.
         share: how far each point of :data:`GRID_PX` belongs to what is followed, 0 to 1; all do by default.
     """
     start, guess = ((each[:, None] + GRID_PX).reshape(-1, 2) for each in (uv_px, guess_px))
-    motion = follow(previous, grey, start, guess)
+    motion = follow(previous, picture, start, guess)
     step = (motion.uv_px - start).reshape(len(uv_px), -1, 2)
     weight = _WEIGHT * motion.found.reshape(len(uv_px), -1)
     weight = weight if share is None else weight * share
@@ -84,11 +85,28 @@ def _heaviest(
     )
 
 
-def look(grey: UInt8[np.ndarray, "H W"], uv_px: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K S"]:
-    """Grey values around each place, of mean 0 and length 1: their products are normalised cross-correlations."""
-    side = 2 * _ANCHOR_PX + 1
-    image = grey.astype(np.float32)
-    around = [cv2.getRectSubPix(image, (side, side), (float(x) - 0.5, float(y) - 0.5)).ravel() for x, y in uv_px]
-    values = np.array(around, dtype=np.float64).reshape(len(uv_px), side * side)
+def tiles(picture: Picture, uv_px: Float[np.ndarray, "K 2"]) -> UInt8[np.ndarray, "K S S"]:
+    """What is around each place, with the place in the middle."""
+    return np.rint(picture.patches(uv_px, _TILE_PX)).astype(np.uint8)
+
+
+def tile_motion(tile: UInt8[np.ndarray, "K S S"], picture: Picture, guess_px: Float[np.ndarray, "K 2"]) -> PatchMotion:
+    """Find the middle of each tile again: how far it is from where it is expected.
+
+    Args:
+        tile: of :func:`tiles`, of any frames.
+        picture: the frame in which they are looked for.
+        guess_px: where they are expected.
+    """
+    middle = np.stack([(np.arange(len(tile)) + 0.5) * _TILE_PX, np.full(len(tile), _TILE_PX / 2)], axis=-1)
+    both = (tile, tiles(picture, guess_px))
+    before, now = (Picture(np.hstack(tuple(each)), picture.descriptors) for each in both)
+    return patch_motion(before, now, middle, middle)
+
+
+def look(tile: UInt8[np.ndarray, "K S S"]) -> Float[np.ndarray, "K P"]:
+    """Grey values in the middle, of mean 0 and length 1: their products are normalised cross-correlations."""
+    inner = slice((_TILE_PX - _LOOK_PX) // 2, (_TILE_PX + _LOOK_PX) // 2)
+    values = tile[:, inner, inner].reshape(len(tile), _LOOK_PX**2).astype(np.float64)
     values -= values.mean(axis=1, keepdims=True)
     return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-9)

@@ -65,7 +65,7 @@ class View:
         return (cam - self.cam_from_world[:3, 3]) @ self.cam_from_world[:3, :3]
 
 
-def in_image(uv_px: Float[np.ndarray, "N 2"], size: tuple[int, int]) -> Bool[np.ndarray, " N"]:
+def in_image(uv_px: Float[np.ndarray, "*N 2"], size: tuple[int, int]) -> Bool[np.ndarray, "*N"]:
     """Whether pixels are in an image of a width and height."""
     return np.asarray(((uv_px >= 0) & (uv_px <= size)).all(axis=-1))
 

@@ -1,0 +1,177 @@
+"""The posterior of each query: which body carries it, whether it is seen there, and whether it is elsewhere.
+
+Its places are where its own patch went, where each body brings it, and the places of the whole frame that are most
+like its anchor. At each it is *seen*, as appearance and depth say, or *occluded*; or it is at none of them. What is
+carried is told by how far the places are apart, by their evidence, and by what carries the points around.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from quest.filter.appearance import PATCH_PX, Likeness
+from quest.filter.landmarks import Landmarks
+from quest.filter.noise import Noise
+from quest.filter.picture import Picture
+from quest.filter.queries import GATE, SURE, Queries
+from quest.filter.surfaces import depth_error, depth_ratio
+from quest.filter.view import View, in_image, move, move_back
+
+_RIVALS = 3
+_SAME_PX = 24.0
+"""Places nearer to each other than this, in two frames, are said to be of one thing."""
+_OCCUPIED_PX = 12.0
+"""Within which of another query's place there is no room for one more."""
+_HALF, _HARDLY = float(np.log(0.5)), float(np.log(0.05))
+_MOST = 9.0
+"""Log-odds are kept within this."""
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where K queries may be: P places: their own patch first, then where each of B = P - 1 bodies brings them."""
+
+    uv_px: Float[np.ndarray, "K P 2"]
+    point_world: Float[np.ndarray, "K B 3"]
+    depth_m: Float[np.ndarray, "K B"]
+    possible: Bool[np.ndarray, "K B"]
+    """Whether a body can bring it anywhere: its place is known, and in front of the camera."""
+    seen: Float[np.ndarray, "K P"]
+    """Log-likelihood ratio of the evidence there if it is seen there, against it being nowhere."""
+    occluded: Float[np.ndarray, "K P"]
+    """The same if it is there and not seen, which is as probable before anything is measured."""
+    covered: Bool[np.ndarray, "K P"]
+    """Whether something is in front of that place, or it is out of view."""
+    agrees: Bool[np.ndarray, "K P"]
+    """Whether the depth is as predicted."""
+
+
+def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, dt_s: float, noise: Noise) -> Queries:
+    """Which hypotheses explain the frame; what is out of question begins anew at the best.
+
+    Args:
+        queries: with their own patches followed into the frame.
+        landmarks: of it.
+        picture: what it shows.
+        view: of it.
+        dt_s: time since the frame before, seconds.
+        noise: parameters.
+    """
+    likeness = Likeness.of(picture, queries.descriptor, queries.patch)
+    places = _places(queries, landmarks, likeness, view, noise)
+    apart = ((queries.own_px[:, None] - places.uv_px[:, 1:]) ** 2).sum(axis=-1)
+    near = queries.own_variance + noise.world_px**2
+    # Evidence repeats itself from frame to frame: however long it lasts, it counts once.
+    new = min(dt_s / noise.correlated_s, 1.0)
+    told = _carriers(queries, places, apart, near, landmarks, noise) - queries.log_odds
+    log_odds = queries.log_odds + np.where(places.possible, told, 0.0) * new
+    each, best = np.arange(len(queries)), log_odds.argmax(axis=1)
+    here = np.where((log_odds[each, best] > 0) & queries.known, best + 1, 0)
+    at_px, seen, occluded = places.uv_px[each, here], places.seen[each, here], places.occluded[each, here]
+    explained = places.covered[each, here]
+
+    rival_px, rival, others = _elsewhere(queries, at_px, likeness, noise)
+    # An occlusion that nothing explains does not last.
+    hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
+    stays = np.logaddexp(seen, hidden)
+    left = np.logaddexp(np.logaddexp(rival, others), np.where(explained, _HARDLY, _HALF))
+    same = ((rival_px - queries.rival_px) ** 2).sum(axis=-1) < _SAME_PX**2
+    rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
+    rival_log_odds += (rival - np.logaddexp(stays, others) - rival_log_odds) * new
+    seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
+    lost_log_odds = np.where(explained, left - stays, -seen_log_odds).clip(-_MOST, _MOST)
+
+    jumps = rival_log_odds > 0
+    far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near)
+    caught = places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
+    own_px = np.where(jumps[:, None], rival_px, np.where(caught[:, None], places.uv_px[each, best + 1], queries.own_px))
+    depth_m = view.near_depth_at(own_px)
+    left_all = (~queries.known | (log_odds[each, best] < -SURE)) & queries.own_found
+    anew = (jumps | left_all) & np.isfinite(depth_m)
+    point = np.repeat(view.lift(own_px, depth_m)[:, None], log_odds.shape[1], axis=1)
+    confirmed = (here > 0) & places.agrees[each, here] & (seen_log_odds > 0) & (log_odds[each, best] > SURE)
+    return replace(
+        _viewed(queries, confirmed, at_px, picture),
+        own_px=own_px,
+        own_variance=np.where(jumps, noise.anchor_px**2, np.where(caught, noise.world_px**2, queries.own_variance)),
+        own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
+        place=np.where(anew[:, None, None], move_back(landmarks.pose, point), queries.place),
+        log_odds=np.where(anew[:, None], 0.0, np.clip(log_odds, -SURE, SURE)),
+        seen_log_odds=np.where(jumps, rival_log_odds, seen_log_odds),
+        lost_log_odds=np.where(jumps, -rival_log_odds, lost_log_odds),
+        unseen_s=np.where(jumps | explained, 0.0, (queries.unseen_s + dt_s) / (1 + np.exp(seen_log_odds))),
+        rival_px=rival_px,
+        rival_log_odds=np.where(jumps, -SURE, rival_log_odds),
+    )
+
+
+def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: View, noise: Noise) -> _Places:
+    """What appearance and depth say at each place."""
+    count, bodies = queries.log_odds.shape
+    point = move(landmarks.pose, queries.place)
+    ride_px, depth_m = (each.reshape(count, bodies, *each.shape[1:]) for each in view.project(point.reshape(-1, 3)))
+    possible = np.asarray(np.isfinite(ride_px).all(axis=-1))
+    ride_px = np.where(possible[..., None], ride_px, queries.own_px[:, None])
+    uv_px = np.concatenate([queries.own_px[:, None], ride_px], axis=1)
+    inside = in_image(uv_px, likeness.picture.size)
+    off_m = view.near_depth_at(ride_px.reshape(-1, 2)).reshape(count, bodies) - depth_m
+    # Of its own patch nothing is predicted.
+    off_m = np.concatenate([np.full((count, 1), np.nan), off_m], axis=1)
+    spread_m = np.concatenate([np.ones((count, 1)), depth_error(depth_m, noise)], axis=1)
+    covered = off_m < -3 * spread_m
+    deep = np.where(covered, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
+    return _Places(
+        uv_px=uv_px,
+        point_world=point,
+        depth_m=depth_m,
+        possible=possible,
+        seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,
+        occluded=np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0) + _HALF,
+        covered=covered | ~inside,
+        agrees=abs(off_m) < spread_m,
+    )
+
+
+def _carriers(
+    queries: Queries,
+    places: _Places,
+    apart: Float[np.ndarray, "K B"],
+    near: Float[np.ndarray, " K"],
+    landmarks: Landmarks,
+    noise: Noise,
+) -> Float[np.ndarray, "K B"]:
+    """Log-odds of this frame that each body carries it, against that it goes with its patch."""
+    far = near + noise.moved_px**2
+    parted = apart / 2 * (1 / far - 1 / near)[:, None] + np.log(far / near)[:, None]
+    there = np.logaddexp(places.seen, places.occluded)
+    share = landmarks.share(places.point_world[np.arange(len(queries)), queries.body])
+    around = np.log(share + np.where(np.arange(share.shape[1]) > 0, 1e-3, 0.1))
+    told = np.where(queries.own_found[:, None], parted, 0.0) + there[:, 1:] - there[:, :1]
+    return noise.rests_log_odds + told + around
+
+
+def _elsewhere(
+    queries: Queries, at_px: Float[np.ndarray, "K 2"], likeness: Likeness, noise: Noise
+) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
+    """The most probable place elsewhere, its log-likelihood ratio against nowhere, and that of all other places."""
+    found = likeness.elsewhere(at_px, _RIVALS, noise)
+    taken = ((found.uv_px[:, :, None] - at_px) ** 2).sum(axis=-1) < _OCCUPIED_PX**2
+    free = 1 - (taken / (1 + np.exp(-queries.seen_log_odds))).max(axis=-1)
+    ratio = found.log_odds + noise.jump_log_odds + np.log(free)
+    each, first = np.arange(len(queries)), ratio.argmax(axis=1)
+    best = ratio[each, first]
+    ratio[each, first] = -np.inf
+    return found.uv_px[each, first], best, np.logaddexp.reduce(ratio, axis=1)
+
+
+def _viewed(
+    queries: Queries, confirmed: Bool[np.ndarray, " K"], at_px: Float[np.ndarray, "K 2"], picture: Picture
+) -> Queries:
+    """The newest view of what is seen, and where depth says that it is."""
+    descriptor, patch = queries.descriptor.copy(), queries.patch.copy()
+    descriptor[confirmed, 1] = picture.describe(at_px[confirmed])
+    patch[confirmed, 1] = picture.patches(at_px[confirmed], PATCH_PX)
+    return replace(queries, descriptor=descriptor, patch=patch)

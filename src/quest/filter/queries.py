@@ -1,0 +1,169 @@
+"""What is known of each query, and the motion of its own patch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, UInt8
+
+from quest.filter.appearance import PATCH_PX
+from quest.filter.noise import Noise
+from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
+from quest.filter.picture import Picture
+from quest.filter.surfaces import depth_error
+from quest.filter.view import View, move
+
+SURE = float(np.log(150.0))
+"""Log-odds beyond which a hypothesis is out of question."""
+GATE = 12.0
+"""Squared distance in standard deviations beyond which two places differ (chi-square, 0.25 %)."""
+
+
+@dataclass(frozen=True)
+class Queries:
+    """K queries, and B bodies that may carry them."""
+
+    anchor: UInt8[np.ndarray, "K S S"]
+    """What was around it when it was named."""
+    descriptor: Float[np.ndarray, "K 2 D"]
+    """Of the anchor, and of the newest view in which depth confirmed that it is seen where it rides."""
+    patch: Float[np.ndarray, "K 2 P P"]
+    """Grey values, likewise."""
+    own_px: Float[np.ndarray, "K 2"]
+    """Where its own patch went."""
+    own_variance: Float[np.ndarray, " K"]
+    """Pixels squared."""
+    own_depth: Float[np.ndarray, " K"]
+    """Its depth when it was seen last, metres; NaN if it never was."""
+    own_found: Bool[np.ndarray, " K"]
+    """Whether that patch was found in this frame, with nothing in front of it."""
+    place: Float[np.ndarray, "K B 3"]
+    """On each body, metres; NaN without depth."""
+    log_odds: Float[np.ndarray, "K B"]
+    """That each body carries it, against that it goes with its patch."""
+    seen_log_odds: Float[np.ndarray, " K"]
+    """That it is seen where it is followed."""
+    lost_log_odds: Float[np.ndarray, " K"]
+    """That it is not there."""
+    unseen_s: Float[np.ndarray, " K"]
+    """For how long it was not seen there, and nothing explains why, seconds."""
+    rival_px: Float[np.ndarray, "K 2"]
+    """The most probable place elsewhere."""
+    rival_log_odds: Float[np.ndarray, " K"]
+    """That it is there."""
+
+    @classmethod
+    def named(
+        cls,
+        picture: Picture,
+        uv_px: Float[np.ndarray, "K 2"],
+        depth_m: Float[np.ndarray, " K"],
+        place: Float[np.ndarray, "K B 3"],
+    ) -> Queries:
+        """Pixels of a frame that are named in it."""
+        count, bodies = place.shape[:2]
+        return cls(
+            anchor=tiles(picture, uv_px),
+            descriptor=picture.describe(uv_px)[:, None].repeat(2, axis=1),
+            patch=picture.patches(uv_px, PATCH_PX)[:, None].repeat(2, axis=1),
+            own_px=uv_px,
+            own_variance=np.full(count, 0.5),
+            own_depth=depth_m,
+            own_found=np.ones(count, dtype=bool),
+            place=place,
+            log_odds=np.zeros((count, bodies)),
+            seen_log_odds=np.full(count, SURE),
+            lost_log_odds=np.full(count, -SURE),
+            unseen_s=np.zeros(count),
+            rival_px=uv_px,
+            rival_log_odds=np.full(count, -SURE),
+        )
+
+    def __len__(self) -> int:
+        return len(self.anchor)
+
+    @property
+    def known(self) -> Bool[np.ndarray, " K"]:
+        """Whether its place is."""
+        return np.asarray(np.isfinite(self.place[:, 0]).all(axis=-1))
+
+    @property
+    def body(self) -> Int[np.ndarray, " K"]:
+        """The most probable carrier."""
+        return np.asarray(self.log_odds.argmax(axis=1))
+
+    @property
+    def rides(self) -> Bool[np.ndarray, " K"]:
+        """Whether it is more probable that a body carries it than that it goes with its patch."""
+        return (self.log_odds.max(axis=1) > 0) & self.known
+
+    def point_world(self, pose: Float[np.ndarray, "B 4 4"]) -> Float[np.ndarray, "K 3"]:
+        """Where each is on its most probable body."""
+        body = self.body
+        return move(pose[body], self.place[np.arange(len(body)), body])
+
+    def meet(self, bodies: int) -> Queries:
+        """A body that begins to move was part of the world: what rested there may ride on it."""
+        new = bodies - self.place.shape[1]
+        return replace(
+            self,
+            place=np.concatenate([self.place, np.repeat(self.place[:, :1], new, axis=1)], axis=1),
+            log_odds=np.concatenate([self.log_odds, np.repeat(self.log_odds[:, :1], new, axis=1)], axis=1),
+        )
+
+
+def follow_patches(
+    queries: Queries,
+    previous: Picture,
+    picture: Picture,
+    expected_px: Float[np.ndarray, "K 2"],
+    old: View,
+    view: View,
+    dt_s: float,
+    noise: Noise,
+) -> Queries:
+    """Where each query's own patch went: its motion since the previous frame, then the anchor's patch around there.
+
+    A Kalman filter: what is followed from frame to frame gathers variance, what the anchor finds takes it away.
+
+    Args:
+        queries: as they were in the previous frame.
+        previous: its picture.
+        picture: the new one.
+        expected_px: where the patches are expected there.
+        old: view of the previous frame.
+        view: of the new one.
+        dt_s: time between both, seconds.
+        noise: parameters.
+    """
+    motion = patch_motion(previous, picture, queries.own_px, expected_px, _of_surface(queries, old, noise))
+    depth_m = view.near_depth_at(queries.own_px + motion.step_px)
+    # Nothing comes nearer at once: what does is in front of it.
+    near_m = queries.own_depth - depth_m - noise.speed_m_s * dt_s
+    found = np.isfinite(motion.variance) & ~(near_m > 3 * depth_error(queries.own_depth, noise))
+    own_px = np.where(found[:, None], queries.own_px + motion.step_px, expected_px)
+    gathered = np.where(found, np.where(found, motion.variance, 0) + noise.chain_px2_s * dt_s, noise.blind_px2_s * dt_s)
+    variance = queries.own_variance + gathered
+    anchored = tile_motion(queries.anchor, picture, own_px)
+    at_px = own_px + anchored.step_px
+    total = variance + noise.anchor_px**2
+    alike = (look(tiles(picture, at_px)) * look(queries.anchor)).sum(axis=1)
+    seen = found & np.isfinite(anchored.variance) & (alike > noise.like_anchor)
+    seen &= ((at_px - own_px) ** 2).sum(axis=-1) < GATE * total
+    gain = np.where(seen, variance / total, 0.0)
+    return replace(
+        queries,
+        own_px=own_px + gain[:, None] * (at_px - own_px),
+        own_variance=(1 - gain) * variance,
+        own_depth=np.where(found & np.isfinite(depth_m), depth_m, queries.own_depth),
+        own_found=found,
+    )
+
+
+def _of_surface(queries: Queries, view: View, noise: Noise) -> Float[np.ndarray, "K P"]:
+    """How far the points of each patch are on the surface that is followed: as deep as it, or of unknown depth."""
+    grid = (queries.own_px[:, None] + GRID_PX).reshape(-1, 2)
+    depth_m = view.depth_at(grid)[0].reshape(len(queries), -1)
+    off = (depth_m - queries.own_depth[:, None]) / (noise.relief_m + depth_error(queries.own_depth, noise)[:, None])
+    return np.where(np.isfinite(off), np.exp(-(off**2) / 2), 1.0)
