@@ -20,7 +20,9 @@ from quest.filter.picture import Picture
 
 PATCH_PX = 13
 _REACH_CELLS = 3
-_CELL_REACH_PX = 6
+_REACH_PX = 4
+CELL_REACH_PX = 6
+"""How far from the middle of a cell a place is looked for in it."""
 _SHORT = 0.02
 """How near to one a likeness is told apart from one."""
 
@@ -43,20 +45,26 @@ class Likeness:
         cosine = np.einsum("kvd,dhw->kvhw", descriptor, picture.descriptors, optimize=True)
         return cls(picture, cosine.max(axis=1), patch)
 
-    def at(self, uv_px: Float[np.ndarray, "K C 2"], noise: Noise, reach_px: int = 4) -> Places:
-        """C places of each query.
+    def at(self, uv_px: Float[np.ndarray, "K C 2"], noise: Noise, reach_px: int = _REACH_PX) -> Places:
+        """How like the anchor C places of each query are.
 
         Args:
             uv_px: pixels.
             noise: parameters.
             reach_px: how far off the best correlation may be.
         """
+        best_px, wide, near = self.terms(uv_px, reach_px)
+        return Places(best_px, noise.look_bias + noise.look_wide * wide + noise.look_near * near)
+
+    def terms(
+        self, uv_px: Float[np.ndarray, "K C 2"], reach_px: int = _REACH_PX
+    ) -> tuple[Float[np.ndarray, "K C 2"], Float[np.ndarray, "K C"], Float[np.ndarray, "K C"]]:
+        """Where the correlation is best, and the logarithms of what the cosine and it fall short of one, negative."""
         count, places = uv_px.shape[:2]
         rows, columns = self.cosine.shape[1:]
-        near = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in self.cosine])
+        around = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in self.cosine])
         cell = np.floor(uv_px / self.picture.cell_px).astype(np.int64).clip(0, (columns - 1, rows - 1))
-        cosine = near[np.arange(count)[:, None], cell[..., 1], cell[..., 0]]
-        around = self.picture.patches(uv_px.reshape(-1, 2), PATCH_PX + 2 * reach_px)
+        cosine = around[np.arange(count)[:, None], cell[..., 1], cell[..., 0]]
         best = [
             max(
                 (
@@ -65,28 +73,30 @@ class Likeness:
                 ),
                 key=lambda found: found[1],
             )
-            for i, each in enumerate(around)
+            for i, each in enumerate(self.picture.patches(uv_px.reshape(-1, 2), PATCH_PX + 2 * reach_px))
         ]
         correlation = np.array([each[1] for each in best]).reshape(count, places)
         shift = np.array([each[3] for each in best], dtype=np.float64).reshape(count, places, 2) - reach_px
-        score = noise.look_bias - noise.look_wide * np.log(1 + _SHORT - cosine)
-        score -= noise.look_near * np.log(1 + _SHORT - np.clip(correlation, -1, 1))
-        return Places(uv_px + shift, score)
+        wide, near = (-np.log(1 + _SHORT - each.clip(-1, 1)) for each in (cosine.astype(np.float64), correlation))
+        return uv_px + shift, wide, near
 
-    def elsewhere(self, uv_px: Float[np.ndarray, "K 2"], count: int, noise: Noise) -> Places:
-        """The places most like the anchor, none of them near where it is followed, or near another."""
+    def elsewhere_px(self, uv_px: Float[np.ndarray, "K 2"], count: int) -> Float[np.ndarray, "K C 2"]:
+        """The cells most like the anchor, none of them near where it is followed, or near another."""
         cosine, cells = self.cosine.copy(), []
         rows, columns = cosine.shape[1:]
         at = np.floor(uv_px / self.picture.cell_px).astype(np.int64).clip(0, (columns - 1, rows - 1))
         row, column = np.arange(rows)[None, :, None], np.arange(columns)[None, None]
         for _ in range(count):
-            here = (abs(row - at[:, 1, None, None]) <= _REACH_CELLS) & (
-                abs(column - at[:, 0, None, None]) <= _REACH_CELLS
-            )
-            cosine[here] = -1
+            off = np.maximum(abs(row - at[:, 1, None, None]), abs(column - at[:, 0, None, None]))
+            cosine[off <= _REACH_CELLS] = -1
             at = np.stack(np.unravel_index(cosine.reshape(len(at), -1).argmax(axis=1), (rows, columns))[::-1], axis=-1)
             cells.append((at + 0.5) * self.picture.cell_px)
-        return self.at(np.stack(cells, axis=1), noise, _CELL_REACH_PX)
+        return np.stack(cells, axis=1)
+
+    def elsewhere(self, uv_px: Float[np.ndarray, "K 2"], count: int, noise: Noise) -> Places:
+        """How like the anchor the likest places elsewhere are."""
+        found = self.at(self.elsewhere_px(uv_px, count), noise, CELL_REACH_PX)
+        return Places(found.uv_px, found.log_odds + noise.jump_log_odds)
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ class Noise:
     """Error of where an entity that rests is seen: of the camera's pose and of the depth, pixels."""
     moved_px: float = 60.0
     """How far from there an entity that moves is seen, pixels."""
-    look_wide: float = 3.13
+    look_wide: float = 3.28
     """Weight of the likeness of descriptors."""
-    look_near: float = 0.52
+    look_near: float = 0.76
     """Weight of the likeness of the grey values close by."""
-    look_bias: float = -5.2
+    look_bias: float = -5.52
     """Log-odds of a place where an entity is followed, were it as unlike its anchor as can be."""
-    jump_log_odds: float = -2.4
+    jump_log_odds: float = -2.52
     """The same elsewhere, less :attr:`look_bias`."""
     hidden_s: float = 1.0
     """For how long an entity stays occluded where it is, seconds."""

@@ -20,7 +20,8 @@ from quest.filter.queries import GATE, SURE, Queries
 from quest.filter.surfaces import depth_error, depth_ratio
 from quest.filter.view import View, in_image, move, move_back
 
-_RIVALS = 3
+RIVALS = 3
+"""Places elsewhere that are weighed."""
 _SAME_PX = 24.0
 """Places nearer to each other than this, in two frames, are said to be of one thing."""
 _OCCUPIED_PX = 12.0
@@ -157,10 +158,10 @@ def _elsewhere(
     queries: Queries, at_px: Float[np.ndarray, "K 2"], likeness: Likeness, noise: Noise
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
     """The most probable place elsewhere, its log-likelihood ratio against nowhere, and that of all other places."""
-    found = likeness.elsewhere(at_px, _RIVALS, noise)
+    found = likeness.elsewhere(at_px, RIVALS, noise)
     taken = ((found.uv_px[:, :, None] - at_px) ** 2).sum(axis=-1) < _OCCUPIED_PX**2
     free = 1 - (taken / (1 + np.exp(-queries.seen_log_odds))).max(axis=-1)
-    ratio = found.log_odds + noise.jump_log_odds + np.log(free)
+    ratio = found.log_odds + np.log(free)
     each, first = np.arange(len(queries)), ratio.argmax(axis=1)
     best = ratio[each, first]
     ratio[each, first] = -np.inf
