@@ -81,14 +81,23 @@ class Landmarks:
         """Where each is, if its most probable body carries it."""
         return move(self.pose[self.body], self.place[np.arange(len(self.body)), self.body])
 
-    def share(self, point_world: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K B"]:
-        """Share of each body in the points near some places of the world."""
-        known = np.flatnonzero(np.isfinite(self.point_world).all(axis=-1))
+    @property
+    def rest(self) -> Float[np.ndarray, "N 3"]:
+        """Where each was before its most probable body moved, metres."""
+        return self.place[np.arange(len(self.body)), self.body]
+
+    def share(self, point: Float[np.ndarray, "K 3"], around: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K B"]:
+        """Share of each body in the points near some places.
+
+        Args:
+            point: the places, metres.
+            around: where the landmarks are: :attr:`rest`, or :attr:`point_world` for what is seen for the first time.
+        """
+        known = np.flatnonzero(np.isfinite(around).all(axis=-1))
         if len(known) <= _NEIGHBOURS:
-            return np.full((len(point_world), len(self.pose)), 1 / len(self.pose))
-        asked = np.asarray(np.isfinite(point_world).all(axis=-1))
-        tree = KDTree(self.point_world[known])
-        apart, index = tree.query(np.where(asked[:, None], point_world, 0.0), _NEIGHBOURS + 1)
+            return np.full((len(point), len(self.pose)), 1 / len(self.pose))
+        asked = np.asarray(np.isfinite(point).all(axis=-1))
+        apart, index = KDTree(around[known]).query(np.where(asked[:, None], point, 0.0), _NEIGHBOURS + 1)
         near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
         member = np.eye(len(self.pose))[self.body] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
         total = np.einsum("mn,mnb->mb", near, member[known][index]) * asked[:, None] + 1e-9
@@ -182,10 +191,10 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
         depth_error(depth_m, noise),
     )
     told = (GATE - np.minimum(_misfits(landmarks, seen, view), 3 * GATE)) / 2
-    told += np.log(landmarks.share(landmarks.point_world) + noise.stray)
+    told += np.log(landmarks.share(landmarks.point_world, landmarks.point_world) + noise.stray)
     weight = landmarks.log_weight + (told - landmarks.log_weight) * min(dt_s / noise.points_s, 1.0)
     body = np.where(told.max(axis=1) > 0, weight.argmax(axis=1), -1)
-    near = landmarks.share(landmarks.surfaces.point_world(landmarks.pose))
+    near = landmarks.share(landmarks.surfaces.rest, landmarks.rest)
     surfaces = measure(landmarks.surfaces, landmarks.pose, near, view, dt_s, noise)
     bodies = landmarks.bodies
     for b in range(1, len(bodies)):
@@ -307,7 +316,7 @@ def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noi
     ray = point - view.centre
     error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * depth_error(depth_m, noise)[:, None]
     bodies = len(landmarks.pose)
-    share = landmarks.share(point) if len(landmarks.uv_px) else np.full((len(uv_px), bodies), 1 / bodies)
+    share = landmarks.share(point, landmarks.point_world) if len(landmarks.uv_px) else np.full((len(uv_px), bodies), 1 / bodies)
     place = move_back(landmarks.pose, np.repeat(point[:, None], bodies, axis=1))
     return replace(
         landmarks,

@@ -26,6 +26,7 @@ _SAME_PX = 24.0
 """Places nearer to each other than this, in two frames, are said to be of one thing."""
 _OCCUPIED_PX = 12.0
 """Within which of another query's place there is no room for one more."""
+_TOGETHER_PX = 2.0
 _HALF, _HARDLY = float(np.log(0.5)), float(np.log(0.05))
 _MOST = 9.0
 """Log-odds are kept within this."""
@@ -87,13 +88,15 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
 
     jumps = rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near)
-    caught = places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
+    caught = (here > 0) & places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
     own_px = np.where(jumps[:, None], rival_px, np.where(caught[:, None], places.uv_px[each, best + 1], queries.own_px))
     depth_m = view.near_depth_at(own_px)
     left_all = (~queries.known | (log_odds[each, best] < -SURE)) & queries.own_found
     anew = (jumps | left_all) & np.isfinite(depth_m)
     point = np.repeat(view.lift(own_px, depth_m)[:, None], log_odds.shape[1], axis=1)
-    confirmed = (here > 0) & places.agrees[each, here] & (seen_log_odds > 0) & (log_odds[each, best] > SURE)
+    # A view is taken where its own patch went where the body went, and depth is as predicted.
+    together = queries.own_found & (apart[each, best] < _TOGETHER_PX**2)
+    confirmed = (here > 0) & together & places.agrees[each, here] & (seen_log_odds > 0)
     return replace(
         _viewed(queries, confirmed, at_px, picture),
         own_px=own_px,
@@ -148,7 +151,7 @@ def _carriers(
     far = near + noise.moved_px**2
     parted = apart / 2 * (1 / far - 1 / near)[:, None] + np.log(far / near)[:, None]
     there = np.logaddexp(places.seen, places.occluded)
-    share = landmarks.share(places.point_world[np.arange(len(queries)), queries.body])
+    share = landmarks.share(queries.place[np.arange(len(queries)), queries.body], landmarks.rest)
     around = np.log(share + np.where(np.arange(share.shape[1]) > 0, 1e-3, 0.1))
     told = np.where(queries.own_found[:, None], parted, 0.0) + there[:, 1:] - there[:, :1]
     return noise.rests_log_odds + told + around

@@ -44,6 +44,11 @@ class Surfaces:
         return move(pose[self.body], self.place[np.arange(len(self.body)), self.body])
 
     @property
+    def rest(self) -> Float[np.ndarray, "M 3"]:
+        """Where each was before its most probable body moved, metres."""
+        return self.place[np.arange(len(self.body)), self.body]
+
+    @property
     def body(self) -> Int[np.ndarray, " M"]:
         """The most probable carrier of each point."""
         return np.asarray(self.log_weight.argmax(axis=1))
