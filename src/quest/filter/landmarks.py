@@ -154,8 +154,7 @@ def observe(
         after = replace(old, cam_from_world=estimate.cam_from_world)
         known = stands_still(moved.place[rests, 0], moved.uv_px[rests], old, after)
         if not known:
-            agree = moved.only(np.flatnonzero(rests)[estimate.inlier])
-            pose = after.cam_from_world if depth_m is None else _refined(agree, replace(after, depth_m=depth_m), noise)
+            pose = after.cam_from_world
             refuted = rests.copy()
             refuted[rests] = ~estimate.inlier
             moved = moved.only(~refuted)
@@ -163,18 +162,6 @@ def observe(
     if depth_m is not None:
         moved = _observe_bodies(moved, view, known, dt_s, noise)
     return moved, CameraMotion(pose, warp)
-
-
-def _refined(landmarks: Landmarks, view: View, noise: Noise) -> Float[np.ndarray, "4 4"]:
-    """The camera's pose by depth as well: how the still world moves before it is the camera's motion reversed."""
-    depth_m, flat = view.depth_at(landmarks.uv_px)
-    spread = landmarks.covariance + noise.point_px**2 * np.eye(2)
-    seen = Seen(landmarks.uv_px, np.where(flat, depth_m, np.nan), spread, depth_error(depth_m, noise))
-    nowhere = Surface(np.zeros((0, 3)), np.zeros((0, 3)))
-    point, free = landmarks.place[:, 0], 1e-6 * np.eye(6)
-    nothing = np.zeros(6), np.zeros((6, 6))
-    moved = fit(point, seen, nowhere, view, np.eye(4), point.mean(axis=0), free, nothing, noise)
-    return view.cam_from_world @ moved.pose
 
 
 def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
@@ -316,7 +303,11 @@ def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noi
     ray = point - view.centre
     error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * depth_error(depth_m, noise)[:, None]
     bodies = len(landmarks.pose)
-    share = landmarks.share(point, landmarks.point_world) if len(landmarks.uv_px) else np.full((len(uv_px), bodies), 1 / bodies)
+    share = (
+        landmarks.share(point, landmarks.point_world)
+        if len(landmarks.uv_px)
+        else np.full((len(uv_px), bodies), 1 / bodies)
+    )
     place = move_back(landmarks.pose, np.repeat(point[:, None], bodies, axis=1))
     return replace(
         landmarks,

@@ -20,6 +20,8 @@ from quest.filter.picture import WINDOW_PX, Picture
 from quest.filter.view import in_image
 
 _LEVELS = 4
+_ENOUGH = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.01)
+"""Steps on each level of the pyramid, and pixels below which one is the last."""
 _BACK_PX = 1.5
 _LEAST_LIKE = 0.3
 """Correlation of the patch in both frames below which it is noise that was followed."""
@@ -78,6 +80,7 @@ def _flow(
         guess,
         winSize=(WINDOW_PX, WINDOW_PX),
         maxLevel=_LEVELS,
+        criteria=_ENOUGH,
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     end = np.asarray(there, dtype=np.float64)[:, 0] + 0.5
