@@ -76,10 +76,13 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     explained = places.covered[each, here]
 
     rival_px, rival, others = _elsewhere(queries, at_px, likeness, noise)
+    # What is out of view, or behind something, is still there: then hardly anything speaks for elsewhere.
+    elsewhere = np.where(explained, _HARDLY, _HALF)
+    rival, others = (each + elsewhere - _HALF for each in (rival, others))
     # An occlusion that nothing explains does not last.
     hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
     stays = np.logaddexp(seen, hidden)
-    left = np.logaddexp(np.logaddexp(rival, others), np.where(explained, _HARDLY, _HALF))
+    left = np.logaddexp(np.logaddexp(rival, others), elsewhere)
     same = ((rival_px - queries.rival_px) ** 2).sum(axis=-1) < _SAME_PX**2
     rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
     rival_log_odds += (rival - np.logaddexp(stays, others) - rival_log_odds) * new
