@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from quest.filter.appearance import PATCH_PX, Likeness
 from quest.filter.landmarks import Landmarks
@@ -27,6 +27,7 @@ _SAME_PX = 24.0
 _OCCUPIED_PX = 12.0
 """Within which of another query's place there is no room for one more."""
 _TOGETHER_PX = 2.0
+"""How far apart its own patch and its body's place are where both saw the same view of it."""
 _HALF, _HARDLY = float(np.log(0.5)), float(np.log(0.05))
 _MOST = 9.0
 """Log-odds are kept within this."""
@@ -37,7 +38,6 @@ class _Places:
     """Where K queries may be: P places: their own patch first, then where each of B = P - 1 bodies brings them."""
 
     uv_px: Float[np.ndarray, "K P 2"]
-    point_world: Float[np.ndarray, "K B 3"]
     depth_m: Float[np.ndarray, "K B"]
     possible: Bool[np.ndarray, "K B"]
     """Whether a body can bring it anywhere: its place is known, and in front of the camera."""
@@ -71,47 +71,59 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     told = _carriers(queries, places, apart, near, landmarks, noise) - queries.log_odds
     log_odds = queries.log_odds + np.where(places.possible, told, 0.0) * new
     each, best = np.arange(len(queries)), log_odds.argmax(axis=1)
-    here = np.where((log_odds[each, best] > 0) & queries.known, best + 1, 0)
-    at_px, seen, occluded = places.uv_px[each, here], places.seen[each, here], places.occluded[each, here]
-    explained = places.covered[each, here]
+    rides = (log_odds[each, best] > 0) & queries.known
+    here = np.where(rides, best + 1, 0)
+    at_px = places.uv_px[each, here]
+    judged = _judged(queries, places, here, likeness, dt_s, noise)
 
-    rival_px, rival, others = _elsewhere(queries, at_px, likeness, noise)
-    # What is out of view, or behind something, is still there: then hardly anything speaks for elsewhere.
-    elsewhere = np.where(explained, _HARDLY, _HALF)
-    rival, others = (each + elsewhere - _HALF for each in (rival, others))
-    # An occlusion that nothing explains does not last.
-    hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
-    stays = np.logaddexp(seen, hidden)
-    left = np.logaddexp(np.logaddexp(rival, others), elsewhere)
-    same = ((rival_px - queries.rival_px) ** 2).sum(axis=-1) < _SAME_PX**2
-    rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
-    rival_log_odds += (rival - np.logaddexp(stays, others) - rival_log_odds) * new
-    seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
-    lost_log_odds = np.where(explained, left - stays, -seen_log_odds).clip(-_MOST, _MOST)
-
-    jumps = rival_log_odds > 0
+    jumps = judged.rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near)
-    caught = (here > 0) & places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
-    own_px = np.where(jumps[:, None], rival_px, np.where(caught[:, None], places.uv_px[each, best + 1], queries.own_px))
+    caught = rides & places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
+    own_px = np.where(jumps[:, None], judged.rival_px, np.where(caught[:, None], at_px, queries.own_px))
     depth_m = view.near_depth_at(own_px)
     left_all = (~queries.known | (log_odds[each, best] < -SURE)) & queries.own_found
     anew = (jumps | left_all) & np.isfinite(depth_m)
     point = np.repeat(view.lift(own_px, depth_m)[:, None], log_odds.shape[1], axis=1)
-    # A view is taken where its own patch went where the body went, and depth is as predicted.
     together = queries.own_found & (apart[each, best] < _TOGETHER_PX**2)
-    confirmed = (here > 0) & together & places.agrees[each, here] & (seen_log_odds > 0)
+    confirmed = rides & together & places.agrees[each, here] & (judged.seen_log_odds > 0)
     return replace(
-        _viewed(queries, confirmed, at_px, picture),
+        _viewed(judged, confirmed, at_px, picture),
         own_px=own_px,
         own_variance=np.where(jumps, noise.anchor_px**2, np.where(caught, noise.world_px**2, queries.own_variance)),
         own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
         place=np.where(anew[:, None, None], move_back(landmarks.pose, point), queries.place),
         log_odds=np.where(anew[:, None], 0.0, np.clip(log_odds, -SURE, SURE)),
-        seen_log_odds=np.where(jumps, rival_log_odds, seen_log_odds),
-        lost_log_odds=np.where(jumps, -rival_log_odds, lost_log_odds),
-        unseen_s=np.where(jumps | explained, 0.0, (queries.unseen_s + dt_s) / (1 + np.exp(seen_log_odds))),
+        seen_log_odds=np.where(jumps, judged.rival_log_odds, judged.seen_log_odds),
+        lost_log_odds=np.where(jumps, -judged.rival_log_odds, judged.lost_log_odds),
+        unseen_s=np.where(jumps, 0.0, judged.unseen_s),
+        rival_log_odds=np.where(jumps, -SURE, judged.rival_log_odds),
+    )
+
+
+def _judged(
+    queries: Queries, places: _Places, here: Int[np.ndarray, " K"], likeness: Likeness, dt_s: float, noise: Noise
+) -> Queries:
+    """Whether each query is seen at its most probable place, occluded there, elsewhere, or nowhere in the frame."""
+    each = np.arange(len(queries))
+    seen, occluded, explained = (value[each, here] for value in (places.seen, places.occluded, places.covered))
+    rival_px, rival, others = _elsewhere(queries, places.uv_px[each, here], likeness, noise)
+    # What is out of view, or behind something, is still there: then hardly anything speaks for elsewhere.
+    elsewhere = np.where(explained, _HARDLY, _HALF)
+    rival, others = (ratio + elsewhere - _HALF for ratio in (rival, others))
+    # An occlusion that nothing explains does not last.
+    hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
+    stays, left = np.logaddexp(seen, hidden), np.logaddexp(np.logaddexp(rival, others), elsewhere)
+    same = ((rival_px - queries.rival_px) ** 2).sum(axis=-1) < _SAME_PX**2
+    rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
+    told = rival - np.logaddexp(stays, others) - rival_log_odds
+    seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
+    return replace(
+        queries,
+        seen_log_odds=seen_log_odds,
+        lost_log_odds=np.where(explained, left - stays, -seen_log_odds).clip(-_MOST, _MOST),
+        unseen_s=np.where(explained, 0.0, (queries.unseen_s + dt_s) / (1 + np.exp(seen_log_odds))),
         rival_px=rival_px,
-        rival_log_odds=np.where(jumps, -SURE, rival_log_odds),
+        rival_log_odds=rival_log_odds + told * min(dt_s / noise.correlated_s, 1.0),
     )
 
 
@@ -132,7 +144,6 @@ def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: Vi
     deep = np.where(covered, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
     return _Places(
         uv_px=uv_px,
-        point_world=point,
         depth_m=depth_m,
         possible=possible,
         seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,
