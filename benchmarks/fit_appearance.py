@@ -83,7 +83,7 @@ class FitAppearance:
         chosen = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), self.frames)).astype(int))
         pictures = {i: self.tracker.picture(clip.rgb[i]) for i in chosen}
         matrix = clip.camera.matrix.astype(np.float64)
-        views = {i: View(matrix, (f := clip.frame(i)).cam_from_world, f.depth_m) for i in chosen}
+        views = {i: View(matrix, (f := clip.frame(int(i))).cam_from_world, f.depth_m) for i in chosen}
         made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
         for a in chosen[::5]:
             uv_px = corners(pictures[a], np.ones(pictures[a].grey.shape, dtype=bool), cell_px=30, count=60)

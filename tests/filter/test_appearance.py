@@ -77,3 +77,17 @@ def test_a_query_that_was_left_behind_is_found_again(tracker: Filtered) -> None:
     np.testing.assert_allclose(tracks.uv_px[-1, 1], [145.0, 20.0], atol=1)
     assert tracks.lost_p is not None
     assert tracks.lost_p[-1, 0] < 0.1
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_what_is_out_of_view_is_neither_visible_nor_elsewhere(tracker: Filtered, depth: bool) -> None:
+    camera_m = np.concatenate([np.linspace(0, 1.4, 24), np.full(6, 1.4), np.linspace(1.4, 0, 24)])
+    tracks = tracker.track(scene(camera_m, depth=depth), [Query.point(0, 70.0, 60.0)])
+    out = 70.0 - 150.0 * camera_m / 2.0 < -2
+    assert out.sum() > 15
+    assert not tracks.visible[out, 0].any()
+    if depth:
+        assert tracks.lost_p is not None
+        assert np.median(tracks.lost_p[out, 0]) < 0.5
+        assert tracks.visible[-3:, 0].all()
+        np.testing.assert_allclose(tracks.uv_px[-1, 0], [70.0, 60.0], atol=1.5)
