@@ -43,7 +43,8 @@ LAGS = pytest.mark.xfail(
     ("stride", "depth"),
     [
         *((stride, False) for stride in (1, 2, 3)),
-        *(pytest.param(stride, True, marks=LAGS) for stride in (1, 2)),
+        pytest.param(1, True, marks=LAGS),
+        (2, True),
         (3, True),
     ],
 )

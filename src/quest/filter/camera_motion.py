@@ -82,7 +82,9 @@ def stands_still(
     off = [((view.project(point_world)[0] - uv_px) ** 2).sum(axis=-1) for view in (before, after)]
     kept = [np.nan_to_num(each, nan=np.inf).clip(max=INLIER_PX**2) for each in off]
     variance = max(float(np.median(kept[1])) / np.log(4), _LEAST_PX**2)
-    return bool((kept[0].sum() - kept[1].sum()) / variance < 6 * np.log(len(uv_px)))
+    # What fits most points worse follows something that moves.
+    worse = float(np.median(kept[1])) > float(np.median(kept[0]))
+    return worse or bool((kept[0].sum() - kept[1].sum()) / variance < 6 * np.log(len(uv_px)))
 
 
 def picture_motion(from_px: Float[np.ndarray, "N 2"], to_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "3 3"]:

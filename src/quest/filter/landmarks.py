@@ -166,16 +166,16 @@ def observe(
 
 def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
     """The pose of each moving body, and which of them carries each point."""
-    depth_m, flat = view.depth_at(landmarks.uv_px)
+    depth_m, error_m = _depth(view, landmarks.uv_px, noise)
     # Poses, lenses and stamps err too: the world's points say by how much they do here (median of chi-square: ln 4).
     rests, _ = view.project(landmarks.place[landmarks.body == 0, 0])
     off = ((rests - landmarks.uv_px[landmarks.body == 0]) ** 2).sum(axis=-1)
     spread = max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) if len(off) else noise.point_px**2
     seen = Seen(
         landmarks.uv_px,
-        np.where(flat, depth_m, np.nan),
+        depth_m,
         landmarks.covariance + spread * np.eye(2),
-        depth_error(depth_m, noise),
+        error_m,
     )
     told = (GATE - np.minimum(_misfits(landmarks, seen, view), 3 * GATE)) / 2
     told += np.log(landmarks.share(landmarks.point_world, landmarks.point_world) + noise.stray)
@@ -295,13 +295,22 @@ def sow(
     return _born(landmarks, np.concatenate(new), view, noise)
 
 
-def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noise: Noise) -> Landmarks:
+def _depth(
+    view: View, uv_px: Float[np.ndarray, "N 2"], noise: Noise
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Depth and its error: at an edge of the nearer surface, to which the edge belongs, give or take the relief."""
     depth_m, flat = view.depth_at(uv_px)
+    depth_m = np.where(flat, depth_m, view.near_depth_at(uv_px))
+    return depth_m, np.where(flat, depth_error(depth_m, noise), noise.relief_m)
+
+
+def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noise: Noise) -> Landmarks:
+    depth_m, error_m = _depth(view, uv_px, noise)
     if view.depth_m is not None:
-        uv_px, depth_m = uv_px[flat], depth_m[flat]
+        uv_px, depth_m, error_m = (each[np.isfinite(depth_m)] for each in (uv_px, depth_m, error_m))
     point = view.lift(uv_px, depth_m)
     ray = point - view.centre
-    error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * depth_error(depth_m, noise)[:, None]
+    error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * error_m[:, None]
     bodies = len(landmarks.pose)
     share = (
         landmarks.share(point, landmarks.point_world)
