@@ -71,7 +71,9 @@ def stands_still(
     before: View,
     after: View,
 ) -> bool:
-    """Whether a new pose explains points no better than the old one: by less than six parameters may (Schwarz, 1978).
+    """Whether a new pose explains points no better than the old one.
+
+    It must fit most points at least as well, and all of them by more than six parameters may (Schwarz, 1978).
 
     Args:
         point_world: metres.

@@ -79,7 +79,7 @@ class Landmarks:
     @property
     def point_world(self) -> Float[np.ndarray, "N 3"]:
         """Where each is, if its most probable body carries it."""
-        return move(self.pose[self.body], self.place[np.arange(len(self.body)), self.body])
+        return move(self.pose[self.body], self.rest)
 
     @property
     def rest(self) -> Float[np.ndarray, "N 3"]:
@@ -271,7 +271,7 @@ def sow(
     around_px: Float[np.ndarray, "K 2"],
     noise: Noise,
 ) -> Landmarks:
-    """Add corners where there are none, closer together around some places; with depth only where it has no edge.
+    """Add corners where there are none, closer together around some places; with depth only where there is any.
 
     Args:
         landmarks: of this frame.
@@ -312,11 +312,7 @@ def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noi
     ray = point - view.centre
     error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * error_m[:, None]
     bodies = len(landmarks.pose)
-    share = (
-        landmarks.share(point, landmarks.point_world)
-        if len(landmarks.uv_px)
-        else np.full((len(uv_px), bodies), 1 / bodies)
-    )
+    share = landmarks.share(point, landmarks.point_world)
     place = move_back(landmarks.pose, np.repeat(point[:, None], bodies, axis=1))
     return replace(
         landmarks,

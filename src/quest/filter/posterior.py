@@ -35,7 +35,7 @@ _MOST = 9.0
 
 @dataclass(frozen=True)
 class _Places:
-    """Where K queries may be: P places: their own patch first, then where each of B = P - 1 bodies brings them."""
+    """P places where each of K queries may be: its own patch first, then where each of B = P - 1 bodies brings it."""
 
     uv_px: Float[np.ndarray, "K P 2"]
     depth_m: Float[np.ndarray, "K B"]
@@ -165,7 +165,7 @@ def _carriers(
     far = near + noise.moved_px**2
     parted = apart / 2 * (1 / far - 1 / near)[:, None] + np.log(far / near)[:, None]
     there = np.logaddexp(places.seen, places.occluded)
-    share = landmarks.share(queries.place[np.arange(len(queries)), queries.body], landmarks.rest)
+    share = landmarks.share(queries.rest, landmarks.rest)
     around = np.log(share + np.where(np.arange(share.shape[1]) > 0, 1e-3, 0.1))
     told = np.where(queries.own_found[:, None], parted, 0.0) + there[:, 1:] - there[:, :1]
     return noise.rests_log_odds + told + around

@@ -98,10 +98,14 @@ class Queries:
         """Whether it is more probable that a body carries it than that it goes with its patch."""
         return (self.log_odds.max(axis=1) > 0) & self.known
 
+    @property
+    def rest(self) -> Float[np.ndarray, "K 3"]:
+        """Where each was before its most probable body moved, metres."""
+        return self.place[np.arange(len(self.body)), self.body]
+
     def point_world(self, pose: Float[np.ndarray, "B 4 4"]) -> Float[np.ndarray, "K 3"]:
         """Where each is on its most probable body."""
-        body = self.body
-        return move(pose[body], self.place[np.arange(len(body)), body])
+        return move(pose[self.body], self.rest)
 
     def meet(self, bodies: int) -> Queries:
         """A body that begins to move was part of the world: what rested there may ride on it."""

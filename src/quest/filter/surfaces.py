@@ -41,7 +41,7 @@ class Surfaces:
 
     def point_world(self, pose: Float[np.ndarray, "B 4 4"]) -> Float[np.ndarray, "M 3"]:
         """Where each is, if its most probable body carries it."""
-        return move(pose[self.body], self.place[np.arange(len(self.body)), self.body])
+        return move(pose[self.body], self.rest)
 
     @property
     def rest(self) -> Float[np.ndarray, "M 3"]:
