@@ -14,18 +14,14 @@ from quest.paper.objective import LOSSES as PAPER_LOSSES
 from quest.train.objective import LOSSES
 from quest.train.settings import WindowConfig
 
-TableName = Literal["parts", "window", "slots", "losses", "design", "data"]
+TableName = Literal["parts", "window", "slots", "losses"]
 PresetName = Literal["default", "paper"]
-TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "design", "data")
+TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses")
 
 LOSSES_3D = ("point", "vel", "acc", "geo", "joint")
 """Losses that know of 3D; the others are of pixels, features and confidences."""
 
-LOSSES_OF: dict[PresetName, tuple[str, ...]] = {
-    "default": tuple(name for name in LOSSES if name != "bound"),  # a heatmap's coordinates cannot leave the image
-    "paper": tuple(PAPER_LOSSES),
-}
-"""Losses that are not zero by construction."""
+LOSSES_OF: dict[PresetName, tuple[str, ...]] = {"default": tuple(LOSSES), "paper": tuple(PAPER_LOSSES)}
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,6 @@ class Variant:
         windows: how windows are drawn.
         flow: whether stage 2 trains a flow head.
         no_depth: whether it never sees depth.
-        sources: of the takes that teach it; None for all.
     """
 
     name: str
@@ -48,7 +43,6 @@ class Variant:
     windows: WindowConfig = field(default_factory=WindowConfig)
     flow: bool = False
     no_depth: bool = False
-    sources: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -77,10 +71,10 @@ def full(preset: PresetName) -> Variant:
     return Variant(preset, _NETWORKS[preset], flow=preset == "default")
 
 
-def changed(preset: PresetName, name: str, **fields: object) -> Variant:
-    """A preset with other fields of the network."""
-    network = replace(_NETWORKS[preset], **fields)  # type: ignore[arg-type]
-    return full(preset) if network == _NETWORKS[preset] else Variant(f"{preset}-{name}", network)
+def changed(name: str, **fields: int) -> Variant:
+    """The published network with other fields."""
+    network = replace(_NETWORKS["paper"], **fields)  # type: ignore[arg-type]
+    return full("paper") if network == _NETWORKS["paper"] else Variant(f"paper-{name}", network)
 
 
 def without(preset: PresetName, name: str, *losses: str) -> Variant:
@@ -99,17 +93,14 @@ def no_3d(preset: PresetName) -> Variant:
 
 
 def lines_of(table: TableName, presets: Sequence[PresetName]) -> tuple[Line, ...]:
-    """The rows of a table; every variant of a preset is compared with that preset as it is."""
-    makers = {
-        "parts": _parts,
-        "window": _window,
-        "slots": _slots,
-        "losses": _losses,
-        "design": _design,
-        "data": _data,
-    }
-    rows = makers[table]
-    return tuple(line for preset in presets for line in rows(preset))
+    """The rows of a table; every variant of a preset is compared with that preset as it is.
+
+    Of the default preset's network the tracker takes nothing but what it finds, so that its head has no rows.
+    """
+    if table == "parts":
+        return tuple(line for preset in presets for line in _parts(preset))
+    rows = {"window": _sizes("window", "T", (2, 4, 8)), "slots": _sizes("slots", "K", (4, 8, 16)), "losses": _losses()}
+    return tuple(rows[table]) if "paper" in presets else ()
 
 
 def chosen_lines(
@@ -142,64 +133,33 @@ def _parts(preset: PresetName) -> list[Line]:
         lines += [
             Line(f"{preset}: no queries", whole, "redetect", own),
             Line(f"{preset}: no queries, detected in every frame", whole, "redetect-1", own),
-        ]
-    # The paper's network never sees depth and is not grounded: shown depth or not, only the lifting would differ.
-    blind = "quest-pixels" if preset == "default" else "quest"
-    lines.append(Line(f"{preset}: no 3D", no_3d(preset), blind, own))
-    lines.append(Line(f"{preset}: no smoothness", without(preset, "smoothness", "vel", "acc"), "quest", own))
-    if preset == "default":
-        lines += [
-            Line(f"{preset}: no grounding", whole, "quest-ungrounded", own),
+            Line(f"{preset}: no 3D", no_3d(preset), "quest-pixels", own),
             *(
                 Line(f"{preset}: flow chain{f', noise {noise}' if noise else ''}", whole, name, own)
                 for name, entry in TRACKERS.items()
                 if (noise := entry.settings.get("noise")) is not None
             ),
         ]
+    else:
+        # The published network never sees depth: shown depth or not, only the lifting would differ.
+        lines += [
+            Line(f"{preset}: no 3D", no_3d(preset), "quest", own),
+            Line(f"{preset}: no smoothness", without(preset, "smoothness", "vel", "acc"), "quest", own),
+        ]
     return [*lines, Line(f"{preset}: hold still", whole, "hold-still", own)]
 
 
-def _window(preset: PresetName) -> list[Line]:
-    own = f"{preset}: T = {_NETWORKS[preset].window}"
-    labels = {t: f"{preset}: T = {t}" for t in (2, 4, 8)}
+def _sizes(field_name: str, symbol: str, sizes: Sequence[int]) -> list[Line]:
+    """The published network with another number of frames or queries."""
+    own = f"paper: {symbol} = {getattr(_NETWORKS['paper'], field_name)}"
+    labels = {size: f"paper: {symbol} = {size}" for size in sizes}
     return [
-        Line(label, changed(preset, f"window-{t}", window=t), reference=None if label == own else own)
-        for t, label in labels.items()
+        Line(label, changed(f"{field_name}-{size}", **{field_name: size}), reference=None if label == own else own)
+        for size, label in labels.items()
     ]
 
 
-def _slots(preset: PresetName) -> list[Line]:
-    """Learned queries are as many as there are slots; anchored ones are as many as are asked for."""
-    if preset != "paper":
-        return []
-    own = f"{preset}: K = {_NETWORKS[preset].slots}"
-    labels = {k: f"{preset}: K = {k}" for k in (4, 8, 16)}
-    return [
-        Line(label, changed(preset, f"slots-{k}", slots=k), reference=None if label == own else own)
-        for k, label in labels.items()
-    ]
-
-
-def _losses(preset: PresetName) -> list[Line]:
-    own = f"{preset}: all losses"
-    lines = [Line(own, full(preset))]
-    return lines + [
-        Line(f"{preset}: no {loss}", without(preset, loss, loss), "quest", own) for loss in LOSSES_OF[preset]
-    ]
-
-
-def _design(preset: PresetName) -> list[Line]:
-    if preset != "default":
-        return []
-    own = f"{preset}: as it is"
-    codes = changed(preset, "no-points3d", points3d=False)
-    return [Line(own, full(preset)), Line(f"{preset}: no 3D position codes", codes, "quest", own)]
-
-
-def _data(preset: PresetName) -> list[Line]:
-    """Objects free for any use against all; the steps are the same."""
-    if preset != "default":
-        return []
-    own = f"{preset}: all training objects"
-    free = replace(full(preset), name=f"{preset}-procedural", flow=False, sources=("procedural",))
-    return [Line(own, full(preset)), Line(f"{preset}: procedural objects only", free, "quest", own)]
+def _losses() -> list[Line]:
+    own = "paper: all losses"
+    lines = [Line(own, full("paper"))]
+    return lines + [Line(f"paper: no {loss}", without("paper", loss, loss), "quest", own) for loss in PAPER_LOSSES]

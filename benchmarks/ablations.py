@@ -182,7 +182,6 @@ class Ablations:
             windows=replace(item.windows, batch=self.batch),
             device=pick_device("auto"),
             report=lambda done, total, frames: None,
-            sources=item.sources,
         )
 
     def _fit(self, objective: Objective, dataset: Dataset, steps: int, seed: int, out: Path, console: Console) -> None:
@@ -213,8 +212,7 @@ class Ablations:
         tracker = PixelsOnly.without_depth(tracker) if item.no_depth else tracker
         stores = [TakeStore(path) for path in self.validation]
         chosen = [(store, select_takes(store.infos(), split=("validation", "unlisted"))) for store in stores]
-        bias, _, _ = discovery_bias(tracker, chosen)
-        return replace(config, slot_bias=bias)
+        return replace(config, slot_bias=discovery_bias(tracker, chosen).slot_bias)
 
     def _settings(self, item: Variant, seed: int) -> dict[str, Any]:
         return {
@@ -228,7 +226,6 @@ class Ablations:
             "network": json.loads(item.network.to_json()),
             "losses": item.losses,
             "windows": asdict(item.windows),
-            "sources": None if item.sources is None else list(item.sources),
             "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
             "training_hash": self.training_hash,
         }

@@ -3,20 +3,16 @@
     OMP_NUM_THREADS=1 python benchmarks/endurance.py --frames 100000 --out benchmarks/results/endurance/endurance.json
 
 The sample clip is played forth and back without end, with time stamps that go on; two handles that move are followed,
-with alarms where the weights have a monitor. The encoder, which keeps nothing between frames, runs in the first 2,000
-frames (a tenth of a shorter run); then its features are replayed by the picture's digest, which saves an hour. All else
-runs in every frame. The times that are compared lie in the replayed part, if every picture has come up by then: a run
-of less than 1,200 frames only shows that this works. Other jobs may run meanwhile: the processor's time counts, wall
-time stands beside it. The result file is written anew at every reading.
+with alarms where the monitor is calibrated. Other jobs may run meanwhile: the processor's time counts, wall time stands
+beside it. The result file is written anew at every reading.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -27,7 +23,6 @@ import tyro
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from torch import Tensor
 
 import quest
 from quest.data.recording import read_recording
@@ -35,7 +30,6 @@ from quest.data.sample import sample_folder
 from quest.errors import ConfigError, InputError
 from quest.evaluation.bootstrap import LEVEL
 from quest.evaluation.report import provenance, write_report
-from quest.model.network import QuestNetwork
 from quest.types import Query
 
 RESAMPLES = 1000
@@ -77,35 +71,6 @@ class Change:
     low: float
     high: float
     readings: int
-
-
-class FeatureRing:
-    """The encoder's features of pictures that come again and again: computed at first, replayed later.
-
-    The network's ``encode`` is replaced. Until :attr:`replay` is set it computes every picture, and keeps the features
-    of each different one; then only pictures that are new are computed.
-
-    Args:
-        network: changed in place.
-    """
-
-    def __init__(self, network: QuestNetwork) -> None:
-        self.replay = False
-        self.computed = 0
-        self._encode: Callable[[Tensor], Tensor] = network.encode
-        self._known: dict[bytes, Tensor] = {}
-        network.encode = self._features  # type: ignore[method-assign]
-
-    def __len__(self) -> int:
-        return len(self._known)
-
-    def _features(self, rgb: Tensor) -> Tensor:
-        key = hashlib.blake2b(rgb.detach().cpu().contiguous().numpy().data, digest_size=16).digest()
-        if self.replay and key in self._known:
-            return self._known[key]
-        self.computed += 1
-        # Kept once: replacing them at every pass would stir the memory that is to be measured.
-        return self._known.setdefault(key, self._encode(rgb))
 
 
 def forth_and_back(t: int, frames: int) -> int:
@@ -190,8 +155,6 @@ class Endurance:
 
     frames: int = 100_000
     """How many; at least 100."""
-    encoded: int = 2_000
-    """Frames in which the encoder runs; at most a tenth of them."""
     settled: int = 10_000
     """Memory is compared with that after so many frames; at most a tenth of them."""
     weights: str = "quest-s16"
@@ -207,18 +170,16 @@ class Endurance:
         torch.set_num_threads(1)
         clip = read_recording(sample_folder())
         tracker = quest.load(self.weights, device="cpu")
-        ring = FeatureRing(tracker.network)
         truth = json.loads((sample_folder() / "truth.json").read_text())
         handles = {entity["name"]: entity["uv_px"][0] for entity in truth["entities"] if entity["moves"]}
         queries = [Query.point(0, x, y, name=name) for name, (x, y) in handles.items()]
         stream = tracker.stream(clip.camera, queries)
-        every, encoded = self.frames // 100, min(self.encoded, self.frames // 10)
+        every = self.frames // 100
         about = provenance() | {
             "weights": self.weights,
             "weights_hash": tracker.weights_hash,
             "alpha": None if stream.budget is None else stream.budget.alpha,
             "frames": self.frames,
-            "encoded": encoded,
         }
         alarms: list[str] = []
         stream.on_alarm(lambda alarm: alarms.append(f"frame {alarm.frame}: {alarm.name}, {alarm.reason}"[:200]))
@@ -226,7 +187,6 @@ class Endurance:
         start_s, start_cpu_s = time.perf_counter(), time.process_time()
         off_px: list[float] = []
         for t in range(every * 100):
-            ring.replay = t >= encoded
             i = forth_and_back(t, len(clip))
             frame = clip.frame(i)
             state = stream.step(frame.rgb, frame.depth_m, t / FRAMES_PER_S, frame.cam_from_world)
@@ -241,7 +201,7 @@ class Endurance:
                 "first_alarms": alarms[:10],
                 "off_px": dict(zip(handles, off_px, strict=True)),
             }
-            report = about | self._found(readings) | seen | {"encoder_runs": ring.computed, "pictures": len(ring)}
+            report = about | self._found(readings) | seen
             console.print(_line(readings))
             if self.out is not None:
                 write_report(report | {"readings": [asdict(r) for r in readings]}, self.out)

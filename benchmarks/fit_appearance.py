@@ -21,12 +21,13 @@ import tyro
 from jaxtyping import Float, Int
 from scipy.optimize import minimize
 
-from quest.baselines.filtered import Filtered
 from quest.data.recording import read_recording
 from quest.filter.appearance import CELL_REACH_PX, PATCH_PX, Likeness
 from quest.filter.local_motion import corners
 from quest.filter.posterior import RIVALS
 from quest.filter.view import View, in_image
+from quest.model.xfeat import XFeat
+from quest.track.preprocess import grey_of, to_picture
 from quest.types import Clip
 
 NAMES = ("look_wide", "look_near", "look_bias", "jump_log_odds")
@@ -58,7 +59,7 @@ class FitAppearance:
     """Corners of each of every fifth of them."""
     seed: int = 0
     out: Path = Path(__file__).parent / "results" / "appearance.json"
-    tracker: tyro.conf.Suppress[Filtered] = field(default_factory=Filtered)
+    features: tyro.conf.Suppress[XFeat] = field(default_factory=XFeat.from_package)
 
     def main(self) -> None:
         """Collect, fit, write and print."""
@@ -81,7 +82,7 @@ class FitAppearance:
     def choices(self, clip: Clip, rng: np.random.Generator) -> Choices:
         """Corners of some frames, looked for in the others."""
         chosen = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), self.frames)).astype(int))
-        pictures = {i: self.tracker.picture(clip.rgb[i]) for i in chosen}
+        pictures = {i: to_picture(grey_of(clip.rgb[i]), self.features) for i in chosen}
         matrix = clip.camera.matrix.astype(np.float64)
         views = {i: View(matrix, (f := clip.frame(int(i))).cam_from_world, f.depth_m) for i in chosen}
         made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []

@@ -2,8 +2,8 @@
 
     python benchmarks/judge_sample.py
 
-A query's entity is the one that its first answer is nearest to. Lost is as in ``docs/metrics.md``: the nearest entity
-is another, or none is near, for three frames or more, not counting those in which the answer's pixel is on the entity.
+A query's entity is the one that its first answer is nearest to. Lost is as where the monitor is judged with depth
+(:func:`quest.evaluation.stream_record.bands`).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import quest
 from quest.data.recording import read_recording
 from quest.data.sample import SAMPLES, sample_folder
 from quest.evaluation.metrics import distance_px
-from quest.evaluation.stream_record import LIFTING_PX, lasting, runs
+from quest.evaluation.stream_record import FAR, LEAST_S, LIFTING_PX, NEAR, lasting, runs
 from quest.types import Camera, Tracks
 
 COLUMNS = ("query", "entity", "px", "mm", "worst mm", "last mm", "joint", "truly", "axis deg", "lost s", "alarm s")
@@ -58,7 +58,6 @@ class JudgeSample:
 def judge(tracks: Tracks, truth: dict[str, Any], k: int, camera: Camera) -> list[str]:
     """A row of the table."""
     assert tracks.joints is not None
-    assert tracks.alarm is not None
     entities = truth["entities"]
     points = np.array([entity["point_world_m"] for entity in entities])
     off_m = np.linalg.norm(points - tracks.point_world[:, k], axis=-1)
@@ -70,9 +69,11 @@ def judge(tracks: Tracks, truth: dict[str, Any], k: int, camera: Camera) -> list
     seen = np.zeros(len(tracks), bool)
     for start, end in entity["visible_frames"]:
         seen[start:end] = True
-    near = (off_m.argmin(axis=0) == e) & (own_m <= 0.1 * truth["half_diagonal_m"])
+    own, other = (gap_m / truth["half_diagonal_m"] for gap_m in (own_m, np.delete(off_m, e, axis=0).min(axis=0)))
     on_it = seen & (distance_px(tracks.uv_px[:, k], true_px, width=camera.width, height=camera.height) <= LIFTING_PX)
-    lost = lasting((bound & ~near & ~on_it)[:, None])[:, 0]
+    right = (own <= NEAR) & (own <= other) | on_it
+    wrong = bound & ~right & ((own > FAR) | (own > NEAR) & (other < own / 2))
+    lost = lasting(wrong[:, None], tracks.stamp_s, LEAST_S)[:, 0]
     kind = entity["joint"]["kind"] if entity["moves"] else "static"
     angle = ""
     if kind == tracks.joints.kind[k] != "static":
@@ -86,7 +87,8 @@ def judge(tracks: Tracks, truth: dict[str, Any], k: int, camera: Camera) -> list
         tracks.joints.kind[k],
         kind,
         angle,
-        *(_spans(flags, tracks.stamp_s) for flags in (lost, tracks.alarm[:, k])),
+        _spans(lost, tracks.stamp_s),
+        "not watched" if tracks.alarm is None else _spans(tracks.alarm[:, k], tracks.stamp_s),
     ]
 
 

@@ -1,7 +1,7 @@
 """Measure how well joints are told from predicted tracks, against the simulator's.
 
     python benchmarks/predicted_joints.py --takes STORE --split validation \
-        --out benchmarks/results/grounding/predicted_joints.json
+        --out benchmarks/results/predicted_joints.json
 
 Every scored entity is asked for as in the protocol point, alarms are off. Moved entities are judged at the first frame
 in which their true joint has gone 45 degrees or 15 cm from rest, and at the end of the take. The result file is written
@@ -31,7 +31,7 @@ from quest.evaluation.metrics import Sums
 from quest.evaluation.protocols import first_visible
 from quest.evaluation.report import provenance, shown, write_report
 from quest.evaluation.selection import select_takes
-from quest.grounding import Joint, JointKind
+from quest.filter.joints import Joint, JointKind
 from quest.track import StreamState, Tracker
 from quest.types import Query, Take
 

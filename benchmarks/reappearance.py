@@ -1,7 +1,7 @@
 """What becomes of hidden entities (suite occlusion), and how often identities switch among likes (suite lockers).
 
-    quest eval --takes SUITES --trackers quest quest-ungrounded lk --out RUN.json
-    python benchmarks/reappearance.py RUN.records.parquet --out benchmarks/results/grounding/reappearance.json
+    quest eval --takes SUITES --trackers quest lk hold-still --out RUN.json
+    python benchmarks/reappearance.py RUN.records.parquet --out benchmarks/results/reappearance.json
 
 An episode is the first run of at least 20 frames in which a moved entity is hidden, after it was seen moving. It is
 judged five frames after its entity is seen again. Protocol point. Records do not hold the truth, but the distance of

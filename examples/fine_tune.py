@@ -1,4 +1,4 @@
-"""Fit the shipped weights to an object of your own, and see what it was worth on takes that nobody learned from.
+"""Teach the shipped weights to find the entities of an object of your own, and see what it was worth on other takes.
 
     python examples/fine_tune.py                                    # the tool chest in examples/toolbox
     python examples/fine_tune.py --objects path/to/mine --steps 1000
@@ -39,7 +39,7 @@ class FineTune:
     procedural: int = 0
     """Procedural objects to learn from as well, so that the network keeps what it knows of others."""
     steps: int = 300
-    """Training steps of what follows entities, and as many of what discovers them."""
+    """Training steps of the map of entities."""
     learning_rate: float = 1e-4
     """A twentieth of what training anew takes: the weights are good already."""
 
@@ -69,10 +69,8 @@ class FineTune:
             "training.warmup-steps": max(1, min(100, self.steps // 10)),
             "training.validate-every": max(1, self.steps // 6),
         }
-        say("train", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
-        found = {"data": data, "validation": takes / "choose", "weights": run / "weights.safetensors"}
-        say("train", stage="map", out=self.folder / "map", **found, **training)
-        mine = self.folder / "map" / "weights.safetensors"
+        say("train", stage="map", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
+        mine = run / "weights.safetensors"
         say("weights", "tune", str(mine), takes=takes / "choose")
         self.judge(mine, "after")
         self.compare()
@@ -82,20 +80,15 @@ class FineTune:
     def judge(self, weights: str | Path, name: str) -> None:
         """Evaluate weights on the takes that are held out."""
         held_out, out = self.folder / "takes" / "held-out", self.folder / f"{name}.json"
-        protocol = ("point", "semantic")
-        say("eval", takes=held_out, split="unlisted", trackers="quest", protocol=protocol, weights=weights, out=out)
+        say("eval", takes=held_out, split="unlisted", trackers="quest", protocol="semantic", weights=weights, out=out)
 
     def compare(self) -> None:
         """Print the moved entities of both result files beside each other."""
-        table = Table("protocol", "weights", "tracks", "APE", "D@100", "Acc %", "recall %", box=None, pad_edge=False)
-        rows = {
-            (row.protocol, name): row
-            for name in ("before", "after")
-            for row in read_results(self.folder / f"{name}.json").rows
-            if row.reading == "moved" and row.tracker == "quest"
-        }
-        for protocol, name in sorted(rows, key=lambda key: (key[0], key[1] != "before")):
-            table.add_row(protocol, name, *figures(rows[protocol, name]))
+        table = Table("weights", "tracks", "APE", "D@100", "Acc %", "recall %", box=None, pad_edge=False)
+        for name in ("before", "after"):
+            for row in read_results(self.folder / f"{name}.json").rows:
+                if row.reading == "moved" and row.tracker == "quest":
+                    table.add_row(name, *figures(row))
         Console().print(table)
 
 

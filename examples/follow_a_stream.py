@@ -5,6 +5,7 @@ from __future__ import annotations
 import quest
 from quest.data.recording import read_recording
 from quest.data.sample import sample_folder
+from quest.tracks import describe_joint
 
 
 def main() -> None:
@@ -17,8 +18,10 @@ def main() -> None:
         state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
         if t % 15 == 0 and state.names:
             x, y, z = state.point_world[0]
-            joint = state.joint[0].describe() if state.joint[0] else "no joint yet"
-            print(f"{frame.stamp_s:5.2f} s  {state.names[0]}  {x:.3f} {y:.3f} {z:.3f} m  {state.state[0]}  {joint}")
+            joint, words = state.joint[0], "no joint yet"
+            if joint is not None:
+                words = describe_joint(joint.kind.value, joint.lower, joint.upper, q=float(state.q[0]))
+            print(f"{frame.stamp_s:5.2f} s  {state.names[0]}  {x:.3f} {y:.3f} {z:.3f} m  {state.state[0]}  {words}")
 
 
 if __name__ == "__main__":

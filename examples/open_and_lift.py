@@ -4,7 +4,7 @@
     python examples/open_and_lift.py --recording path/to/mine
 
 Without a recording, a procedural laptop is rendered once. Its lid is closed at first, and both rims are then a few
-pixels apart. The rim that it is lifted by is taken to stand where it is first seen, the other one goes with the lid.
+pixels apart. Weights find both by what they are for; one goes with the lid, the other one should stay.
 """
 
 from __future__ import annotations

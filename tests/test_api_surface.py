@@ -35,15 +35,19 @@ MEMBERS = {
     "Query": "frame intent kind label name point semantic slot uv_px",
     "State": "HELD LOST TRACKING",
     "Stream": "add budget camera frame looking memory on_alarm rename retire step unbound",
-    "StreamState": "alarm confidence flags has_depth joint labels lost_p names point_world q query signals stamp_s "
-    "state uv_px visible",
-    "Tracker": "calibration candidates config device name network restore save stream track weights_hash with_config",
+    "StreamState": "alarm confidence flags has_depth joint labels lost_log_odds lost_p names only point_world q "
+    "query stamp_s state uv_px visible",
+    "Tracker": "calibrations candidates config device features name network noise restore save stream track "
+    "weights_hash",
     "Tracks": "alarm confidence describe frame_flags joints labels lost_p names point_world save select stamp_s state "
     "to_pandas uv_px visible",
 }
 """Fields, methods and properties of the public classes."""
 
-COMMANDS = ["data", "doctor", "eval", "eval-monitor", "generate", "monitor", "objects", "track", "train", "weights"]
+COMMANDS = [
+    *("calibrate", "data", "doctor", "eval", "eval-monitor"),
+    *("generate", "monitor", "objects", "track", "train", "weights"),
+]
 
 ERRORS = [
     "ConfigError",

@@ -19,7 +19,7 @@ MODULES = {
 
 RANKS = {
     **dict.fromkeys(["geometry"], 0),
-    **dict.fromkeys(["sim", "data", "model", "grounding", "monitor", "filter"], 1),
+    **dict.fromkeys(["sim", "data", "model", "monitor", "filter"], 1),
     **dict.fromkeys(["train", "track"], 2),
     "paper": 3,
     "baselines": 4,

@@ -40,7 +40,7 @@ def test_fine_tuning_runs_commands_that_exist(tmp_path: Path, monkeypatch: pytes
     module.FineTune(out=tmp_path, procedural=procedural).run()
     names = [words[0] for words in commands]
     generate = ["generate"] * (4 if procedural else 3)
-    assert names == [*generate, "eval", "train", "train", "weights", "eval"]
+    assert names == [*generate, "eval", "train", "weights", "eval"]
     for words in commands:
         parse(words)
     train: Any = parse(commands[names.index("train")])

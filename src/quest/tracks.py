@@ -176,7 +176,7 @@ class Tracks:
     alarm: Bool[np.ndarray, "T K"] | None = None
     """Whether an alarm is open; None likewise."""
     joints: Joints | None = None
-    """What explains the tracks at the end; None without grounding."""
+    """What explains the tracks at the end; None of trackers that tell of none."""
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -255,7 +255,7 @@ def write_joints(tracks: Tracks, path: str | Path) -> None:
     """
     joints = tracks.joints
     if joints is None:
-        raise InputError(f"joints {path}: these tracks have none; a tracker that is grounded in joints gives them")
+        raise InputError(f"joints {path}: these tracks have none; quest gives them")
     rows = [
         {"query": k, "name": tracks.names[k], "label": tracks.labels[k], **row, "q": _plain(joints.q[:, k], digits=6)}
         for k, row in enumerate(_joints_to_json(joints, digits=6))

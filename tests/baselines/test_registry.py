@@ -72,8 +72,8 @@ def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_variants_take_threshold_and_noise_from_their_name() -> None:
     tracker = make_tracker(flow=True)
-    config = replace(tracker.config, slot_bias=0.5, slot_gain=2.0, slot_threshold=0.8)
-    detector = detector_of(tracker.with_config(config, name="quest"))
+    config = tracker.config = replace(tracker.config, slot_bias=0.5, slot_gain=2.0, slot_threshold=0.8)
+    detector = detector_of(tracker)
     score = 1 / (1 + np.exp(-config.slot_gain * (detector.min_logit + config.slot_bias)))
     np.testing.assert_allclose(score, 0.8)
     shared = Shared(tracker, unit_m, seed=3)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from benchmarks.endurance import (
-    FeatureRing,
     Reading,
     forth_and_back,
     memory_growth,
@@ -15,7 +13,6 @@ from benchmarks.endurance import (
     time_change,
 )
 from quest.errors import InputError
-from tests.tiny import make_network
 
 
 def readings(ms_per_frame: np.ndarray, resident: np.ndarray | None = None) -> list[Reading]:
@@ -57,19 +54,3 @@ def test_memory_growth():
 
 def test_resident_memory_is_that_of_this_process():
     assert 10e6 < resident_bytes() < 100e9
-
-
-def test_features_are_computed_first_and_replayed_later():
-    network = make_network()
-    size = network.config.encoder.image_size
-    pictures = [torch.full((1, size, size, 3), value, dtype=torch.uint8) for value in (0, 90, 200)]
-    with torch.inference_mode():
-        expected = [network.encode(p) for p in pictures]
-        ring = FeatureRing(network)
-        for p, e in zip(pictures[:2] * 2, expected[:2] * 2, strict=True):
-            torch.testing.assert_close(network.encode(p), e)
-        assert (ring.computed, len(ring)) == (4, 2)
-        ring.replay = True
-        for p, e in zip(pictures * 2, expected * 2, strict=True):
-            torch.testing.assert_close(network.encode(p), e)
-    assert (ring.computed, len(ring)) == (5, 3)

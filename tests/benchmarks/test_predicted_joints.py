@@ -15,7 +15,7 @@ from benchmarks.predicted_joints import (
     judge_view,
     moments_of,
 )
-from quest.grounding import JointKind
+from quest.filter.joints import JointKind
 from quest.types import Take
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker

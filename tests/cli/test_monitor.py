@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from quest.cli.main import main
 from quest.data.store import TakeStore
 from quest.model.weights import save_network
+from quest.monitor import calibration_file, write_calibrations
 from quest.track import Stream, TrackerConfig
 from quest.types import Camera
 from tests.synthetic import make_take
@@ -31,20 +33,28 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 
 @pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """Untrained weights whose tracker takes every peak, or none; with a calibration that alarms or never does."""
     folder = tmp_path_factory.mktemp("weights")
-    network = make_network()
-    eager, blind = (TrackerConfig(slot_threshold=t, prompt_threshold=t).to_json() for t in (0.0, 1.0))
-    for name, settings, monitor in (
-        ("plain", eager, None),
-        ("calm", eager, make_calibration(alarming=False).to_json()),
-        ("alarming", eager, make_calibration(alarming=True).to_json()),
-        ("few", eager, replace(make_calibration(alarming=True), maxima=np.arange(20.0)).to_json()),
-        ("blind", blind, None),
+    network, alarming = make_network(), make_calibration(alarming=True)
+    for name, threshold in (("eager", 0.0), ("blind", 1.0)):
+        settings = TrackerConfig(slot_threshold=threshold, prompt_threshold=threshold).to_json()
+        save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test")
+    found = {name: ["--weights", str(folder / f"{name}.safetensors")] for name in ("eager", "blind")}
+    for name, calibration in (
+        ("calm", make_calibration(alarming=False)),
+        ("alarming", alarming),
+        ("few", replace(alarming, maxima=np.arange(20.0))),
     ):
-        save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test", monitor=monitor)
-    return {path.stem: str(path) for path in folder.iterdir()}
+        write_calibrations(folder / f"{name}.json", {"depth": calibration})
+        found[name] = [*found["eager"], "--monitor", str(folder / f"{name}.json")]
+    return found
+
+
+@pytest.fixture(autouse=True)
+def nothing_ships(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """There is no calibration but those of these tests."""
+    monkeypatch.setattr(calibration_file, "resources", SimpleNamespace(files=lambda package: tmp_path))
 
 
 def objects(text: str) -> list[dict[str, Any]]:
@@ -54,9 +64,9 @@ def objects(text: str) -> list[dict[str, Any]]:
     return [json.loads(line, parse_constant=refuse) for line in text.splitlines()]
 
 
-def test_without_a_calibration(take: str, weights: dict[str, str], tmp_path: Path, capsys):
+def test_without_a_calibration(take: str, weights: dict[str, list[str]], tmp_path: Path, capsys):
     path = tmp_path / "new" / "frames.jsonl"
-    assert main(["monitor", take, "--weights", weights["plain"], *POINTS, "--jsonl", str(path)]) == 0
+    assert main(["monitor", take, *weights["eager"], *POINTS, "--jsonl", str(path)]) == 0
     out = capsys.readouterr().out
     assert "no calibration of the monitor" in out
     assert "now following left" in out
@@ -70,23 +80,23 @@ def test_without_a_calibration(take: str, weights: dict[str, str], tmp_path: Pat
     assert left["alarm"] is None
 
 
-def test_too_few_streams_for_an_alarm(take: str, weights: dict[str, str], capsys):
+def test_too_few_streams_for_an_alarm(take: str, weights: dict[str, list[str]], capsys):
     """Nothing may look as if it were watched."""
-    assert main(["monitor", take, "--weights", weights["few"], *POINTS]) == 0
+    assert main(["monitor", take, *weights["few"], *POINTS]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "no alarm at all at alpha 0.05: calibrated on 20 loss-free streams of" in out
 
 
-def test_no_alarm(take: str, weights: dict[str, str], capsys):
-    assert main(["monitor", take, "--weights", weights["calm"], *POINTS]) == 0
+def test_no_alarm(take: str, weights: dict[str, list[str]], capsys):
+    assert main(["monitor", take, *weights["calm"], *POINTS]) == 0
     out = capsys.readouterr().out
     assert "calibration" not in out
     assert "ALARM" not in out
     assert "0 raised, 0 cleared, 0 left open" in out
 
 
-def test_an_open_alarm(take: str, weights: dict[str, str], capsys):
-    assert main(["monitor", take, "--weights", weights["alarming"], *POINTS, "--jsonl", "-"]) == 3
+def test_an_open_alarm(take: str, weights: dict[str, list[str]], capsys):
+    assert main(["monitor", take, *weights["alarming"], *POINTS, "--jsonl", "-"]) == 3
     captured = capsys.readouterr()
     last = objects(captured.out)[-1]
     assert len(captured.out.splitlines()) == FRAMES, "nothing else goes to standard output"
@@ -99,49 +109,54 @@ def test_an_open_alarm(take: str, weights: dict[str, str], capsys):
     assert "2 left open" in captured.err
 
 
-def test_a_smaller_alpha_needs_more_evidence(take: str, weights: dict[str, str], capsys):
+def test_a_smaller_alpha_needs_more_evidence(take: str, weights: dict[str, list[str]], capsys):
     first = []
     for alpha in ("0.05", "1e-9"):
-        assert main(["monitor", take, "--weights", weights["alarming"], *POINTS, "--alpha", alpha, "--jsonl", "-"]) == 3
+        assert main(["monitor", take, *weights["alarming"], *POINTS, "--alpha", alpha, "--jsonl", "-"]) == 3
         first.append(objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"]["frame"])
     assert first[0] < first[1]
 
 
-def test_alpha_in_so_many_frames(take: str, weights: dict[str, str], capsys):
+def test_alpha_in_so_many_frames(take: str, weights: dict[str, list[str]], capsys):
     """The calibration's blocks have 60 frames: 180 are in three of them, which share alpha alike."""
     for frames, part in (([], 0.8 * 0.05), (["--alpha-frames", "180"], 0.05 / 3)):
-        assert main(["monitor", take, "--weights", weights["alarming"], *POINTS, *frames, "--jsonl", "-"]) == 3
+        assert main(["monitor", take, *weights["alarming"], *POINTS, *frames, "--jsonl", "-"]) == 3
         assert objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"]["alpha"] == pytest.approx(part)
 
 
-def test_discovery(take: str, weights: dict[str, str], capsys):
-    assert main(["monitor", take, "--weights", weights["calm"]]) == 0
+def test_a_file_of_calibrations_that_is_not_there(take: str, weights: dict[str, list[str]], tmp_path: Path, capsys):
+    assert main(["monitor", take, *weights["eager"], "--monitor", str(tmp_path / "none.json")]) == 2
+    assert "quest calibrate" in capsys.readouterr().err
+
+
+def test_discovery(take: str, weights: dict[str, list[str]], capsys):
+    assert main(["monitor", take, *weights["calm"]]) == 0
     assert "now following" in capsys.readouterr().out
 
 
-def test_own_pace(take: str, weights: dict[str, str], monkeypatch, capsys):
+def test_own_pace(take: str, weights: dict[str, list[str]], monkeypatch, capsys):
     waited: list[float] = []
     monkeypatch.setattr("quest.cli.monitor.time.sleep", waited.append)
-    assert main(["monitor", take, "--weights", weights["calm"], *POINTS, "--realtime"]) == 0
+    assert main(["monitor", take, *weights["calm"], *POINTS, "--realtime"]) == 0
     assert len(waited) == FRAMES
     assert all(wait >= 0 for wait in waited)
 
 
 @pytest.mark.parametrize("asked", [[], ["--label", "knob"]])
-def test_nothing_is_found(take: str, weights: dict[str, str], asked: list[str], capsys):
-    assert main(["monitor", take, "--weights", weights["blind"], *asked]) == 2
+def test_nothing_is_found(take: str, weights: dict[str, list[str]], asked: list[str], capsys):
+    assert main(["monitor", take, *weights["blind"], *asked]) == 2
     error = capsys.readouterr().err
     assert "--point FRAME,X,Y" in error
     assert "--label" in error
 
 
-def test_one_of_two_is_found(take: str, weights: dict[str, str], capsys):
+def test_one_of_two_is_found(take: str, weights: dict[str, list[str]], capsys):
     asked = ["--label", "knob", "--point", "0,20,30"]
-    assert main(["monitor", take, "--weights", weights["blind"], *asked]) == 0
+    assert main(["monitor", take, *weights["blind"], *asked]) == 0
     assert "knob: found no entity" in capsys.readouterr().out
 
 
-def test_interrupted(take: str, weights: dict[str, str], monkeypatch, capsys):
+def test_interrupted(take: str, weights: dict[str, list[str]], monkeypatch, capsys):
     step = Stream.step
 
     def interrupt(stream: Stream, *arguments: Any) -> Any:
@@ -150,7 +165,7 @@ def test_interrupted(take: str, weights: dict[str, str], monkeypatch, capsys):
         return step(stream, *arguments)
 
     monkeypatch.setattr(Stream, "step", interrupt)
-    assert main(["monitor", take, "--weights", weights["plain"], *POINTS]) == 130
+    assert main(["monitor", take, *weights["eager"], *POINTS]) == 130
     captured = capsys.readouterr()
     assert f"3 of {FRAMES} frames" in captured.out
     assert "interrupted" in captured.err
@@ -167,18 +182,20 @@ def test_interrupted(take: str, weights: dict[str, str], monkeypatch, capsys):
         (["--jsonl", "/dev/full"], "frame 0 cannot be written"),
     ],
 )
-def test_bad_arguments(take: str, weights: dict[str, str], tmp_path: Path, capsys, arguments: list[str], named: str):
+def test_bad_arguments(
+    take: str, weights: dict[str, list[str]], tmp_path: Path, capsys, arguments: list[str], named: str
+):
     if "/dev/full" in arguments and not Path("/dev/full").exists():
         pytest.skip("this system has no full disk to write to")
     arguments = [argument.format(folder=tmp_path) for argument in arguments]
-    assert main(["monitor", take, "--weights", weights["plain"], *POINTS, *arguments]) == 2
+    assert main(["monitor", take, *weights["eager"], *POINTS, *arguments]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ")
     assert error.count("\n") == 1
     assert named in error
 
 
-def test_sample_is_a_source(weights: dict[str, str], monkeypatch, capsys):
+def test_sample_is_a_source(weights: dict[str, list[str]], monkeypatch, capsys):
     """The word, not a folder of that name; the clip itself is not stepped through."""
     seen: list[Camera] = []
 
@@ -187,5 +204,5 @@ def test_sample_is_a_source(weights: dict[str, str], monkeypatch, capsys):
         raise KeyboardInterrupt
 
     monkeypatch.setattr("quest.track.Tracker.stream", stop)
-    assert main(["monitor", "sample", "--weights", weights["plain"]]) == 130
+    assert main(["monitor", "sample", *weights["eager"]]) == 130
     assert seen

@@ -22,12 +22,12 @@ from quest.evaluation.detectors import (
     loss_free_maxima,
     one_per_object,
     our_monitor,
+    replay_statistic,
     rivals,
 )
 from quest.evaluation.drift import (
     BINS,
     DEADLINE_FRAMES,
-    LEAST_FRAMES,
     augrc,
     auroc,
     calibration_error,
@@ -38,7 +38,7 @@ from quest.evaluation.drift import (
 )
 from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, parts_of, write_drift
 from quest.evaluation.results import Run
-from quest.evaluation.stream_record import StreamRecord
+from quest.evaluation.stream_record import LOST, RIGHT, UNCLEAR, StreamRecord
 from quest.monitor import Budget
 from quest.monitor.statistic import Cusum, Latest
 from tests.monitor.calibrations import share, watching
@@ -54,10 +54,10 @@ def scored() -> tuple[np.ndarray, np.ndarray]:
 
 
 def stream(lost: list[str], *, seed: int = 0, **changes: object) -> StreamRecord:
-    """A stream in which each query is lost where its text has an x."""
+    """A stream in which each query is lost where its text has an x, and unclear where it has a question mark."""
     record = make_stream(seed, frames=len(lost[0]), queries=len(lost))
-    truth = np.array([[c == "x" for c in text] for text in lost]).T
-    return replace(record, lost=truth, **changes)  # type: ignore[arg-type]
+    band = np.array([[{".": RIGHT, "?": UNCLEAR, "x": LOST}[c] for c in text] for text in lost], np.int8).T
+    return replace(record, band=band, **changes)  # type: ignore[arg-type]
 
 
 def test_auroc(scored: tuple[np.ndarray, np.ndarray]):
@@ -104,21 +104,22 @@ def test_quantile_counts_what_is_infinite():
 
 
 def test_losses_and_delays():
-    late, short, twice = "." * 52 + "x" * 8, "." * 10 + "xxx" + "." * 47, "." * 5 + "x" * 50 + "..xxx"
-    record = stream([late, short, "." * 60, twice])
+    """At 30 frames per second half a second has 15 frames."""
+    late, short, brief = "." * 46 + "x" * 14, "." * 10 + "x" * 15 + "." * 35, "." * 10 + "x" * 14 + "." * 36
+    twice = "." * 3 + "xx" + "?" * 2 + "x" * 48 + "." * 5
+    record = stream([late, short, "." * 60, twice, brief])
     found = {loss.query: loss for loss in losses(record)}
-    assert sorted(found) == [0, 1, 3]
-    assert found[0].too_late
-    assert 52 + LEAST_FRAMES > 60
-    assert (found[1].start, found[1].deadline, found[1].too_late) == (10, 10 + DEADLINE_FRAMES, False)
-    assert (found[3].start, found[3].deadline) == (5, 55)  # the loss is longer than the deadline
+    assert sorted(found) == [0, 1, 3, 4]
+    assert [found[k].lasts for k in sorted(found)] == [False, True, True, False]
+    assert (found[1].first, found[1].start, found[1].deadline) == (10, 10, 10 + DEADLINE_FRAMES)
+    assert (found[3].first, found[3].start, found[3].deadline) == (3, 7, 55)  # the loss is longer than the deadline
     above = np.zeros(60, bool)
     assert delay_of(found[1], above) == math.inf
     above[[2, 14, 15]] = True
     assert delay_of(found[1], above) == 4.0  # the alarm before the loss does not count
     above[:] = np.arange(60) >= 10 + DEADLINE_FRAMES
     assert delay_of(found[1], above) == math.inf
-    assert delay_of(found[3], above) == 35.0
+    assert delay_of(found[3], above) == 33.0
 
 
 def test_frames_before_a_query_do_not_count():
@@ -141,7 +142,7 @@ def test_one_stream_per_object_is_drawn_without_looking():
     drawn = one_per_object(records)
     assert [records[i].object_id for i in drawn] == [f"object-{o}" for o in range(20)]
     assert len({records[i].view for i in drawn}) == 3
-    turned = one_per_object([replace(r, lost=~r.lost) for r in records])
+    turned = one_per_object([replace(r, band=LOST - r.band) for r in records])
     assert turned == drawn
 
 
@@ -155,12 +156,20 @@ def test_maxima_are_of_loss_free_streams_that_are_long_enough():
         loss_free_maxima(Latest(), records[3:], evidence[3:], block_frames=30)
 
 
+def test_what_has_no_log_odds_changes_no_statistic():
+    record = stream(["." * 12])
+    evidence = np.ones((12, 1))
+    evidence[[2, 3, 9]] = np.nan
+    (path,) = replay_statistic(Cusum(0.0), [evidence], [record], block_frames=6)
+    np.testing.assert_array_equal(path[:, 0], [1, 2, 2, 2, 3, 4, 1, 2, 3, 3, 4, 5])
+
+
 def test_the_soonest_statistic_is_chosen():
     records = [stream(["." * 40], seed=s) for s in range(40)] + [
         stream(["." * 20 + "x" * 20], seed=s) for s in range(9)
     ]
     rng = np.random.default_rng(0)
-    evidence = [rng.normal(size=r.lost.shape) + 1.5 * r.lost for r in records]
+    evidence = [rng.normal(size=r.band.shape) + 1.5 * r.lost for r in records]
     best, delays = choose([Latest(), Cusum(0.7), Cusum(50.0)], evidence, records, block_frames=40)
     assert best == Cusum(0.7)
     assert delays[1] < min(delays[0], delays[2])
@@ -171,7 +180,7 @@ def test_the_soonest_statistic_is_chosen():
 
 @pytest.fixture(scope="module")
 def detectors() -> tuple[Detector, ...]:
-    return (our_monitor(watching("right_logit", block_frames=60)), *rivals(make_streams(120), block_frames=60))
+    return (our_monitor(watching(block_frames=60)), *rivals(make_streams(120), block_frames=60))
 
 
 def test_rows(detectors: tuple[Detector, ...]):
@@ -184,9 +193,10 @@ def test_rows(detectors: tuple[Detector, ...]):
     for row in rows:
         group = [r for r in records if r.source == row.source]
         assert (row.part, row.objects, row.streams) == ("test", len(group), len(group))
-        assert row.frames == sum(r.lost.size for r in group)
+        assert row.frames + row.unclear_frames == sum(r.band.size for r in group)
+        assert row.unclear_frames == sum((r.band == UNCLEAR).sum() for r in group)
         assert row.lost_frames == sum(r.lost.sum() for r in group)
-        assert row.losses + row.too_late == sum(len(losses(r)) for r in group)
+        assert row.losses + row.brief == sum(len(losses(r)) for r in group)
         assert row.auroc is not None
         assert row.auroc.low is not None
         assert row.auroc.high is not None
@@ -194,6 +204,8 @@ def test_rows(detectors: tuple[Detector, ...]):
         assert (row.ece is None) == (row.detector in ("cusum", "page-hinkley"))
         for alarm in row.alarms:
             assert alarm.trials == alarm.all_trials == sum(r.loss_free for r in group)
+            assert alarm.unclear_trials == sum(r.loss_free and not r.right.all() for r in group)
+            assert alarm.unclear_false_alarms <= min(alarm.false_alarms, alarm.unclear_trials)
             assert alarm.low is not None
             assert alarm.high is not None
             assert alarm.low <= alarm.false_alarms / alarm.trials <= alarm.high
@@ -202,8 +214,8 @@ def test_rows(detectors: tuple[Detector, ...]):
         assert row.alarms[1].missed is not None
         assert row.alarms[0].missed.mean >= row.alarms[1].missed.mean
     threshold = next(r for r in rows if r.detector == "threshold")
-    score = np.concatenate([doubt(r).ravel() for r in records if r.source == "partnet-mobility"])
-    lost = np.concatenate([r.lost.ravel() for r in records if r.source == "partnet-mobility"])
+    score = np.concatenate([doubt(r)[r.judged] for r in records if r.source == "partnet-mobility"])
+    lost = np.concatenate([r.lost[r.judged] for r in records if r.source == "partnet-mobility"])
     assert threshold.auroc is not None
     assert threshold.auroc.mean == pytest.approx(auroc(score, lost))
 
@@ -241,23 +253,24 @@ def test_false_alarms_keep_the_promise():
 
 @pytest.mark.slow
 def test_false_alarms_in_so_many_frames_keep_the_promise():
-    """Alpha is for 40 frames, streams have 120: any part of a stream alarms as rarely as the first."""
-    streams = make_streams(1500, losses=0.0, queries=2, frames=120)
-    lossy = make_streams(60, first=5000, queries=2, frames=120, losses=1.0)
-    rows = drift_rows(
-        rivals([*streams[:1200], *lossy], block_frames=40),
-        [replace(r, part="test") for r in streams[1200:]],
-        budgets=[Budget(0.2, 40)],
-        resamples=2,
-        seed=0,
-    )
-    for row in rows:
-        (alarm,) = row.alarms
-        assert (alarm.alpha_frames, alarm.trials, alarm.all_trials) == (40, 300, 900)
-        assert alarm.low is not None
-        assert alarm.high is not None
-        assert alarm.low <= 0.2
-        assert alarm.high >= 0.1
+    """Alpha is for 40 frames, streams have 120: any part of a stream alarms as rarely as the first.
+
+    The promise is of the mean over calibrations, each of which is a little off: here of four, with streams of their
+    own. Three standard deviations of the mean, of thresholds and streams together, are 0.055.
+    """
+    false, trials = {}, {}
+    for first in range(0, 40_000, 10_000):
+        known = make_streams(400, first=first, losses=0.0, queries=2, frames=120)
+        lossy = make_streams(60, first=first + 1000, queries=2, frames=120, losses=1.0)
+        new = make_streams(200, first=first + 2000, losses=0.0, queries=2, frames=120, part="test")
+        detectors = rivals([*known, *lossy], block_frames=40)
+        for row in drift_rows(detectors, new, budgets=[Budget(0.2, 40)], resamples=2, seed=0):
+            (alarm,) = row.alarms
+            assert (alarm.alpha_frames, alarm.trials, alarm.all_trials) == (40, 200, 600)
+            false[row.detector] = false.get(row.detector, 0) + alarm.all_false_alarms
+            trials[row.detector] = trials.get(row.detector, 0) + alarm.all_trials
+    for detector, count in false.items():
+        assert 0.1 < count / trials[detector] < 0.255, detector
 
 
 @pytest.mark.parametrize(
@@ -271,11 +284,11 @@ def test_parts_are_whole(frames: int, each: int | None, parts: list[tuple[int, i
 
 def test_parts_after_a_loss_are_no_trials():
     record = make_streams(1, losses=0.0, frames=100)[0]
-    lost = record.lost.copy()
-    lost[50:60, 0] = True
+    band = record.band.copy()
+    band[50:60, 0] = LOST
     rows = drift_rows(
         rivals(make_streams(120, frames=100), block_frames=40),
-        [replace(record, lost=lost, part="test")],
+        [replace(record, band=band, part="test")],
         budgets=[Budget(0.2, 40), Budget(0.2)],
         resamples=2,
         seed=0,

@@ -1,4 +1,4 @@
-"""``quest weights calibrate`` and ``quest eval-monitor``, end to end on a tiny network and made-up signals."""
+"""``quest calibrate`` and ``quest eval-monitor``, end to end on a tiny network and made-up log odds."""
 
 from __future__ import annotations
 
@@ -9,26 +9,25 @@ from pathlib import Path
 
 import pytest
 
+from quest.cli.calibrate import Calibrate
 from quest.cli.evaluate_monitor import EvalMonitor
 from quest.cli.main import parse
-from quest.cli.weights import CalibrateWeights
 from quest.data.store import TakeStore
-from quest.errors import ConfigError, InputError
-from quest.evaluation import calibrate, stream_record
-from quest.evaluation.calibrate import FitConfig
-from quest.evaluation.stream_record import StreamRecord, tracker_id
+from quest.errors import ConfigError, InputError, WeightsError
+from quest.evaluation import stream_record
+from quest.evaluation.stream_record import StreamRecord
 from quest.model.weights import load_network, save_network
-from quest.monitor import Calibration
-from quest.track import Tracker, load
+from quest.monitor import Inputs, read_calibrations
+from quest.track import Tracker
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
 from tests.tiny import make_network
 
 
-def made_up(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
-    """Signals that do not come from the tracker, whose weights are random: every second stream has a loss."""
-    stream = make_stream(take.info.seed, frames=40, part=part, losses=float(take.info.seed % 2))
+def made_up(tracker: Tracker, take: Take, view: int, *, part: str, inputs: Inputs) -> StreamRecord:
+    """Log odds that do not come from the tracker, whose weights are random: every second stream has a loss."""
+    stream = make_stream(take.info.seed, frames=40, part=part, losses=float(take.info.seed % 2), inputs=inputs)
     return replace(stream, take=take.info.name, view=view, object_id=take.info.object_id)
 
 
@@ -49,16 +48,17 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(tmp_path: Path, stores: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with weights and the takes."""
     monkeypatch.setattr(stream_record, "record_stream", made_up)
-    monkeypatch.setattr(calibrate, "FitConfig", lambda: FitConfig(folds=2, hidden=(0,), decay=(0.1,), epochs=2))
     save_network(tmp_path / "w.safetensors", make_network(), settings="{}", about="a test")
     for name in ("validation", "test"):
         shutil.copytree(stores / name, tmp_path / name)
     return tmp_path
 
 
-def calibrated(folder: Path, **changes: str | int) -> int:
-    command = CalibrateWeights(folder / "w.safetensors", (str(folder / "validation"),), folder / "records")
-    return replace(command, **changes).run()  # type: ignore[arg-type]
+def calibrated(folder: Path, **changes: object) -> int:
+    command = Calibrate(
+        (str(folder / "validation"),), folder / "records", folder / "monitor.json", str(folder / "w.safetensors")
+    )
+    return replace(command, **{"inputs": ("depth",), **changes}).run()  # type: ignore[arg-type]
 
 
 def judged(folder: Path, **changes: object) -> int:
@@ -67,6 +67,7 @@ def judged(folder: Path, **changes: object) -> int:
         folder / "judged",
         folder / "records",
         weights=str(folder / "w.safetensors"),
+        monitor=folder / "monitor.json",
         resamples=3,
         out=folder / "drift.json",
     )
@@ -75,24 +76,17 @@ def judged(folder: Path, **changes: object) -> int:
 
 @pytest.mark.slow
 def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
-    before = load_network(folder / "w.safetensors")
-    assert before.monitor is None
-    made_by = tracker_id(load(folder / "w.safetensors"))
-    with pytest.raises(ConfigError, match="quest weights calibrate"):
+    with pytest.raises(WeightsError, match="quest calibrate"):
         judged(folder)
 
     assert calibrated(folder, shard="1/2") == 0
     assert "left to other shards: 10 streams" in capsys.readouterr().out
-    assert load_network(folder / "w.safetensors").monitor is None
+    assert not (folder / "monitor.json").exists()
     assert calibrated(folder, shard="0/2") == 0
     assert "AUROC" in capsys.readouterr().out
 
-    after = load_network(folder / "w.safetensors")
-    assert after.monitor is not None
-    assert Calibration.from_json(after.monitor).block_frames == 40
-    assert (after.settings, after.about) == (before.settings, before.about)
-    assert after.network.state_dict().keys() == before.network.state_dict().keys()
-    assert tracker_id(load(folder / "w.safetensors")) == made_by
+    (calibration,) = read_calibrations(folder / "monitor.json").values()
+    assert calibration.block_frames == 40
 
     assert judged(folder, shard="0/2") == 0
     assert "left to other shards: 2 streams" in capsys.readouterr().err
@@ -101,8 +95,8 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
     raw = json.loads((folder / "drift.json").read_text())
     assert [row["detector"] for row in raw["rows"]] == ["monitor", "cusum", "page-hinkley", "threshold"]
     assert all(row["detector"] in printed for row in raw["rows"])
-    assert raw["run"]["weights_hash"] == after.sha256
-    assert raw["calibration"] == Calibration.from_json(after.monitor).about
+    assert raw["run"]["weights_hash"] == load_network(folder / "w.safetensors").sha256
+    assert raw["calibration"] == calibration.about
     assert [alarm["alpha"] for alarm in raw["rows"][0]["alarms"]] == [0.01, 0.05, 0.1]
 
     assert judged(folder, alpha=(0.1,), alpha_frames=40) == 0
@@ -112,12 +106,21 @@ def test_calibrate_and_judge(folder: Path, capsys: pytest.CaptureFixture):
     with pytest.raises(ConfigError, match="40 frames"):
         judged(folder, alpha_frames=60)
 
+    with pytest.raises(ConfigError, match="no calibration for colours"):
+        judged(folder, inputs="colours")
+    assert calibrated(folder, inputs=("depth", "colours")) == 0
+    assert judged(folder, inputs="colours") == 0
+    names = sorted(path.name for path in (folder / "judged").iterdir())
+    assert names == [
+        f"panels-{n}-view0-{inputs}.npz" for n in range(110_000, 110_004) for inputs in ("colours", "depth")
+    ]
+
 
 def test_objects_of_the_calibration_are_not_judged(folder: Path):
     calibrated(folder)
     with pytest.raises(ConfigError, match="calibrated on them"):
         judged(folder, takes=(str(folder / "validation"),), split=("validation",))
-    with pytest.raises(InputError, match="none among 0 files"):
+    with pytest.raises(InputError, match="none among 0 files of depth"):
         judged(folder, calibration=folder / "elsewhere")
     with pytest.raises(ConfigError, match="alpha"):
         judged(folder, alpha=(0.0,))
@@ -125,14 +128,16 @@ def test_objects_of_the_calibration_are_not_judged(folder: Path):
         judged(folder, seed=-1)
     with pytest.raises(ConfigError, match="block_frames"):
         calibrated(folder, block_frames=0)
+    with pytest.raises(ConfigError, match="inputs"):
+        calibrated(folder, inputs=())
 
 
 @pytest.mark.slow
 def test_a_monitor_of_takes_is_judged_by_other_takes(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ):
-    def one_object(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord:
-        return replace(made_up(tracker, take, view, part=part), object_id="chest")
+    def one_object(tracker: Tracker, take: Take, view: int, *, part: str, inputs: Inputs) -> StreamRecord:
+        return replace(made_up(tracker, take, view, part=part, inputs=inputs), object_id="chest")
 
     monkeypatch.setattr(stream_record, "record_stream", one_object)
     assert calibrated(folder, unit="take") == 0
@@ -149,16 +154,8 @@ def test_the_rivals_need_the_streams_of_the_calibration(folder: Path):
     calibrated(folder)
     for left in sorted((folder / "records").iterdir())[:4]:
         left.unlink()
-    with pytest.raises(InputError, match="expected the streams that the weights were calibrated on"):
+    with pytest.raises(InputError, match="expected the streams that the monitor was calibrated on"):
         judged(folder)
-
-
-def test_a_monitor_outlives_being_saved_again(folder: Path):
-    calibrated(folder)
-    path = folder / "w.safetensors"
-    loaded = load_network(path)
-    save_network(path, loaded.network, settings=loaded.settings, about="again", monitor=loaded.monitor)
-    assert load_network(path).monitor == loaded.monitor
 
 
 def test_arguments():
@@ -180,5 +177,5 @@ def test_arguments():
     )
     assert isinstance(command, EvalMonitor)
     assert (command.takes, command.alpha) == (("a", "b"), (0.05,))
-    command = parse(["weights", "calibrate", "w.safetensors", "--takes", "a", "b", "--records", "r"])
-    assert command == CalibrateWeights(Path("w.safetensors"), ("a", "b"), Path("r"))
+    command = parse(["calibrate", "--takes", "a", "b", "--records", "r", "--inputs", "colours"])
+    assert command == Calibrate(("a", "b"), Path("r"), inputs=("colours",))

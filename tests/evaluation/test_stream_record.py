@@ -7,16 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
 from quest.evaluation import stream_record
 from quest.evaluation.selection import Shard, SplitPart
 from quest.evaluation.stream_record import (
+    LOST,
+    RIGHT,
+    UNCLEAR,
     StreamRecord,
+    bands,
+    duration_s,
     lasting,
-    lost,
     read_records,
     record_stream,
     record_streams,
@@ -24,18 +27,18 @@ from quest.evaluation.stream_record import (
     tracker_id,
     write_record,
 )
-from quest.monitor import SIGNALS
+from quest.filter.noise import Noise
+from quest.monitor import Inputs
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
-from tests.tiny import DEFAULT
 from tests.track.clips import make_tracker
 
 NAMES: dict[str, SplitPart] = {"panels-100001": "validation", "panels-100002": "validation"}
 
 
 def equal(a: StreamRecord, b: StreamRecord) -> bool:
-    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=f.name in ("signals", "confidence"))
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=f.name == "log_odds")
                for f in fields(StreamRecord))  # fmt: skip
 
 
@@ -56,42 +59,90 @@ def test_runs():
     flags = np.array([1, 1, 0, 1, 0, 1, 1, 1], bool)
     assert runs(flags) == [(0, 2), (3, 4), (5, 8)]
     assert runs(np.zeros(3, bool)) == []
-    np.testing.assert_array_equal(lasting(flags[:, None])[:, 0], [0, 0, 0, 0, 0, 1, 1, 1])
+    stamp_s = np.arange(8) / 30
+    assert [duration_s(stamp_s, *run) for run in runs(flags)] == [0.067, 0.033, 0.1]
+    np.testing.assert_array_equal(lasting(flags[:, None], stamp_s, 0.1)[:, 0], [0, 0, 0, 0, 0, 1, 1, 1])
+    np.testing.assert_array_equal(lasting(flags[:, None], 2 * stamp_s, 0.1)[:, 0], [1, 1, 0, 0, 0, 1, 1, 1])
+    assert duration_s(np.zeros(1), 0, 1) == 0.0
 
 
-def test_lost(take: Take):
-    """The truth is never lost; nor is an answer that strays for two frames, or only in depth."""
-    entities = take.tracked
+def test_bands_with_depth(take: Take):
+    """By 3D distance in normalised units; an answer that strays for two frames, or only in depth, is not lost."""
+    entities, half = take.tracked, take.info.half_diagonal_m
     uv, point = take.views[0].uv_px[:, entities], take.point_world[:, entities]
     assert take.views[0].visible[:, entities].all()
 
     def found(uv_px: np.ndarray, point_world: np.ndarray) -> np.ndarray:
-        return lost(take, 0, uv_px.astype(np.float32), point_world.astype(np.float32), entities)
+        return bands(take, 0, uv_px.astype(np.float32), point_world.astype(np.float32), entities, inputs="depth")
 
-    assert not found(uv, point).any()
+    def off(distance: float) -> np.ndarray:
+        return found(uv + 50, point + np.array([0, distance * half, 0]))
+
+    assert (found(uv, point) == RIGHT).all()
+    for distance, band in ((0.069, RIGHT), (0.071, UNCLEAR), (0.139, UNCLEAR), (0.141, LOST)):
+        assert (off(distance) == band).all()
+    assert (found(uv, point + np.array([0, 2, 0])) == RIGHT).all()  # the pixel is right: an error of lifting
     swapped_uv, swapped = uv[:, ::-1], point[:, ::-1]
-    assert found(swapped_uv, swapped).all()
+    assert (found(swapped_uv, swapped) == LOST).all()
     frames = np.arange(len(take))[:, None, None]
-    for first, last, expected in ((5, 7, False), (5, 8, True)):
+    for first, last, expected in ((5, 7, UNCLEAR), (5, 8, LOST)):
         within = (frames >= first) & (frames < last)
-        assert found(np.where(within, swapped_uv, uv), np.where(within, swapped, point)).any() == expected
-    behind = point + np.array([0.0, 2.0, 0.0])
-    assert not found(uv, behind).any()  # the pixel is right: an error of lifting
-    assert found(uv + 50.0, behind).all()
-    assert found(np.full_like(uv, np.nan), np.full_like(point, np.nan)).all()
+        band = found(np.where(within, swapped_uv, uv), np.where(within, swapped, point))
+        assert (band[first:last] == expected).all()
+        assert (band[:first] == RIGHT).all()
+        assert (band[last:] == RIGHT).all()
+    assert (found(np.full_like(uv, np.nan), np.full_like(point, np.nan)) == LOST).all()
 
 
-def test_a_stream_is_asked_by_true_pixels(take: Take):
-    record = record_stream(make_tracker(), take, 0, part="validation")
+def test_near_another_entity_is_lost_sooner(take: Take):
+    """Two thirds of the way to an entity that is 0.12 away: 0.08 from its own, 0.04 from the other."""
+    entities, half = take.tracked, take.info.half_diagonal_m
+    point = take.point_world.copy()
+    point[:, entities[1]] = point[:, entities[0]] + [0, 0.12 * half, 0]
+    close = replace(take, point_world=point)
+    uv, mine = take.views[0].uv_px[:, entities] + 50, point[:, entities]
+    for share, band in ((0.4, RIGHT), (0.55, UNCLEAR), (0.65, UNCLEAR), (0.7, LOST)):
+        between = (mine + share * (mine[:, ::-1] - mine)).astype(np.float32)
+        assert (bands(close, 0, uv, between, entities, inputs="depth") == band).all(), share
+
+
+def test_bands_of_colours(take: Take):
+    """By pixels of a picture 640 wide, while the entity is in view; this one is 64 wide."""
+    entities, view = take.tracked, take.views[0]
+    uv, nowhere = view.uv_px[:, entities], np.full_like(take.point_world[:, entities], np.nan)
+    up = np.array([0.0, 1.0], np.float32)
+
+    def found(uv_px: np.ndarray, of: Take = take) -> np.ndarray:
+        return bands(of, 0, uv_px.astype(np.float32), nowhere, entities, inputs="colours")
+
+    for distance_px, band in ((11.9, RIGHT), (12.1, UNCLEAR), (31.9, UNCLEAR), (32.1, LOST)):
+        assert (found(uv + distance_px / 10 * up) == band).all(), distance_px
+    true_px = view.uv_px.copy()
+    true_px[:, entities[1]] = true_px[:, entities[0]] + 2.4 * up
+    close = replace(take, views=(replace(view, uv_px=true_px),))
+    mine = true_px[:, entities]
+    for share, band in ((0.4, RIGHT), (0.6, UNCLEAR), (0.7, LOST)):
+        assert (found(mine + share * (mine[:, ::-1] - mine), close) == band).all(), share
+    true_px[:5, entities[0]] = [-1.0, 30.0]
+    true_px[5:9, entities[0]] = np.nan
+    band = found(np.full_like(uv, np.nan), replace(take, views=(replace(view, uv_px=true_px),)))
+    assert (band[:9, 0] == UNCLEAR).all()
+    assert (band[9:, 0] == LOST).all()
+    assert (band[:, 1] == LOST).all()
+
+
+@pytest.mark.parametrize("inputs", ["depth", "colours"])
+def test_a_stream_is_asked_by_true_pixels(take: Take, inputs: Inputs):
+    record = record_stream(make_tracker(), take, 0, part="validation", inputs=inputs)
     assert record is not None
-    assert record.signals.shape == (24, 2, len(SIGNALS))
-    assert np.isfinite(record.signals[..., SIGNALS.index("right_logit")]).all()
+    assert record.log_odds.shape == record.band.shape == (24, 2)
+    assert np.isfinite(record.log_odds).all()
     assert (record.take, record.view, record.object_id, record.part) == (take.info.name, 0, "panels-0", "validation")
     assert (record.asked == 0).all()
+    assert record.inputs == inputs
     np.testing.assert_array_equal(record.moved, take.moved[take.tracked])
-    logit = record.signals[..., SIGNALS.index("right_logit")]
-    np.testing.assert_allclose(record.confidence, 1 / (1 + np.exp(-logit)), rtol=1e-5)
     assert record.watched.all()
+    assert record.right[0].all()
 
 
 def test_recording_goes_on_where_it_stopped(store: TakeStore, tmp_path: Path):
@@ -100,77 +151,72 @@ def test_recording_goes_on_where_it_stopped(store: TakeStore, tmp_path: Path):
 
     def record(shard: str) -> tuple[int, int]:
         found = record_streams(
-            tracker, [(store, NAMES)], tmp_path, shard=Shard.parse(shard), progress=lambda name, i, n: told.append(name)
+            tracker,
+            [(store, NAMES)],
+            tmp_path,
+            inputs="depth",
+            shard=Shard.parse(shard),
+            progress=lambda name, i, n: told.append(name),
         )
         return len(found.records), found.missing
 
     assert record("0/2") == (2, 2)
-    assert told == ["panels-100001 view 0", "panels-100002 view 0"]
+    assert told == ["panels-100001 view 0, depth", "panels-100002 view 0, depth"]
     assert record("1/2") == (4, 0)
     assert len(told) == 4
     assert record("0/1") == (4, 0)
     assert len(told) == 4
-    records = read_records(tmp_path, made_by=tracker_id(tracker))
-    again = record_streams(tracker, [(store, NAMES)], tmp_path, shard=Shard())
+    records = read_records(tmp_path, inputs="depth", made_by=tracker_id(tracker))
+    again = record_streams(tracker, [(store, NAMES)], tmp_path, inputs="depth", shard=Shard())
     assert all(equal(a, b) for a, b in zip(records, again.records, strict=True))
     assert not list(tmp_path.glob(".*"))
 
 
 def test_another_tracker_records_again(store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    first, second = make_tracker(), make_tracker(seed=1)
-    assert tracker_id(first) == tracker_id(make_tracker()) != tracker_id(second)
+    """One with other noise parameters or other code; not one with other weights, which do not follow points."""
+    first, second = make_tracker(), make_tracker()
+    second.noise = replace(Noise(), stray=0.06)
+    assert tracker_id(first) == tracker_id(make_tracker(seed=1)) != tracker_id(second)
     with monkeypatch.context() as patched:
         patched.setattr(stream_record, "REVISION", -1)
         changed = tracker_id(first)
     assert changed != tracker_id(first)
-    record_streams(first, [(store, NAMES)], tmp_path, shard=Shard(0, 4))
-    with pytest.raises(InputError, match="quest weights calibrate"):
-        read_records(tmp_path, made_by=tracker_id(second))
+    record_streams(first, [(store, NAMES)], tmp_path, inputs="depth", shard=Shard(0, 4))
+    with pytest.raises(InputError, match="quest calibrate"):
+        read_records(tmp_path, inputs="depth", made_by=tracker_id(second))
     told: list[str] = []
-    record_streams(second, [(store, NAMES)], tmp_path, shard=Shard(0, 4), progress=lambda name, i, n: told.append(name))
+    record_streams(
+        second,
+        [(store, NAMES)],
+        tmp_path,
+        inputs="depth",
+        shard=Shard(0, 4),
+        progress=lambda name, *_: told.append(name),
+    )
     assert len(told) == 1
-    assert len(read_records(tmp_path, made_by=tracker_id(second))) == 1
-
-
-def test_records_outlive_what_given_points_are_not_followed_by(take: Take):
-    first = make_tracker(replace(DEFAULT, flow=True))
-    known = tracker_id(first)
-    before = record_stream(first, take, 0, part="validation")
-    assert tracker_id(make_tracker()) == known  # without the flow head
-    assert tracker_id(first.with_config(replace(first.config, slot_bias=1.0), name="other")) == known
-    with torch.no_grad():
-        for name, parameter in first.network.named_parameters():
-            if name.startswith(("affordance", "flow.")):
-                parameter += 1
-    assert tracker_id(first) == known
-    after = record_stream(first, take, 0, part="validation")
-    assert before is not None
-    assert after is not None
-    assert equal(before, after)
-    assert tracker_id(first.with_config(replace(first.config, off_joint=-1.5), name="other")) != known
-    with torch.no_grad():
-        next(first.network.binder.parameters()).add_(1)
-    assert tracker_id(first) != known
+    assert len(read_records(tmp_path, inputs="depth", made_by=tracker_id(second))) == 1
+    with pytest.raises(InputError, match="0 files of colours"):
+        read_records(tmp_path, inputs="colours", made_by=tracker_id(second))
 
 
 def test_a_view_with_nothing_to_follow_is_remembered(tmp_path: Path):
-    write_record(None, tmp_path / "empty.npz", made_by="me", take_hash="t")
-    write_record(make_stream(0), tmp_path / "full.npz", made_by="me", take_hash="t")
-    (record,) = read_records(tmp_path, made_by="me")
+    write_record(None, tmp_path / "empty-depth.npz", made_by="me", take_hash="t")
+    write_record(make_stream(0), tmp_path / "full-depth.npz", made_by="me", take_hash="t")
+    (record,) = read_records(tmp_path, inputs="depth", made_by="me")
     assert equal(record, make_stream(0))
 
 
 def test_damaged_files(tmp_path: Path):
-    path = tmp_path / "a.npz"
+    path = tmp_path / "a-depth.npz"
     write_record(make_stream(0), path, made_by="me", take_hash="t")
     whole = path.read_bytes()
     for torn in (b"", whole[:100], whole[: len(whole) // 2], b"PK"):
         path.write_bytes(torn)
         with pytest.raises(InputError, match="delete it"):
-            read_records(tmp_path, made_by="me")
+            read_records(tmp_path, inputs="depth", made_by="me")
     np.savez(path, format=np.array(0))  # of a version before: as if it were not there
     with pytest.raises(InputError, match="found none"):
-        read_records(tmp_path, made_by="me")
+        read_records(tmp_path, inputs="depth", made_by="me")
 
 
 @pytest.mark.slow
@@ -185,6 +231,7 @@ def test_takes_that_were_made_again_are_recorded_again(
             tracker,
             [(store, dict.fromkeys(NAMES, part))],
             tmp_path,
+            inputs="depth",
             shard=Shard(0, 1),
             progress=lambda name, i, n: told.append(name),
         )
@@ -198,7 +245,7 @@ def test_takes_that_were_made_again_are_recorded_again(
 
 def test_two_stores_with_one_name(store: TakeStore, tmp_path: Path):
     with pytest.raises(ConfigError, match="twice"):
-        record_streams(make_tracker(), [(store, NAMES), (store, NAMES)], tmp_path, shard=Shard())
+        record_streams(make_tracker(), [(store, NAMES), (store, NAMES)], tmp_path, inputs="depth", shard=Shard())
 
 
 @pytest.mark.parametrize("text", ["", "1", "2/2", "a/b", "-1/2", "0/0"])

@@ -1,4 +1,4 @@
-"""Settings are chosen on validation objects only, and remembering frames changes no answer."""
+"""Discovery's threshold is chosen on validation objects only, and remembering frames changes no answer."""
 
 from __future__ import annotations
 
@@ -12,9 +12,7 @@ import torch
 from quest.baselines.memory import remember_frames
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation import tuning
-from quest.evaluation.selection import SplitPart
-from quest.evaluation.tuning import Trial, discovery_bias, tune
+from quest.evaluation.tuning import Tuned, discovery_bias
 from quest.model.discovery import Peaks
 from quest.track import Tracker
 from quest.types import LABELS, Query
@@ -31,43 +29,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> TakeStore:
     return store
 
 
-def test_the_best_value_of_every_setting_is_kept(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(tuning, "GRID", {"jump": (0.001, 0.5), "hold_below": (0.0, 1.0)})
-    told: list[Trial] = []
-    tuned = tune(make_tracker(), [(store, {NAME: "validation"})], report=told.append)
-    assert list(tuned.trials) == told
-    assert [(t.name, t.value) for t in told] == [
-        ("jump", 0.001),
-        ("jump", 0.5),
-        ("hold_below", 0.0),
-        ("hold_below", 1.0),
-    ]
-    assert tuned.config.jump == min(told[:2], key=lambda t: t.ape).value
-    assert tuned.config.hold_below == min(told[2:], key=lambda t: t.ape).value
-    assert np.isfinite([t.ape for t in told]).all()
-
-
-@pytest.mark.slow
-def test_takes_of_a_suite_count_as_much_as_ordinary_ones(store: TakeStore, tmp_path: Path, monkeypatch):
-    """However many there are: the mean is over sources and suites, and over every frame within them."""
-    monkeypatch.setattr(tuning, "GRID", {"jump": (0.001,)})
-    hard = TakeStore(tmp_path)
-    names = [f"panels-10000{i}-L1-occlusion60-s000000" for i in range(2, 4)]
-    for seed, name in enumerate(names, start=2):
-        hard.write(make_take(frames=10, views=1, entities=2, size=(64, 64), seed=seed, name=name))
-    chosen: list[tuple[TakeStore, dict[str, SplitPart]]] = [
-        (store, {NAME: "validation"}), (hard, dict.fromkeys(names, "validation"))
-    ]  # fmt: skip
-    ape = [tune(make_tracker(), takes, report=lambda t: None).trials[0].ape for takes in ([c] for c in chosen)]
-    (both,) = tune(make_tracker(), chosen, report=lambda t: None).trials
-    assert both.ape == pytest.approx(np.mean(ape))
-
-
 def test_other_objects_than_validation_are_refused(store: TakeStore):
     with pytest.raises(ConfigError, match="validation"):
-        tune(make_tracker(), [(store, {NAME: "test"})], report=lambda trial: None)
+        discovery_bias(make_tracker(), [(store, {NAME: "test"})])
     with pytest.raises(ConfigError, match="none"):
-        tune(make_tracker(), [(store, {})], report=lambda trial: None)
+        discovery_bias(make_tracker(), [(store, {})])
 
 
 def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
@@ -85,13 +51,13 @@ def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pyte
         intent=torch.zeros(3, dtype=torch.long),
     )
     monkeypatch.setattr(Tracker, "candidates", lambda *_: peaks)
-    bias, precision, recall = discovery_bias(make_tracker(), [(store, {NAME: "validation"})])
-    assert (precision, recall) == pytest.approx((2 / 3, 1.0))
-    assert bias == pytest.approx(1.0)
+    tuned = discovery_bias(make_tracker(), [(store, {NAME: "validation"})])
+    assert (tuned.precision, tuned.recall) == pytest.approx((2 / 3, 1.0))
+    assert tuned.slot_bias == pytest.approx(1.0)
     wrong = replace(peaks, point_m=point_m[[0, 0, 0]] + 9)
     monkeypatch.setattr(Tracker, "candidates", lambda *_: wrong)
     tracker = make_tracker()
-    assert discovery_bias(tracker, [(store, {NAME: "validation"})]) == (tracker.config.slot_bias, 0.0, 0.0)
+    assert discovery_bias(tracker, [(store, {NAME: "validation"})]) == Tuned(tracker.config.slot_bias, 0.0, 0.0)
 
 
 def test_every_source_counts_the_same_for_the_threshold_of_discovery(
@@ -118,25 +84,17 @@ def test_every_source_counts_the_same_for_the_threshold_of_discovery(
 
     seen = {"procedural": peaks([2.0, 2.0], 0), "partnet-mobility": peaks([1.5, 1.5, 1.0, 0.0], 2)}
 
-    def discovered(*takes: tuple[TakeStore, str]) -> tuple[float, float, float]:
+    def discovered(*takes: tuple[TakeStore, str]) -> Tuned:
         answers = iter([seen[store.infos()[name].source] for store, name in takes])
         monkeypatch.setattr(Tracker, "candidates", lambda *_: next(answers))
         return discovery_bias(make_tracker(), [(store, {name: "validation"}) for store, name in takes])
 
     procedural = (store, NAME), (more, "panels-100002")
-    assert discovered(*procedural)[1:] == (1.0, 1.0)
+    both = discovered(*procedural)
+    assert (both.precision, both.recall) == (1.0, 1.0)
     one = discovered(procedural[0], (real, "44817-L1"))
-    assert one == (pytest.approx(0.0), pytest.approx(0.75), 1.0)
+    assert (one.slot_bias, one.precision, one.recall) == (pytest.approx(0.0), pytest.approx(0.75), 1.0)
     assert discovered(*procedural, (real, "44817-L1")) == one, "however many there are of either"
-
-
-def test_after_the_map_alone_only_discovery_is_tuned(store: TakeStore):
-    tracker, told = make_tracker(), list[Trial]()
-    tuned = tune(tracker, [(store, {NAME: "validation"})], report=told.append, discovery_only=True)
-    assert not told
-    assert tuned.config == replace(tracker.config, slot_bias=tuned.config.slot_bias)
-    assert 0 <= tuned.precision <= 1
-    assert 0 <= tuned.recall <= 1
 
 
 @pytest.mark.parametrize("capacity", [3, 100])

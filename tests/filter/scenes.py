@@ -8,11 +8,17 @@ import cv2
 import numpy as np
 
 from quest.filter.picture import Picture
-from quest.types import Camera, Clip
+from quest.types import Camera, Clip, Query, Tracks
+from tests.track.clips import make_tracker
 
 SIZE = (160, 120)
 FOCAL = 150.0
 WALL_M = 2.0
+
+
+def follow(clip: Clip, queries: list[Query]) -> Tracks:
+    """What the tracker answers, without a monitor."""
+    return make_tracker().track(clip, queries)
 
 
 def texture(width: int, height: int, seed: int) -> np.ndarray:

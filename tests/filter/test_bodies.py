@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from quest.baselines.filtered import Filtered
 from quest.filter.bodies import Bodies, go_on, on_joint, screw, twist, update
 from quest.filter.camera_motion import stands_still
 from quest.filter.noise import Noise
@@ -16,7 +15,7 @@ from quest.filter.rigid_motion import Seen, Surface, align, common_motion, fit, 
 from quest.filter.surfaces import Surfaces, depth_ratio, measure, sow_surfaces
 from quest.filter.view import View, move, move_back
 from quest.types import Query
-from tests.filter.scenes import SIZE, Board, scene
+from tests.filter.scenes import SIZE, Board, follow, scene
 
 MATRIX = np.array([[300.0, 0, 160], [0, 300, 120], [0, 0, 1]])
 VIEW = View(MATRIX, np.eye(4), np.full((240, 320), 2.0, np.float32))
@@ -139,7 +138,7 @@ def test_an_occluded_entity_rides_on_its_body() -> None:
     way = np.stack([10 + 2 * np.maximum(frames - 4, 0), np.full(36, 20)], axis=-1)
     cover = np.stack([way[:, 0] + 30 + np.where(frames < 14, -200, 0), np.full(36, 60)], axis=-1)
     clip = scene(np.linspace(0, 1e-3, 36), Board(way, (70, 80), 1.7, seed=5), Board(cover, (24, 24), 1.2, seed=6))
-    tracks = Filtered().track(clip, [Query.point(0, 52.0, 72.0)])
+    tracks = follow(clip, [Query.point(0, 52.0, 72.0)])
     there = way + np.array([42, 52])
     inside = there[:, 0] < SIZE[0] - 12
     off = np.linalg.norm(tracks.uv_px[:, 0] - there, axis=-1)

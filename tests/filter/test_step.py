@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quest.baselines.filtered import Filtered
-from quest.errors import ConfigError
 from quest.types import Clip, Query
-from tests.filter.scenes import FOCAL, SIZE, WALL_M, Board, scene
+from tests.filter.scenes import FOCAL, WALL_M, Board, follow, scene
 
 FRAMES = 24
 STILL = np.zeros(FRAMES)
@@ -26,7 +24,7 @@ def without_poses(clip: Clip) -> Clip:
 def test_what_rests_stays_in_the_world_while_the_camera_moves(posed: bool, depth: bool) -> None:
     camera_m = np.linspace(0, 0.4, FRAMES)
     clip = scene(camera_m, depth=depth)
-    tracks = Filtered().track(clip if posed else without_poses(clip), [Query.point(0, *AT)])
+    tracks = follow(clip if posed else without_poses(clip), [Query.point(0, *AT)])
     off = tracks.uv_px[:, 0] - np.stack([AT[0] - FOCAL * camera_m / WALL_M, np.full(FRAMES, AT[1])], axis=-1)
     assert np.abs(off).max() < 0.5
     assert tracks.visible.all()
@@ -35,7 +33,7 @@ def test_what_rests_stays_in_the_world_while_the_camera_moves(posed: bool, depth
 
 
 LAGS = pytest.mark.xfail(
-    reason="world_px stands in for the covariance of the pose: what slides is said to rest at first"
+    reason="whether a patch slipped or its entity moved is told by looks alone: what slides is said to rest at first"
 )
 
 
@@ -52,7 +50,7 @@ def test_what_moves_is_followed_and_what_rests_beside_it_stays(stride: int, dept
     way = np.stack([30 + 2.0 * np.arange(FRAMES), np.full(FRAMES, 40.0)], axis=-1)[::stride]
     clip = scene(STILL[::stride], Board(way, (50, 40), 1.7, seed=5), depth=depth)
     clip = replace(clip, stamp_s=stride * clip.stamp_s)
-    tracks = Filtered().track(clip, [Query.point(0, 55.0, 60.0), Query.point(0, 140.0, 60.0)])
+    tracks = follow(clip, [Query.point(0, 55.0, 60.0), Query.point(0, 140.0, 60.0)])
     np.testing.assert_allclose(tracks.uv_px[:, 0], way + np.array([25, 20]), atol=1.0)
     np.testing.assert_allclose(tracks.uv_px[:, 1], np.tile([140.0, 60.0], (len(way), 1)), atol=0.5)
 
@@ -61,7 +59,7 @@ def test_an_occluder_that_passes_takes_nothing_along() -> None:
     """The camera moves, so that its poses are taken from the clip."""
     camera_m = np.linspace(0, 0.2, FRAMES)
     way = np.stack([-60 + 10.0 * np.arange(FRAMES), np.full(FRAMES, 20.0)], axis=-1)
-    tracks = Filtered().track(scene(camera_m, Board(way, (50, 80), 0.8, seed=6)), [Query.point(0, *AT)])
+    tracks = follow(scene(camera_m, Board(way, (50, 80), 0.8, seed=6)), [Query.point(0, *AT)])
     there = np.stack([AT[0] - FOCAL * camera_m / WALL_M, np.full(FRAMES, AT[1])], axis=-1)
     covered = (way[:, 0] < there[:, 0] - 2) & (way[:, 0] + 50 > there[:, 0] + 2)
     assert not tracks.visible[covered, 0].any()
@@ -72,24 +70,18 @@ def test_an_occluder_that_passes_takes_nothing_along() -> None:
 def test_queries_come_in_when_they_are_asked_for() -> None:
     clip = scene(np.linspace(0, 0.2, FRAMES))
     queries = [Query.point(5, 90.0, 50.0, name="late"), Query.point(0, *AT, name="first")]
-    tracks = Filtered().track(clip, queries)
+    tracks = follow(clip, queries)
     assert tracks.names == ("late", "first")
     assert np.isnan(tracks.uv_px[:5, 0]).all()
     assert np.isfinite(tracks.uv_px[:, 1]).all()
     np.testing.assert_allclose(tracks.uv_px[5, 0], [90.0, 50.0])
-    alone = Filtered().track(clip, queries[1:])
+    alone = follow(clip, queries[1:])
     np.testing.assert_array_equal(alone.uv_px[:, 0], tracks.uv_px[:, 1])
 
 
 def test_frames_of_nothing_do_no_harm() -> None:
     clip = scene(STILL)
     blank = replace(clip, rgb=np.concatenate([clip.rgb[:4], np.zeros_like(clip.rgb[:6]), clip.rgb[10:]]))
-    tracks = Filtered().track(blank, [Query.point(0, *AT)])
+    tracks = follow(blank, [Query.point(0, *AT)])
     np.testing.assert_allclose(tracks.uv_px[:, 0], np.tile(AT, (FRAMES, 1)), atol=1.0)
-    assert Filtered().track(clip, []).uv_px.shape == (FRAMES, 0, 2)
-
-
-def test_it_follows_given_points_only() -> None:
-    with pytest.raises(ConfigError, match="quest-filter"):
-        Filtered().track(scene(STILL[:2]), None)
-    assert SIZE == (160, 120)
+    assert follow(clip, []).uv_px.shape == (FRAMES, 0, 2)

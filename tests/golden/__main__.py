@@ -25,14 +25,12 @@ from quest.data.store import TakeStore
 from quest.types import Take
 from tests.golden.streams import (
     CLIPS,
-    WEIGHTS,
     GoldenClip,
     Truth,
     arrays_of,
     cut,
     follow,
     judge,
-    key,
     load,
     write_depth,
 )
@@ -66,7 +64,7 @@ def generate(take: tuple[str, int], folder: str) -> list[str]:
     """Arguments of the command that renders a take."""
     name, seed = take
     what = ["generate", "--objects", f"procedural:{name}", "--seed", str(seed), "--out", folder]
-    return [*what, "--suite", "occlusion", "--hidden", str(HIDDEN_FRAMES), "--look-alike"]
+    return [*what, "--suite", "occlusion", "--hidden", str(HIDDEN_FRAMES), "--look-alike", "--size", "480"]
 
 
 def write(golden: GoldenClip, take: Take) -> None:
@@ -111,19 +109,16 @@ class Record:
 
     def run(self) -> int:
         """Write the answers of every clip."""
-        trackers = {weights: load(weights) for weights in WEIGHTS}
+        tracker = load()
         for golden in CLIPS:
             if self.only and golden.name not in self.only:
                 continue
             clip, truth, answers, rows = golden.read(), golden.truth(), {}, {}
-            queries = golden.queries(truth)
-            for weights, tracker in trackers.items():
-                for stride in golden.strides:
-                    run = key(weights, stride)
-                    tracks, signals = follow(tracker, clip, queries, stride)
-                    answers |= {f"{run}/{name}": value for name, value in arrays_of(tracks, signals).items()}
-                    rows[run] = {name: asdict(row) for name, row in judge(tracks, truth, stride).items()}
-                    sys.stdout.write(f"{golden.name} {run} {json.dumps(rows[run])}\n")
+            for stride in golden.strides:
+                tracks = follow(tracker, clip, golden.queries(truth), stride)
+                answers |= {f"{stride}/{name}": value for name, value in arrays_of(tracks).items()}
+                rows[stride] = {name: asdict(row) for name, row in judge(tracks, truth, stride).items()}
+                sys.stdout.write(f"{golden.name} {stride} {json.dumps(rows[stride])}\n")
             golden.folder.mkdir(exist_ok=True)
             np.savez_compressed(golden.folder / "answers.npz", **answers)
             if self.figures:

@@ -1,4 +1,4 @@
-"""Whether the tracker still follows as it did, with the weights that ship: one run a clip, weights and stride.
+"""Whether the tracker still follows as it did, with the weights that ship: one run a clip and stride.
 
 Against the truth, it must not become worse than the figures on file allow. Against the recorded answers, it must stay
 the same but for the rounding of other machines: a change that is meant is recorded anew (``python -m tests.golden``).
@@ -11,10 +11,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from quest.monitor import SIGNALS
 from tests.golden.streams import (
     CLIPS,
-    WEIGHTS,
     Figures,
     GoldenClip,
     arrays_of,
@@ -36,12 +34,9 @@ SAME_PX, SAME_M, SAME_P = 0.5, 0.005, 0.05
 SAME_AXIS_DEG = 2.0
 SAME_FLAGS = 0.05
 """Share of frames in which visible or alarm may be another: those in which a probability is near its threshold."""
-SAME_SIGNAL = 0.1
-"""Median distance to a recorded signal, as a share of its spread over all runs of the clip (and at least of 0.1)."""
-
 RUNS = [(clip, stride) for clip in CLIPS for stride in clip.strides]
 
-trackers = cache(load)
+tracker = cache(load)
 
 
 def worse(got: Figures, was: Figures, truth: str) -> list[str]:
@@ -87,24 +82,18 @@ def differences(got: dict[str, np.ndarray], was: dict[str, np.ndarray]) -> list[
     cosine = np.abs((got["axis"] * was["axis"]).sum(axis=-1))
     turned = np.degrees(np.arccos(np.clip(cosine, 0, 1)))
     found += [f"axis of {got['name'][k]}: {turned[k]:.1f} degrees" for k in np.flatnonzero(turned > SAME_AXIS_DEG)]
-    for i, signal in enumerate(SIGNALS):
-        before = was["signals"][..., i]
-        spread = max(float(np.std(before[np.isfinite(before)])), 0.1) if np.isfinite(before).any() else 0.1
-        off = float(np.median(distance(got["signals"][..., i], before))) / spread
-        found += [f"signal {signal}: {off:.2f} of its spread"] if off > SAME_SIGNAL else []
     return found
 
 
-@pytest.mark.parametrize("weights", WEIGHTS)
 @pytest.mark.parametrize(("clip", "stride"), RUNS, ids=[f"{clip.name}-{stride}" for clip, stride in RUNS])
-def test_answers_are_as_good_as_they_were_and_the_same(clip: GoldenClip, stride: int, weights: str):
+def test_answers_are_as_good_as_they_were_and_the_same(clip: GoldenClip, stride: int):
     truth = clip.truth()
-    tracks, signals = follow(trackers(weights), clip.read(), clip.queries(truth), stride)
-    got, was = judge(tracks, truth, stride), read_figures(clip, weights, stride)
+    tracks = follow(tracker(), clip.read(), clip.queries(truth), stride)
+    got, was = judge(tracks, truth, stride), read_figures(clip, stride)
     assert got.keys() == was.keys()
     kinds = dict(zip(got, truth.joint[truth.followed(tracks)].tolist(), strict=True))
     assert {name: found for name in got if (found := worse(got[name], was[name], kinds[name]))} == {}
-    assert differences(arrays_of(tracks, signals), read_answers(clip, weights, stride)) == []
+    assert differences(arrays_of(tracks), read_answers(clip, stride)) == []
 
 
 @pytest.mark.parametrize("clip", [clip for clip in CLIPS if clip.take is not None], ids=lambda clip: clip.name)
@@ -120,7 +109,6 @@ def test_a_tracker_that_becomes_worse_is_noticed():
     was = Figures(1.0, 5.0, 6.0, True, "revolute", 3.0)
     assert worse(was, was, "revolute") == []
     assert len(worse(Figures(2.0, 12.0, 30.0, False, "prismatic", None), was, "revolute")) == 5
-    answers = read_answers(CLIPS[0], WEIGHTS[0], CLIPS[0].strides[0])
+    answers = read_answers(CLIPS[0], CLIPS[0].strides[0])
     assert differences(answers, answers) == []
     assert len(differences({**answers, "uv_px": answers["uv_px"] + 1}, answers)) == len(answers["name"])
-    assert differences({**answers, "signals": answers["signals"] * 1.5}, answers)

@@ -15,9 +15,9 @@ import quest
 from quest.cli.main import main
 from quest.errors import WeightsError
 from quest.model.hub import FILE, HubId, download, model_card
+from quest.model.tensor_file import read_tensors, save_tensors
 from quest.model.weights import LoadedNetwork, load_network, save_network
 from tests.model.hub_server import COMMIT, FakeHub
-from tests.monitor.calibrations import watching
 from tests.tiny import DEFAULT, make_network
 
 ABOUT = "a test | of weights"
@@ -30,9 +30,8 @@ def file(tmp_path: Path) -> Path:
     save_network(
         path,
         make_network(),
-        settings='{"jump": 0.1}',
+        settings='{"slot_bias": 0.1}',
         about=ABOUT,
-        monitor=watching("right_logit").to_json(),
         licence="Apache-2.0",
         version="1.2",
     )
@@ -59,7 +58,7 @@ def listen(monkeypatch: pytest.MonkeyPatch, address: str) -> None:
 
 def same(one: LoadedNetwork, other: LoadedNetwork) -> bool:
     """Whether two files hold the same."""
-    fields = ("settings", "about", "monitor", "licence", "version")
+    fields = ("settings", "about", "licence", "version")
     state = other.network.state_dict()
     return (
         all(getattr(one, f) == getattr(other, f) for f in fields)
@@ -80,7 +79,7 @@ def test_a_folder_loses_nothing(file: Path, tmp_path: Path):
 
 def test_a_run_is_a_folder_of_weights(file: Path):
     assert same(load_network(file.parent), load_network(file))
-    assert quest.load(str(file.parent), device="cpu").calibration is not None
+    assert quest.load(str(file.parent), device="cpu").weights_hash == load_network(file).sha256
 
 
 def test_the_card_says_what_the_file_holds(file: Path, tmp_path: Path):
@@ -90,7 +89,6 @@ def test_the_card_says_what_the_file_holds(file: Path, tmp_path: Path):
     assert told["license"] == "apache-2.0"
     assert {"pytorch_model_hub_mixin", "rgb-d"} <= set(told["tags"])
     assert "| training | a test / of weights |" in card.text
-    assert watching("right_logit").about in card.text
     assert 'quest.load("path/to/this/folder")' in card.text
 
 
@@ -106,10 +104,10 @@ def test_the_card_beside_the_file_is_taken(file: Path, tmp_path: Path):
 
 
 def test_a_card_of_a_file_that_says_little():
-    loaded_as = {"config": DEFAULT, "about": "", "settings": "{}", "monitor": None, "licence": "", "version": ""}
+    loaded_as = {"config": DEFAULT, "about": "", "settings": "{}", "licence": "", "version": ""}
     text = str(model_card({}, text=None, load_as="owner/name", **loaded_as))  # type: ignore[arg-type]
     assert "license" not in text.partition("# Weights")[0]
-    assert "not calibrated" in text
+    assert "| licence | not said |" in text
 
 
 def test_loaded_from_the_hub_and_then_from_the_cache(hub: FakeHub, file: Path, monkeypatch: pytest.MonkeyPatch):
@@ -204,7 +202,7 @@ def test_ids():
 def test_show_and_save(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main(["weights", "show", str(file)]) == 0
     printed = capsys.readouterr().out
-    for expected in ("Apache-2.0", "1.2", load_network(file).sha256[:16], "jump 0.1", "preset default", "alpha"):
+    for expected in ("Apache-2.0", "1.2", load_network(file).sha256[:16], "slot_bias 0.1", "preset default"):
         assert expected in printed
     assert main(["weights", "save", str(file), str(tmp_path / "saved"), "--licence", "MIT"]) == 0
     assert load_network(tmp_path / "saved").licence == "MIT"
@@ -213,10 +211,7 @@ def test_show_and_save(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture
     assert "no such weights" in capsys.readouterr().err
 
 
-def test_weights_whose_monitor_is_of_no_use_are_shown(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
-    path = tmp_path / "older.safetensors"
-    replace(load_network(file), monitor='{"format": 1}').save(path)
-    assert main(["weights", "show", str(path)]) == 0
-    printed = capsys.readouterr().out
-    assert "weights calibrate" in " ".join(printed.split())
-    assert "Apache-2.0" in printed
+def test_what_older_files_say_of_a_monitor_is_left_out(file: Path, tmp_path: Path):
+    metadata, tensors = read_tensors(file)
+    save_tensors(tensors, tmp_path / "older.safetensors", metadata=metadata | {"monitor": '{"format": 3}'})
+    assert same(load_network(tmp_path / "older.safetensors"), load_network(file))

@@ -1,26 +1,33 @@
-"""The calibrator and the text that keeps it."""
+"""Calibrated log odds, and the text and file that keep a calibration."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from quest.errors import WeightsError
-from quest.monitor import SIGNALS, Budget, Calibration
-from quest.monitor import memory as memories
-from quest.monitor.calibration import rounded
-from quest.monitor.calibrator import LOGIT_LIMIT, probability
+from quest.monitor import (
+    Budget,
+    Calibration,
+    calibration_file,
+    probability,
+    read_calibrations,
+    write_calibrations,
+)
+from quest.monitor.calibration import LOGIT_LIMIT
 from quest.monitor.statistic import Cusum
-from tests.monitor.calibrations import make_calibrator, share
+from tests.monitor.calibrations import share
 
 MAXIMA = np.sort(np.random.default_rng(0).random(20))
 
 
-def made(hidden: int = 3) -> Calibration:
-    return Calibration(make_calibrator(hidden=hidden), Cusum(-1.0, 0.85), MAXIMA, 60, "a test", 0)
+def made() -> Calibration:
+    return Calibration(0.8, -0.5, Cusum(-1.0, 0.85), MAXIMA, 60, "a test", 0)
 
 
 @pytest.mark.parametrize(
@@ -68,54 +75,20 @@ def test_later_blocks_have_thresholds_that_nothing_exceeds():
     assert last < 55.0 <= next_one
 
 
-def test_squashing_and_back():
-    calibrator = make_calibrator()
-    values = 10 * np.random.default_rng(1).normal(size=(3, len(SIGNALS)))
-    squashed = calibrator.squash(values)
-    np.testing.assert_allclose(calibrator.unsquash(squashed[0]), values[0])
-    assert np.isnan(calibrator.squash(np.where(values > 0, np.inf, np.nan))).all()
+def test_log_odds_are_scaled_shifted_and_bounded():
+    log_odds = np.array([[0.0, 2.0, np.nan], [-9.0, 9.0, 1000.0]], np.float32)
+    expected = [[-0.5, 1.1, np.nan], [-7.7, 6.7, LOGIT_LIMIT]]
+    np.testing.assert_allclose(made().logit(log_odds), expected, rtol=1e-6)
+    np.testing.assert_allclose(probability(np.array([0.0, np.log(3.0), np.nan])), [0.5, 0.75, np.nan])
 
 
-@pytest.mark.parametrize("hidden", [0, 3])
-def test_logit_against_a_plain_loop(hidden: int):
-    calibrator = make_calibrator(hidden=hidden)
-    x = np.random.default_rng(2).normal(size=(5, memories.FEATURES))
-    found = calibrator.logit(x)
-    for n in range(5):
-        members = []
-        for m in range(2):
-            units = [
-                np.tanh(x[n] @ calibrator.inner[m, :, h] + calibrator.inner_bias[m, h]) * calibrator.outer[m, h]
-                for h in range(hidden)
-            ]
-            members.append(x[n] @ calibrator.direct[m] + sum(units) + calibrator.bias[m])
-        assert found[n] == pytest.approx(np.clip(np.mean(members), -LOGIT_LIMIT, LOGIT_LIMIT))
-    np.testing.assert_allclose(probability(np.array([0.0, np.log(3.0)])), [0.5, 0.75])
-
-
-def test_shares_are_what_a_signal_adds():
-    calibrator = make_calibrator(hidden=0, members=1)
-    rng = np.random.default_rng(3)
-    memory = memories.start(1)
-    for _ in range(9):
-        memory, found = calibrator.step(memory, rng.normal(size=(1, len(SIGNALS))))
-    shares = calibrator.shares(found[0], memory[0])
-    normal = memories.with_normal(found[0], memory[0])
-    np.testing.assert_allclose(shares, (found[0] - normal) @ calibrator.direct[0])
-
-
-@pytest.mark.parametrize("hidden", [0, 3])
-def test_round_trip(hidden: int):
-    calibration = made(hidden)
+def test_round_trip():
+    calibration = made()
     text = calibration.to_json()
     again = Calibration.from_json(text)
     assert "\n" not in text
     assert again.to_json() == text
-    assert (again.statistic, again.block_frames, again.about) == (Cusum(-1.0, 0.85), 60, "a test")
-    near = rounded(calibration.calibrator)
-    for name, value in vars(again.calibrator).items():
-        np.testing.assert_array_equal(value, getattr(near, name))
-        np.testing.assert_allclose(value, getattr(calibration.calibrator, name), rtol=1e-3)
+    assert replace(again, maxima=MAXIMA) == replace(calibration, maxima=MAXIMA)
     assert (again.maxima >= calibration.maxima).all()  # rounded up: a threshold never becomes more eager
     np.testing.assert_allclose(again.maxima, calibration.maxima, atol=2e-4)
 
@@ -131,20 +104,19 @@ def damaged(**changes: object) -> str:
         "[]",
         "{}",
         damaged(format=0),
-        damaged(signals=["other"]),
-        damaged(features=3),
         damaged(maxima=[]),
         damaged(maxima=[2.0, 1.0]),
         damaged(maxima="none"),
         damaged(block_frames=0),
         damaged(statistic={"drift": 0.0, "keep": 2.0}),
         damaged(statistic={"other": 0.0}),
-        damaged(calibrator={"center": [0.0]}),
-        damaged(calibrator=json.loads(made().to_json())["calibrator"] | {"scale": [0.0] * len(SIGNALS)}),
-        damaged(calibrator=json.loads(made().to_json())["calibrator"] | {"bias": [0.0]}),
+        damaged(slope=0.0),
+        damaged(slope=None),
+        damaged(shift="inf"),
+        damaged(unit="house"),
     ],
 )
-def test_a_text_of_another_version(text: str):
+def test_a_text_that_is_no_calibration(text: str):
     with pytest.raises(WeightsError, match=r"calibrate"):
         Calibration.from_json(text)
 
@@ -152,3 +124,36 @@ def test_a_text_of_another_version(text: str):
 def test_maxima_must_be_sorted():
     with pytest.raises(WeightsError, match="ascending"):
         replace(made(), maxima=MAXIMA[::-1])
+
+
+def test_the_file_keeps_both(tmp_path: Path):
+    path = tmp_path / "new" / "monitor.json"
+    both = {"depth": made(), "colours": replace(made(), slope=0.3)}
+    write_calibrations(path, both)  # type: ignore[arg-type]
+    again = read_calibrations(path)
+    assert {inputs: (c.slope, c.to_json()) for inputs, c in again.items()} == {
+        inputs: (c.slope, c.to_json()) for inputs, c in both.items()
+    }
+    write_calibrations(path, {"colours": made()})
+    assert list(read_calibrations(path)) == ["colours"]
+
+
+def test_the_file_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(calibration_file, "resources", SimpleNamespace(files=lambda package: tmp_path))
+    assert read_calibrations() == {}
+    write_calibrations(tmp_path / "assets" / "monitor.json", {"depth": made()})
+    assert list(read_calibrations()) == ["depth"]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"sound": {}}', '{"depth": {}}', '{"depth": 3}', "\ud800"])
+def test_a_file_that_is_damaged(text: str, tmp_path: Path):
+    path = tmp_path / "monitor.json"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(WeightsError, match=r"monitor\.json.*quest calibrate") as error:
+        read_calibrations(path)
+    assert "\n" not in str(error.value)
+
+
+def test_a_file_that_is_not_there(tmp_path: Path):
+    with pytest.raises(WeightsError, match=r"none\.json.*quest calibrate"):
+        read_calibrations(tmp_path / "none.json")

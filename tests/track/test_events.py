@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from quest.monitor import SIGNALS, Alarm, Signals
+from quest.monitor import Alarm
 from quest.track import StreamState
 from quest.track.events import Events
 from quest.types import State
@@ -29,7 +29,7 @@ def make_state(**changes: object) -> StreamState:
         q=np.full(2, np.nan, np.float32),
         lost_p=np.zeros(2, np.float32),
         alarm=(None, None),
-        signals=Signals(np.zeros((2, len(SIGNALS)), np.float32)),
+        lost_log_odds=np.full(2, -3.0, np.float32),
     )
     return replace(state, **changes)
 
@@ -78,7 +78,7 @@ def test_queries_come_and_go():
     one = make_state(
         **{n: getattr(make_state(), n)[1:] for n in ("names", "labels", "uv_px", "point_world", "confidence")},
         **{n: getattr(make_state(), n)[1:] for n in ("visible", "state", "query", "joint", "q", "lost_p", "alarm")},
-        signals=Signals(np.zeros((1, len(SIGNALS)), np.float32)),
+        lost_log_odds=np.zeros(1, np.float32),
     )
     events = Events()
     assert kinds(events, one, make_state(), one) == [["bound"], ["bound"], []]

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from quest.errors import InputError
-from quest.model.decoder import Anchor
 from quest.model.discovery import Candidates, Peaks
-from quest.model.network import QuestNetwork
-from quest.model.observation import Observation
 from quest.types import Clip, Query
 from tests.tiny import DEFAULT
 from tests.track.clips import make_clip, make_tracker
@@ -34,28 +32,11 @@ def peaks(*_: object, **__: object) -> Candidates:
 
 
 def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.binding.find_candidates", peaks)
-    tracker, bound, bind = make_tracker(), [], QuestNetwork.bind
-
-    def spy(self: QuestNetwork, observed: Observation, uv: torch.Tensor, *rest: torch.Tensor) -> Anchor:
-        bound.append((uv[0].tolist(), rest[-1][0].tolist()))
-        return bind(self, observed, uv, *rest)
-
-    monkeypatch.setattr(QuestNetwork, "bind", spy)
-    tracker.track(clip, [Query.semantic("rim", intent=intent) for intent in ("lift", "open")])
-    assert bound == [([[0.75, 0.75], [0.25, 0.25]], [1, 0])]
+    monkeypatch.setattr("quest.track.finder.find_candidates", peaks)
+    tracker = make_tracker()
+    tracks = tracker.track(clip, [Query.semantic("rim", intent=intent) for intent in ("lift", "open")])
+    np.testing.assert_allclose(tracks.uv_px[0], [[48, 48], [16, 16]])
     assert tracker.track(clip).names == ("rim 0", "rim 1 (lift)", "handle 2 (lift)")
-
-
-def test_what_is_asked_for_to_be_lifted_by_stands_still(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.binding.find_candidates", peaks)
-    tracker, frame = make_tracker(), clip.frame(0)
-    queries = [Query.semantic("rim", intent=intent) for intent in ("lift", "open")]
-    stream = tracker.stream(clip.camera, [*queries, Query.semantic("handle")], alpha=None)
-    stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-    # Of a handle that nobody asked for to lift by, the network may only think so.
-    for each in (stream, tracker.restore(tracker.save(stream))):
-        assert [f.ground.fixed for f in each.memory.following] == [True, False, False]
 
 
 def all_at_one_place(*_: object, **__: object) -> Candidates:
@@ -91,7 +72,7 @@ HANDLE, OPEN, LIFT = (
 
 
 def test_a_prompt_is_not_kept_from_its_entity_by_another_label(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.binding.find_candidates", all_at_one_place)
+    monkeypatch.setattr("quest.track.finder.find_candidates", all_at_one_place)
     assert names_after(clip, [HANDLE, OPEN, LIFT]) == ["handle 0", "rim 1", "rim 2"]
     assert names_after(clip, [HANDLE, HANDLE, LIFT, LIFT]) == ["handle 0", "rim 2"]
     assert make_tracker().track(clip).names == ("handle 0", "rim 1 (or handle 0)", "rim 2 (lift) (or handle 0)")
@@ -100,8 +81,8 @@ def test_a_prompt_is_not_kept_from_its_entity_by_another_label(clip: Clip, monke
 def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_purpose(
     clip: Clip, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("quest.track.binding.find_candidates", all_at_one_place)
-    monkeypatch.setattr("quest.track.binding.Binding._near", lambda _, uv, __, following: [[True] * len(following)] * 4)
+    monkeypatch.setattr("quest.track.finder.find_candidates", all_at_one_place)
+    monkeypatch.setattr("quest.track.queries.StreamQueries._near", lambda _, __, at_px: [[True] * len(at_px)] * 4)
     assert names_after(clip, [OPEN], [LIFT]) == ["rim 0", "rim 1"]
     assert names_after(clip, [OPEN], [OPEN]) == ["rim 0"]
     assert names_after(clip, [HANDLE], [OPEN]) == ["handle 0", "rim 1"]

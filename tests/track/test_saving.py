@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from quest.errors import InputError
-from quest.grounding import JointKind
+from quest.filter.joints import JointKind
 from quest.track.saving import load, save
 from quest.types import Query
 

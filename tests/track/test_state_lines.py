@@ -8,14 +8,12 @@ import numpy as np
 import pytest
 
 from quest.errors import InputError
-from quest.grounding import Joint, JointKind
+from quest.filter.joints import Joint, JointKind
 from quest.track.state_lines import StateLines, state_line
 from quest.types import State
 from tests.track.test_events import ALARM, make_state
 
-HINGE = Joint(
-    JointKind.REVOLUTE, np.array([0.0, 0, 1]), np.zeros(3), np.array([0.5, 0, 0]), 0.0, 1.0, np.eye(6), 0.002, 9
-)
+HINGE = Joint(JointKind.REVOLUTE, np.array([0.0, 0, 1]), np.zeros(3), np.array([0.5, 0, 0]), 0.0, 1.0, np.eye(4))
 DOOR = replace(make_state(), point_world=np.array([[0, 0.5, 0], [np.nan] * 3], np.float32))
 
 

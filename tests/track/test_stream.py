@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
-from quest.monitor import SIGNALS, Alarm, Budget
+from quest.monitor import Alarm, Budget
 from quest.track import Stream, StreamState, Tracker
 from quest.track.events import Events
 from quest.types import Clip, Query, State
+from tests.filter.scenes import scene
 from tests.tolerances import PIXEL_MOVED, POINT
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
@@ -33,15 +33,14 @@ def feed(stream: Stream, clip: Clip, frames: range, **changes) -> list[StreamSta
 def assert_equal(got: StreamState, expected: StreamState) -> None:
     for name in ("names", "labels", "state", "query", "alarm", "stamp_s"):
         assert getattr(got, name) == getattr(expected, name), name
-    for name in ("uv_px", "point_world", "confidence", "visible", "lost_p", "q"):
+    for name in ("uv_px", "point_world", "confidence", "visible", "lost_log_odds", "lost_p", "q"):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name), err_msg=name)
-    np.testing.assert_array_equal(got.signals.values, expected.signals.values)
 
 
 def watched(alarming: bool = False) -> Tracker:
     """A tracker with a monitor, which finds everything or nothing suspicious."""
     tracker = make_tracker()
-    tracker.calibration = make_calibration(alarming=alarming)
+    tracker.calibrations = {"depth": make_calibration(alarming=alarming)}
     return tracker
 
 
@@ -77,47 +76,21 @@ def test_a_clock_that_begins_anew_is_followed(clip: Clip):
     assert state.stamp_s == 0.0
 
 
-def test_dropped_frames_let_things_move_farther(clip: Clip):
-    tracker = make_tracker()
-    soon, later = (tracker.stream(clip.camera, POINTS) for _ in range(2))
-    for stream in (soon, later):
-        feed(stream, clip, range(1))
-    feed(soon, clip, range(4, 5), stamp_s=1 / 30)
-    feed(later, clip, range(4, 5), stamp_s=0.3)
-    spreads = [stream.memory.intake.elapsed for stream in (soon, later)]
-    assert spreads == [1.0, pytest.approx(9.0)]
-
-
-def test_equal_pictures_at_other_times_are_looked_at_once(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    tracker = make_tracker()
-    looks = []
-    encode = tracker.network.encode
-    monkeypatch.setattr(tracker.network, "encode", lambda rgb: looks.append(1) or encode(rgb))
-    stream, frame = tracker.stream(clip.camera, POINTS), clip.frame(0)
-    for t in range(3):
-        stream.step(frame.rgb, frame.depth_m, t / 30)
-    assert len(looks) == 1
-
-
 def test_missing_depth_and_poses_are_flagged(clip: Clip):
     stream = make_tracker().stream(clip.camera, POINTS)
     assert feed(stream, clip, range(1))[0].flags == ()
     assert "depth" in feed(stream, without_depth(clip, slice(1, 2)), range(1, 2))[0].flags[0]
-    assert "pose" in feed(stream, clip, range(2, 3), cam_from_world=None)[0].flags[0]
+    moved = np.eye(4)
+    moved[0, 3] = 0.01
+    feed(stream, clip, range(2, 3), cam_from_world=moved)
+    assert "pose" in feed(stream, clip, range(3, 4), cam_from_world=None)[0].flags[0]
     unposed = make_tracker().stream(clip.camera, POINTS)
     assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
 
 
-def test_time_passes_in_every_frame(clip: Clip):
-    tracker = make_tracker()
-    stream = tracker.stream(clip.camera, POINTS[:1])
-    feed(stream, without_depth(clip, slice(1, 3)), range(3))
-    feed(stream, clip, range(3, 4), stamp_s=1.0)
-    assert [s.memory.intake.now for s in (stream, tracker.restore(tracker.save(stream)))] == [3 + 28, 3 + 28]
-
-
-def test_poses_that_begin_late_move_nothing(clip: Clip):
-    """Until a pose comes the camera is taken to stand still, so its first pose is where it has been."""
+def test_poses_that_begin_late_move_nothing():
+    """Until a pose comes the world is the first camera, so the first pose is where the camera is by then."""
+    clip = scene(np.zeros(6))
     still, late = (make_tracker().stream(clip.camera, POINTS) for _ in range(2))
     turned = np.eye(4)
     turned[:3, :3] = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
@@ -151,19 +124,14 @@ def test_a_pose_of_lists_is_taken_whole(clip: Clip):
     assert stream.step(frame.rgb, frame.depth_m, 0.0, pose).names == ("a", "b")
 
 
-def test_specks_of_depth_make_no_reference(clip: Clip):
-    """A sensor that warms up: one pixel, then all."""
-    first, full = clip.frame(0), clip.frame(1)
-    assert first.depth_m is not None
-    specks = np.zeros_like(first.depth_m)
-    specks[5, 5] = first.depth_m[5, 5]
-    stream, whole = (make_tracker().stream(clip.camera, ()) for _ in range(2))
-    stream.step(first.rgb, specks, 0.0)
-    stream.step(full.rgb, full.depth_m, 0.1)
-    whole.step(full.rgb, full.depth_m, 0.1)
-    assert stream.memory.intake.reference is not None
-    assert whole.memory.intake.reference is not None
-    torch.testing.assert_close(stream.memory.intake.reference.scale, whole.memory.intake.reference.scale)
+def test_retiring_leaves_the_others_alone(clip: Clip):
+    both, one = (make_tracker().stream(clip.camera, POINTS) for _ in range(2))
+    feed(both, clip, range(3))
+    feed(one, clip, range(3))
+    one.retire("a")
+    left, kept = (feed(stream, clip, range(3, 6))[-1] for stream in (one, both))
+    np.testing.assert_allclose(left.uv_px[0], kept.uv_px[1], atol=0.5)
+    assert left.names == ("b",)
 
 
 def test_queries_come_and_go(clip: Clip):
@@ -184,19 +152,6 @@ def test_queries_come_and_go(clip: Clip):
     assert feed(stream, clip, range(7, 8), stamp_s=9.0)[0].query == ()
 
 
-def test_retiring_leaves_the_others_alone():
-    """Queries see each other in the decoder, so only what does not pass through it is equal: anchors and beliefs."""
-    clip = make_clip(frames=4)
-    stream = make_tracker().stream(clip.camera, POINTS)
-    feed(stream, clip, range(3))
-    kept, anchor = stream.memory.following[1], stream.memory.binding.anchor
-    stream.retire("a")
-    assert stream.memory.following == [kept]
-    assert stream.memory.binding.anchor is not None
-    assert anchor is not None
-    np.testing.assert_array_equal(stream.memory.binding.anchor.content[0, 0], anchor.content[0, 1])
-
-
 def test_queries_that_are_not_there(clip: Clip):
     stream = make_tracker().stream(clip.camera, POINTS)
     feed(stream, clip, range(2))
@@ -214,7 +169,7 @@ def test_a_label_is_looked_for_in_several_frames(clip: Clip):
     tracker = make_tracker(config=replace(EAGER, prompt_threshold=1.0))
     stream = tracker.stream(clip.camera, [Query.semantic("handle")])
     assert feed(stream, clip, range(2))[-1].query == ()
-    stream._binding._config = EAGER
+    stream._queries._config = EAGER
     assert feed(stream, clip, range(2, 3))[0].query == (0,)
 
 
@@ -225,21 +180,6 @@ def test_ignored_frames_use_up_no_patience(clip: Clip):
     for _ in range(9):
         assert "duplicate" in feed(stream, clip, range(1))[0].flags[0]
     assert feed(stream, clip, range(1, 2))[0].query == (0, number)
-
-
-def test_signals_are_measured(clip: Clip):
-    states = feed(make_tracker().stream(clip.camera, POINTS), clip, range(3))
-    for state in states:
-        assert state.signals.values.shape == (2, len(SIGNALS))
-        assert np.isnan(state.lost_p).all()
-        assert state.alarm == (None, None)
-    values = states[-1].signals.named(0)
-    assert all(np.isfinite(v) for v in values.values()), values
-    assert -1 <= values["anchor_cosine"] <= 1
-    first = states[0].signals.named(0)
-    assert first["embedding_cosine"] == pytest.approx(1.0, abs=1e-5)
-    dark = feed(make_tracker().stream(clip.camera, POINTS), without_depth(clip, slice(None)), range(2))[-1]
-    assert np.isfinite(dark.signals.named(0)["right_logit"])
 
 
 def test_joints_are_in_the_world(clip: Clip):
@@ -321,19 +261,10 @@ def test_a_saved_stream_keeps_what_alpha_is_for(clip: Clip):
             each.stream(clip.camera, POINTS, alpha_frames=0)
 
 
-def test_without_alpha_there_are_no_alarms(clip: Clip):
-    stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=None)
-    assert stream.budget is None
-    states = feed(stream, clip, range(8))
-    assert all(s.alarm == (None, None) for s in states)
-
-
 def test_what_is_found_again_ends_the_alarm(clip: Clip):
-    """The signals of a lost query turn good again: three such frames, and it is trusted."""
     tracker = watched(alarming=True)
     stream = tracker.stream(clip.camera, POINTS[1:], alpha=0.1)
-    states = feed(stream, clip, range(4))
-    assert states[-1].state == (State.LOST,)
+    assert feed(stream, clip, range(4))[-1].state == (State.LOST,)
     assert stream._monitor is not None
     stream._monitor.calibration = make_calibration(alarming=False)
     after = feed(stream, clip, range(4, 8))
@@ -342,22 +273,17 @@ def test_what_is_found_again_ends_the_alarm(clip: Clip):
     assert after[-1].state != (State.LOST,)
 
 
-def test_alarms_end_too_when_depth_has_gone(clip: Clip):
-    blind = replace(clip, depth_m=None)
-    stream = watched(alarming=True).stream(clip.camera, POINTS[1:], alpha=0.1)
-    feed(stream, clip, range(3))
-    assert stream._monitor is not None
-    stream._monitor.calibration = make_calibration(alarming=False)
-    after = feed(stream, blind, range(3, 8))
-    assert after[0].alarm[0] is not None
-    assert after[-1].alarm == (None,)
+def test_without_alpha_there_are_no_alarms(clip: Clip):
+    stream = watched(alarming=True).stream(clip.camera, POINTS, alpha=None)
+    assert stream.budget is None
+    states = feed(stream, clip, range(8))
+    assert all(s.alarm == (None, None) for s in states)
 
 
 @pytest.mark.parametrize("alarming", [False, True])
-@pytest.mark.parametrize(("after", "bfloat16"), [(1, False), (3, True), (5, False)])
-def test_a_saved_stream_goes_on_to_the_bit(after: int, bfloat16: bool, alarming: bool, clip: Clip):
+@pytest.mark.parametrize("after", [1, 5])
+def test_a_saved_stream_goes_on_to_the_bit(after: int, alarming: bool, clip: Clip):
     tracker = watched(alarming)
-    tracker._autocast = bfloat16
     stream = tracker.stream(clip.camera, [*POINTS, Query.semantic("handle"), Query.point(6, 9, 9, name="late")])
     feed(stream, clip, range(after))
     data = tracker.save(stream)
@@ -383,7 +309,7 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.Monk
         with pytest.raises(InputError, match="saved stream"):
             tracker.restore(torn)
     with pytest.raises(InputError, match="other weights, settings"):
-        make_tracker(config=replace(EAGER, jump=0.2)).restore(data)
+        make_tracker(config=replace(EAGER, slot_bias=0.2)).restore(data)
     monkeypatch.setattr("quest.track.tracker.REVISION", -1)
     with pytest.raises(InputError, match="another revision"):
         tracker.restore(data)

@@ -109,8 +109,8 @@ def test_an_own_map_begins_with_what_the_network_knows():
 
 @pytest.mark.slow
 def test_stage_map_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """A file that discovers otherwise and tracks the same, calibration included."""
-    save_network(tmp_path / "one.safetensors", make_network(OLD), settings="{}", about="one", monitor="{}")
+    """A file that discovers otherwise and tracks the same."""
+    save_network(tmp_path / "one.safetensors", make_network(OLD), settings="{}", about="one")
     make_store(tmp_path / "takes", (0, 1))
     make_store(tmp_path / "choose", (100_002,))
     stores = ("--data", str(tmp_path / "takes"), "--validation", str(tmp_path / "choose"))
@@ -118,7 +118,6 @@ def test_stage_map_by_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     out = ("--out", str(tmp_path / "map"))
     assert main(["train", "--stage", "map", *stores, *out, *sizes, "--weights", str(tmp_path / "one.safetensors")]) == 0
     one, two = load_network(tmp_path / "one.safetensors"), load_network(tmp_path / "map" / "weights.safetensors")
-    assert two.monitor == one.monitor
     assert two.network.config.intents
     assert two.network.affordance_trunk is not None
     new = two.network.state_dict()

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from quest.grounding import Joint, JointKind
+from quest.filter.joints import Joint, JointKind
 from quest.monitor import Budget
 from quest.types import Query
 from quest.viz.live import LiveView, joint_words, query_words
 from tests.track.test_events import ALARM, make_state
 from tests.track.test_state_lines import DOOR, HINGE
 
-RAIL = Joint(
-    JointKind.PRISMATIC, np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3), -0.001, 0.31, np.eye(4), 0.002, 9
-)  # fmt: skip
+RAIL = Joint(JointKind.PRISMATIC, np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3), -0.001, 0.31, np.eye(4))
 
 EACH_90 = Budget(0.05, 90)
 

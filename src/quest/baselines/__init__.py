@@ -1,6 +1,6 @@
 """Trackers to compare: each is one line in :data:`TRACKERS`, from which commands take names, help and errors.
 
-The plain ones follow pixels and need no weights; the others are QueST's network without one of its parts. Nothing
+The plain ones follow pixels and need no weights; the others are QueST without one of its parts. Nothing
 heavy is imported before a tracker is built.
 """
 
@@ -84,15 +84,13 @@ def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHI
 
 TRACKERS: dict[str, Entry] = {
     "quest": _of_weights("this tracker", "whole"),
-    "quest-ungrounded": _of_weights("quest without joints", "ungrounded"),
-    "quest-pixels": _of_weights("quest without depth and joints", "pixels_only", inputs=("colours",)),
+    "quest-pixels": _of_weights("quest without depth", "pixels_only", inputs=("colours",)),
     "redetect": _of_weights("its network without queries, every 4th frame", "redetect", every=4),
     "redetect-1": _of_weights("the same in every frame", "redetect", every=1),
     "flow-chain": _of_weights("its flow head, chained", "flow_chain", noise=0.0),
     "flow-chain-0.01": _of_weights("the same with noise", "flow_chain", noise=0.01),
     "flow-chain-0.02": _of_weights("the same with noise", "flow_chain", noise=0.02),
     "flow-chain-0.05": _of_weights("the same with noise", "flow_chain", noise=0.05),
-    "quest-filter": Entry("the filter by itself, with XFeat's features", "filtered:Filtered", inputs=EVERYTHING),
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
     "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),

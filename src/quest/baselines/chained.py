@@ -5,11 +5,11 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
 from quest.baselines.point_queries import check_point_queries, depth_flags, hold_last, lift_pixels, query_names
+from quest.track.preprocess import grey_of
 from quest.types import Clip, Query, State, Tracks
 
 
@@ -93,8 +93,3 @@ class Chained(ABC):
             uv_px[frame, born], alive[frame, born] = uv_first[born], True
             previous = grey
         return uv_px, alive
-
-
-def grey_of(rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
-    """Grey values of a frame."""
-    return cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 from quest.baselines import Shared
 from quest.baselines.flow_chain import FlowChain
@@ -18,13 +17,8 @@ def whole(name: str, shared: Shared) -> Tracker:
     return shared.tracker
 
 
-def ungrounded(name: str, shared: Shared) -> Tracker:
-    """The tracker without joints."""
-    return shared.tracker.with_config(replace(shared.tracker.config, ground=False), name=name)
-
-
 def pixels_only(name: str, shared: Shared) -> PixelsOnly:
-    """The tracker without depth and joints."""
+    """The tracker without depth."""
     return PixelsOnly.without_depth(shared.tracker, name=name)
 
 

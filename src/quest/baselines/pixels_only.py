@@ -16,19 +16,20 @@ from quest.types import Camera, Clip, Frame, Query, Tracks
 
 
 class PixelsOnly(Tracker):
-    """A tracker that never sees depth and is not grounded in joints; made by :meth:`without_depth`."""
+    """A tracker that never sees depth; made by :meth:`without_depth`."""
 
     name = "quest-pixels"
 
     @classmethod
     def without_depth(cls, tracker: Tracker, *, name: str = "quest-pixels") -> PixelsOnly:
-        """A tracker's network and settings without depth and without joints."""
+        """A tracker's networks and settings without depth."""
         other = cls(
             tracker.network,
-            replace(tracker.config, ground=False),
+            tracker.config,
             device=tracker.device,
             weights_hash=tracker.weights_hash,
-            calibration=tracker.calibration,
+            calibrations=tracker.calibrations,
+            noise=tracker.noise,
         )
         other.name = name
         return other
@@ -51,8 +52,7 @@ class PixelsOnly(Tracker):
 
         Returns:
             Pixels of the tracker. World points are these pixels lifted by the median of the valid depths in 3 x 3
-            pixels; where there are none, the last world point. The reference frame of the tracker has no depth either,
-            so that it knows of a moving camera only what it sees.
+            pixels; where there are none, the last world point.
         """
         tracks = super().track(replace(clip, depth_m=None), queries, alpha=alpha)
         begun = np.isfinite(tracks.uv_px).all(axis=-1)

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from quest.baselines.chained import grey_of
 from quest.baselines.hold_still import HoldStill
 from quest.baselines.lucas_kanade import checked_flow
 from quest.baselines.point_queries import lift_pixels
 from quest.data.cut import cut_clip
+from quest.track.preprocess import grey_of
 from quest.types import Clip, Query, Tracks
 
 _CORNERS = 500

@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 class EvalMonitor:
     """Judge the monitor on takes: a table in the terminal and, with --out, a result file.
 
-    Every view of every take is tracked once with alarms off and its signals are kept in --records; the monitor, CUSUM,
-    Page-Hinkley and a threshold on the network's confidence are then played on them, all calibrated on the same
-    streams. A monitor that was calibrated with --unit take is judged by other takes of the same objects: every take
-    then counts as an object.
+    Every view of every take is tracked once with alarms off, and what the tracker says of losses is kept in --records;
+    the monitor, and CUSUM, Page-Hinkley and a threshold on the tracker's own probability, are then played on that, all
+    calibrated on the same streams. A monitor that was calibrated with --unit take is judged by other takes of the same
+    objects: every take then counts as an object.
     """
 
     takes: tuple[str, ...]
@@ -37,9 +37,13 @@ class EvalMonitor:
     records: Path
     """Folder for the recorded streams."""
     calibration: Path
-    """Folder of the streams that the weights were calibrated on."""
+    """Folder of the streams that the monitor was calibrated on."""
     weights: str = "quest-s16"
     """Name or file of the weights."""
+    monitor: Path | None = None
+    """File of `quest calibrate`; default: the monitor's calibrations that ship."""
+    inputs: Literal["depth", "colours"] = "depth"
+    """What the streams bring."""
     split: tuple[Literal["validation", "test", "unlisted"], ...] = ("test",)
     """Parts of the object split."""
     level: tuple[int, ...] = ()
@@ -61,8 +65,8 @@ class EvalMonitor:
         """Record, judge, print the table, write the file.
 
         Raises:
-            ConfigError: weights without a calibration, objects that they were calibrated on, or bad settings.
-            InputError: the calibration streams are missing, of other weights, or not those of the calibration.
+            ConfigError: no calibration for such streams, objects that they were calibrated on, or bad settings.
+            InputError: the calibration streams are missing, of another tracker, or not those of the calibration.
             TakeError: a take cannot be read; those whose description is corrupt are named and omitted.
         """
         from rich.console import Console
@@ -80,10 +84,11 @@ class EvalMonitor:
             raise ConfigError(f"eval-monitor: expected resamples >= 1, seed >= 0 and at least one alpha, got {self}")
         start_s = time.monotonic()
         console = Console(stderr=True, highlight=False)
-        tracker = load(self.weights)
-        if tracker.calibration is None:
-            raise ConfigError(f"weights {self.weights}: they have no monitor; run `quest weights calibrate` first")
-        block_frames = tracker.calibration.block_frames
+        tracker = load(self.weights, monitor=self.monitor or True)
+        calibration = tracker.calibrations.get(self.inputs)
+        if calibration is None:
+            raise ConfigError(f"eval-monitor: there is no calibration for {self.inputs}; run `quest calibrate` first")
+        block_frames = calibration.block_frames
         if self.alpha_frames is not None and self.alpha_frames % block_frames:
             raise ConfigError(
                 f"eval-monitor: expected --alpha-frames as a multiple of the calibration's {block_frames} frames, got "
@@ -96,25 +101,27 @@ class EvalMonitor:
             tracker,
             takes,
             self.records,
+            inputs=self.inputs,
             shard=Shard.parse(self.shard),
             progress=lambda name, done, total: console.print(f"{done + 1}/{total} {name}"),
         )
         if recorded.missing:
             console.print(f"left to other shards: {counted(recorded.missing, 'stream')}; nothing is judged yet")
             return 0
-        known = [r for r in read_records(self.calibration, made_by=tracker_id(tracker)) if r.part == "validation"]
-        unit = tracker.calibration.unit
+        known = read_records(self.calibration, inputs=self.inputs, made_by=tracker_id(tracker))
+        known = [r for r in known if r.part == "validation"]
+        unit = calibration.unit
         streams, known = by_unit(recorded.records, unit), by_unit(known, unit)
         if unit == "take":
             console.print("calibrated on takes of the same objects: every take counts as an object")
         both = {r.object_id for r in known} & {r.object_id for r in streams}
         if both:
             raise ConfigError(f"{', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
-        detectors = self._detectors(tracker.calibration, known)
+        detectors = self._detectors(calibration, known)
         rows = drift_rows(detectors, streams, budgets=budgets, resamples=self.resamples, seed=self.seed)
         Console(width=TABLE_WIDTH).print(drift_table(rows))
         if self.out is not None:
-            write_drift(rows, self._run(tracker, takes, start_s), tracker.calibration.about, self.out)
+            write_drift(rows, self._run(tracker, takes, start_s), calibration.about, self.out)
             console.print(f"wrote {self.out}")
         return 0
 
@@ -126,7 +133,7 @@ class EvalMonitor:
         others, expected = rivals(known, block_frames=calibration.block_frames), len(calibration.maxima)
         if len(others[0].maxima) != expected:
             raise InputError(
-                f"calibration {self.calibration}: expected the streams that the weights were calibrated on, {expected} "
+                f"calibration {self.calibration}: expected the streams that the monitor was calibrated on, {expected} "
                 f"of which give thresholds, got {len(others[0].maxima)}; keep others in another folder"
             )
         return our_monitor(calibration), *others

@@ -72,7 +72,7 @@ COMMANDS: dict[str, Entry | Group] = {
     "monitor": Entry("monitor", "Monitor", "Watch a recording or a take live: states, joints and alarms."),
     "doctor": Entry("doctor", "Doctor", "Check this machine: devices, renderer, weights, extras."),
     "weights": Group(
-        "List, show, share, tune and calibrate weights.",
+        "List, show, share and tune weights.",
         {
             "list": Entry("weights", "ListWeights", "List the weights that come with the package."),
             "show": Entry("weights", "ShowWeights", "Print the content of a file of weights."),
@@ -81,8 +81,7 @@ COMMANDS: dict[str, Entry | Group] = {
             "merge": Entry("weights", "MergeWeights", "Merge parts that were trained apart."),
             "import-encoder": Entry("weights", "ImportEncoder", "Make the encoder's initial weights."),
             "pieces": Entry("weights", "PiecesWeights", "Teach discovery which pieces are handles and knobs."),
-            "tune": Entry("weights", "TuneWeights", "Choose the tracker's settings."),
-            "calibrate": Entry("weights", "CalibrateWeights", "Fit the monitor."),
+            "tune": Entry("weights", "TuneWeights", "Choose the threshold of discovery."),
         },
     ),
     "data": Group(
@@ -105,6 +104,7 @@ COMMANDS: dict[str, Entry | Group] = {
     "generate": Entry("generate", "Generate", "Render simulated takes with ground truth into a take store."),
     "train": Entry("train", "Train", "Train a network on takes."),
     "eval": Entry("evaluate", "Eval", "Score trackers."),
+    "calibrate": Entry("calibrate", "Calibrate", "Fit the monitor to takes."),
     "eval-monitor": Entry("evaluate_monitor", "EvalMonitor", "Score the monitor beside plainer rules."),
 }
 """Every command by its name on the command line, in the order of the help."""

@@ -62,8 +62,8 @@ class Monitor(Source):
         console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
         if stream.budget is None:
             console.print(
-                f"[yellow]note:[/] weights {escape(self.weights)} carry no calibration of the monitor: no alarms, "
-                "P(lost) is unknown, and exit code 0 says nothing; `quest weights calibrate` makes one"
+                "[yellow]note:[/] no calibration of the monitor: no alarms, P(lost) is unknown, and exit code 0 says "
+                "nothing; `quest calibrate` makes one"
             )
         self.say_shortfall(tracker, console, frames=length)
         view = LiveView(console, name=source.name, frames=length if source.exact else None, budget=stream.budget)

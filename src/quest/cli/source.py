@@ -29,6 +29,8 @@ class Source:
     (STORE/NAME.zarr), or the word sample or sample-alarm for a clip that ships."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
+    monitor: Path | None = None
+    """File of `quest calibrate`; default: the monitor's calibrations that ship."""
     point: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An entity by pixel, as FRAME,X,Y or FRAME,X,Y,NAME; give it again for each entity."""
     label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
@@ -139,26 +141,27 @@ class Source:
         """Print which alarms there will never be, if the monitor's calibration is too small for some.
 
         Args:
-            tracker: with the weights.
+            tracker: with its calibrations.
             console: to print on.
             frames: length of the recording, if it is known.
         """
         from quest.monitor import Budget
 
         budget = Budget(self.alpha, self.alpha_frames)
-        if tracker.calibration is not None and (why := tracker.calibration.shortfall(budget, frames=frames)):
-            console.print(f"[yellow]note:[/] weights {escape(self.weights)}: {why}; `quest weights calibrate`")
+        calibration = tracker.calibrations.get("depth")
+        if calibration is not None and (why := calibration.shortfall(budget, frames=frames)):
+            console.print(f"[yellow]note:[/] monitor: {why}; `quest calibrate`")
 
     def tracker(self) -> Tracker:
         """The tracker of the weights.
 
         Raises:
-            WeightsError: no such weights, or the file is damaged.
+            WeightsError: no such weights or calibrations, or a file is damaged.
             ConfigError: no such device.
         """
         from quest.track import load
 
-        return load(self.weights, device=self.device)
+        return load(self.weights, device=self.device, monitor=self.monitor or True)
 
 
 def _check_memory(source: FrameSource) -> None:

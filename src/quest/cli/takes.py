@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from quest.data.store import TakeStore
+    from quest.evaluation.selection import SplitPart
 
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -104,6 +105,29 @@ def open_store(where: str) -> TakeStore:
     if not store.exists():
         raise TakeError(f"store {where}: no such folder; check the path, or make takes with `quest generate`")
     return store
+
+
+def takes_to_choose_by(
+    stores: Iterable[str], *, levels: tuple[int, ...], objects: tuple[str, ...] = ()
+) -> list[tuple[TakeStore, dict[str, SplitPart]]]:
+    """Takes of validation objects, and of objects in no part of the split, which count as such here, store by store.
+
+    Args:
+        stores: their folders or URLs; takes whose description is corrupt are named and omitted.
+        levels: to use; all if there are none.
+        objects: to use; all if there are none.
+
+    Raises:
+        TakeError: there is no such store.
+    """
+    from quest.evaluation.selection import select_takes
+
+    found = []
+    for store in map(open_store, stores):
+        say_corrupt([store])
+        chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
+        found.append((store, dict.fromkeys(chosen, "validation")))
+    return found
 
 
 def _is_take(where: str) -> bool:

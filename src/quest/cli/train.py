@@ -178,9 +178,8 @@ class Train:
         network, before = loaded.network.train(), f"{loaded.about}; "
         if self.stage == 1:
             return _Start(without_flow_head(network), loaded.settings, about=before, licence=loaded.licence)
-        # Tracking stays as it is, and so does what the monitor was calibrated on.
         grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
-        return _Start(grown, loaded.settings, loaded.monitor, before, loaded.licence)
+        return _Start(grown, loaded.settings, before, loaded.licence)
 
     def _dataset(self, network: WindowNetwork[DecoderConfig], device: torch.device, progress: Progress) -> Dataset:
         from quest.cli.takes import open_store, say_corrupt
@@ -235,17 +234,16 @@ class Train:
             network.save(file, about=about, licence=licence)
         else:
             assert isinstance(network, QuestNetwork)
-            save_network(file, network, settings=start.settings, about=about, monitor=start.monitor, licence=licence)
+            save_network(file, network, settings=start.settings, about=about, licence=licence)
         return file
 
 
 @dataclass(frozen=True)
 class _Start:
-    """What to train; settings of the tracker and calibration of the monitor to store with it, as JSON text; licence."""
+    """What to train; settings of the tracker to store with it, as JSON text; licence."""
 
     network: WindowNetwork[DecoderConfig]
     settings: str = ""
-    monitor: str | None = None
     about: str = ""
     licence: str = ""
 

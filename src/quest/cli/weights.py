@@ -1,4 +1,4 @@
-"""``quest weights``: list, show, save, push, merge, import the encoder, learn pieces, tune, calibrate."""
+"""``quest weights``: list, show, save, push, merge, import the encoder, learn pieces, tune."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import tyro
 from rich.console import Console
@@ -17,8 +17,6 @@ from rich.table import Table
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from quest.data.store import TakeStore
-    from quest.evaluation.selection import SplitPart
     from quest.model.weights import LoadedNetwork
 
 
@@ -53,7 +51,7 @@ class ListWeights:
 
 @dataclass(frozen=True)
 class ShowWeights:
-    """Print the content of a file of weights: network, training, tracker settings, monitor, licence, hash."""
+    """Print the content of a file of weights: network, training, tracker settings, licence, hash."""
 
     weights: tyro.conf.Positional[str]
     """Shipped name, file, folder, or owner/name on the Hugging Face hub (fetched if the cache has no copy)."""
@@ -122,7 +120,7 @@ class MergeWeights:
     """Merge parts that were trained apart: tracking, the affordance map, the flow head."""
 
     weights: tyro.conf.Positional[str]
-    """Shipped name, file or folder: the part that tracks, with its settings and monitor."""
+    """Shipped name, file or folder: the part that tracks, with its settings."""
     out: tyro.conf.Positional[Path]
     """File to write."""
     map: tuple[str, ...] = ()
@@ -165,7 +163,7 @@ class ImportEncoder:
 
 @dataclass(frozen=True)
 class TuneWeights:
-    """Choose the tracker's settings on validation objects and store them with the weights.
+    """Choose the threshold of discovery on validation objects and store it with the weights.
 
     Your own objects, which are in no part of the split, count as validation objects here: name a store that did not
     teach.
@@ -174,38 +172,28 @@ class TuneWeights:
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
     takes: tuple[str, ...] = ("takes",)
-    """Stores with takes of validation objects, or of your own. Ordinary takes and those of every suite count alike."""
+    """Stores with takes of validation objects, or of your own, of which the first frames are used."""
     level: tuple[int, ...] = (1,)
     """Levels of the takes to use."""
     objects: tuple[str, ...] = ()
     """Objects to use; all by default."""
-    discovery_only: bool = False
-    """Leave all settings but the threshold of discovery as they are, as after training with --stage map."""
 
     def run(self) -> int:
-        """Tune, print every trial, rewrite the file."""
-        from quest.evaluation.stream_record import tracker_id
-        from quest.evaluation.tuning import tune
+        """Tune, print how discovery does, rewrite the file."""
+        from quest.cli.takes import takes_to_choose_by
+        from quest.evaluation.tuning import discovery_bias
         from quest.model.weights import load_network
         from quest.track import load
 
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
-        takes = _to_choose_by(self.takes, levels=self.level, objects=self.objects)
+        takes = takes_to_choose_by(self.takes, levels=self.level, objects=self.objects)
         tracker = load(self.weights, monitor=False)
-        tuned = tune(
-            tracker,
-            takes,
-            report=lambda t: console.print(f"{t.name} {t.value}: APE {t.ape:.4f}"),
-            discovery_only=self.discovery_only,
-        )
+        tuned = discovery_bias(tracker, takes)
+        config = replace(tracker.config, slot_bias=tuned.slot_bias)
         console.print(f"discovery: precision {tuned.precision:.1%}, recall {tuned.recall:.1%}")
-        console.print(f"settings {tuned.config.to_json()}")
-        found = replace(load_network(self.weights), settings=tuned.config.to_json())
-        if found.monitor and tracker_id(tracker) != tracker_id(tracker.with_config(tuned.config, name=tracker.name)):
-            console.print("other settings make other signals: the monitor is dropped; run `quest weights calibrate`")
-            found = replace(found, monitor=None)
-        found.save(self.weights)
+        console.print(f"settings {config.to_json()}")
+        replace(load_network(self.weights), settings=config.to_json()).save(self.weights)
         return 0
 
 
@@ -214,7 +202,7 @@ class PiecesWeights:
     """Teach discovery which pieces that stand out of planes are handles and knobs, and store it with the weights.
 
     After training the affordance map, on takes of training objects that the map did not learn from, or of your own.
-    Tune the threshold afterwards (`quest weights tune --discovery-only`).
+    Tune the threshold afterwards (`quest weights tune`).
     """
 
     weights: tyro.conf.Positional[Path]
@@ -251,65 +239,6 @@ class PiecesWeights:
         return 0
 
 
-@dataclass(frozen=True)
-class CalibrateWeights:
-    """Fit the monitor on validation objects and store it with the weights.
-
-    Every view of every take is tracked once and its signals are kept in --records, so that an interrupted run goes on
-    where it stopped. Tune before you calibrate: other settings make other signals. Your own objects, which are in no
-    part of the split, count as validation objects here: name stores that did not teach.
-    """
-
-    weights: tyro.conf.Positional[Path]
-    """File of trained weights; it is rewritten."""
-    takes: tuple[str, ...]
-    """Stores with takes of validation objects, or of your own."""
-    records: Path
-    """Folder for the recorded streams."""
-    level: tuple[int, ...] = ()
-    """Levels of the takes to use; all by default."""
-    shard: str = "0/1"
-    """Part of the streams to record, such as 0/2 and 1/2 for two processes side by side; the last one fits."""
-    block_frames: int | None = None
-    """Length of the streams that thresholds rest on; that of the shortest by default."""
-    unit: Literal["object", "take"] = "object"
-    """Subject of the promise: other objects, or other takes of these objects (where there are few objects)."""
-
-    def run(self) -> int:
-        """Record, fit, rewrite the file."""
-        from quest.errors import ConfigError
-        from quest.evaluation.calibrate import fit_calibration
-        from quest.evaluation.selection import Shard
-        from quest.evaluation.stream_record import record_streams
-        from quest.model.weights import load_network
-        from quest.track import load
-
-        _must_be_a_file(self.weights)
-        if self.block_frames is not None and self.block_frames < 1:
-            raise ConfigError(f"calibrate: expected block_frames of at least 1, got {self.block_frames}")
-        console = Console(highlight=False)
-        takes = _to_choose_by(self.takes, levels=self.level)
-        recorded = record_streams(
-            load(self.weights, monitor=False),
-            takes,
-            self.records,
-            shard=Shard.parse(self.shard),
-            progress=lambda name, done, total: console.print(f"{done + 1}/{total} {escape(name)}"),
-        )
-        if recorded.missing:
-            console.print(f"left to other shards: {counted(recorded.missing, 'stream')}; nothing is fitted yet")
-            return 0
-        fitted = fit_calibration(recorded.records, block_frames=self.block_frames, unit=self.unit)
-        monitor = fitted.calibration.to_json()
-        console.print(_monitor(monitor))
-        console.print(
-            f"cross-validated: AUROC {fitted.auroc:.4f}, ECE {fitted.ece:.4f}, mean delay {fitted.delay:.1f} frames; "
-            f"{fitted.hidden} hidden units, decay {fitted.decay}, {fitted.calibration.statistic}"
-        )
-        replace(load_network(self.weights), monitor=monitor).save(self.weights)
-        return 0
-
-
 def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedNetwork:
     """A network with another licence or version, where they are given."""
     from quest.model.weights import load_network
@@ -335,7 +264,6 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
         "network": f"preset {preset}: {_pairs(config)}",
         "encoder": _pairs(encoder),
         "tracker": _pairs(json.loads(loaded.settings)) or "the usual settings",
-        "monitor": _monitor(loaded.monitor),
     }
 
 
@@ -352,39 +280,5 @@ def _must_be_a_file(weights: Path) -> None:
         raise ConfigError(f"{weights}: the file is written anew beside itself, and {weights.parent} cannot be written")
 
 
-def _monitor(calibration: str | None) -> str:
-    from quest.errors import WeightsError
-    from quest.monitor import Calibration
-    from quest.track.settings import REVISION
-
-    if calibration is None:
-        return "not calibrated: no alarms; see `quest weights calibrate`"
-    try:
-        monitor = Calibration.from_json(calibration)
-    except WeightsError as error:
-        return str(error)  # the rest of the file is of use still
-    if monitor.revision != REVISION:
-        return (
-            f"of no use: calibrated on a tracker of revision {monitor.revision}, this is {REVISION}; "
-            "run `quest weights calibrate` again"
-        )
-    return f"{monitor.about}; alpha of at least {monitor.least_alpha:.3g} can be promised"
-
-
 def _pairs(values: Mapping[str, Any]) -> str:
     return ", ".join(f"{key} {value}" for key, value in values.items())
-
-
-def _to_choose_by(
-    stores: tuple[str, ...], *, levels: tuple[int, ...], objects: tuple[str, ...] = ()
-) -> list[tuple[TakeStore, dict[str, SplitPart]]]:
-    """Takes of validation objects, and of objects in no part of the split, which count as such here, store by store."""
-    from quest.cli.takes import open_store, say_corrupt
-    from quest.evaluation.selection import select_takes
-
-    found = []
-    for store in map(open_store, stores):
-        say_corrupt([store])
-        chosen = select_takes(store.infos(), split=("validation", "unlisted"), levels=levels, objects=objects)
-        found.append((store, dict.fromkeys(chosen, "validation")))
-    return found

@@ -1,8 +1,8 @@
 """The monitor and the rules that it is compared with, each calibrated by the same rule on the same streams.
 
 Every detector collects evidence with a statistic and alarms where that exceeds a conformal threshold. The monitor's
-evidence is its log odds of a loss; that of the others is the network's own doubt, one minus its confidence. Recorded
-streams are played many at once; the monitor itself does the same frame by frame.
+evidence is calibrated log odds of a loss; that of the others is the tracker's own probability of one, uncalibrated.
+Recorded streams are played many at once; the monitor itself does the same frame by frame.
 """
 
 from __future__ import annotations
@@ -14,48 +14,14 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
 from quest.errors import ConfigError
 from quest.evaluation.drift import DEADLINE_FRAMES, delay_of, losses
 from quest.evaluation.stream_record import StreamRecord
-from quest.monitor import Calibration
-from quest.monitor import memory as memories
-from quest.monitor.calibrator import Calibrator, probability
+from quest.monitor import Calibration, probability
 from quest.monitor.conformal import Budget, Threshold, threshold
 from quest.monitor.statistic import Cusum, Latest, PageHinkley, Statistic
-
-
-def replay_features(calibrator: Calibrator, records: Sequence[StreamRecord]) -> list[Float32[np.ndarray, "_ _ F"]]:
-    """Features of every frame and query; zero before a query was asked.
-
-    Args:
-        calibrator: squashes the signals; its weights do not matter.
-        records: the streams.
-    """
-    found = [np.zeros((*r.lost.shape, memories.FEATURES), np.float32) for r in records]
-    for batch in _batches(records):
-        signals = np.concatenate([records[i].signals for i in batch], axis=1).astype(np.float64)
-        watched = np.concatenate([records[i].watched for i in batch], axis=1)
-        cuts = np.cumsum([records[i].lost.shape[1] for i in batch])[:-1]
-        memory = memories.start(signals.shape[1])
-        for t, active in enumerate(watched):
-            memory[active], values = calibrator.step(memory[active], signals[t, active])
-            row = np.zeros((len(active), memories.FEATURES))
-            row[active] = values
-            for i, own in zip(batch, np.split(row, cuts), strict=True):
-                found[i][t] = own
-    return found
-
-
-def replay_logits(calibrator: Calibrator, features: Sequence[Float32[np.ndarray, "_ _ F"]]) -> list[np.ndarray]:
-    """Log odds of a loss in every frame and query, T by K.
-
-    Args:
-        calibrator: the one whose squashing made the features.
-        features: from :func:`replay_features`.
-    """
-    return [calibrator.logit(x.reshape(-1, x.shape[-1]).astype(np.float64)).reshape(x.shape[:2]) for x in features]
 
 
 def replay_statistic(
@@ -69,7 +35,7 @@ def replay_statistic(
 
     Args:
         statistic: collects the evidence; it starts from nothing at the beginning of every block.
-        evidence: per stream.
+        evidence: per stream; where it is NaN, the statistic stays as it is.
         records: the streams.
         block_frames: length of a block.
     """
@@ -77,12 +43,14 @@ def replay_statistic(
     for batch in _batches(records):
         joined = np.concatenate([evidence[i] for i in batch], axis=1)
         watched = np.concatenate([records[i].watched for i in batch], axis=1)
-        cuts = np.cumsum([records[i].lost.shape[1] for i in batch])[:-1]
+        cuts = np.cumsum([records[i].band.shape[1] for i in batch])[:-1]
         path = np.full(joined.shape, -np.inf)
         state = np.zeros((joined.shape[1], statistic.size))
-        for t, active in enumerate(watched):
+        for t, active in enumerate(watched & ~np.isnan(joined)):
             if t % block_frames == 0:
                 state[:] = 0.0
+            elif t:
+                path[t] = path[t - 1]
             state[active], path[t, active] = statistic.update(state[active], joined[t, active])
         for i, own in zip(batch, np.split(path, cuts, axis=1), strict=True):
             found[i] = own
@@ -100,7 +68,7 @@ def _batches(records: Sequence[StreamRecord]) -> Iterator[list[int]]:
 AnyStatistic = TypeVar("AnyStatistic", bound=Statistic)
 
 FIT_PERCENT = 40
-"""Share of the objects whose streams the calibrator is fitted on; those of the others give the thresholds."""
+"""Share of the objects whose streams anything is fitted to; those of the others give the thresholds."""
 
 _JUDGED_AT = (0.05, 0.1)
 
@@ -121,7 +89,7 @@ class Detector:
     block_frames: int
     """Length of these streams."""
     calibration: Calibration | None = None
-    """The monitor's; None for the rules on the network's own confidence."""
+    """The monitor's; None for the rules on the tracker's own probability."""
     probabilistic: bool = False
     """Whether the score of a frame is meant as a probability."""
 
@@ -155,20 +123,19 @@ def play(detector: Detector, records: Sequence[StreamRecord]) -> Played:
     if detector.calibration is None:
         evidence = [doubt(record) for record in records]
     else:
-        calibrator = detector.calibration.calibrator
-        evidence = replay_logits(calibrator, replay_features(calibrator, records))
+        evidence = [detector.calibration.logit(record.log_odds) for record in records]
     path = replay_statistic(detector.statistic, evidence, records, block_frames=detector.block_frames)
     score = path if detector.calibration is None else [probability(value) for value in evidence]
     return Played(score, path)
 
 
 def doubt(record: StreamRecord) -> Float64[np.ndarray, "T K"]:
-    """One minus the network's own confidence; one where it has none."""
-    return np.nan_to_num(1.0 - record.confidence.astype(np.float64), nan=1.0)
+    """The tracker's own probability of a loss; NaN where it has none."""
+    return probability(record.log_odds)
 
 
 def our_monitor(calibration: Calibration) -> Detector:
-    """The monitor that is stored with the weights."""
+    """The monitor with a calibration."""
     return Detector(
         "monitor",
         calibration.statistic,
@@ -180,7 +147,7 @@ def our_monitor(calibration: Calibration) -> Detector:
 
 
 def rivals(records: Sequence[StreamRecord], *, block_frames: int) -> tuple[Detector, ...]:
-    """CUSUM, Page-Hinkley and a threshold on the network's own confidence, at their best settings.
+    """CUSUM, Page-Hinkley and a threshold on the tracker's own probability, at their best settings.
 
     Settings are chosen, as the monitor's are, on the streams that it is fitted on; thresholds come from the others.
 
@@ -204,7 +171,7 @@ def rivals(records: Sequence[StreamRecord], *, block_frames: int) -> tuple[Detec
 
 
 def fit_part(records: Sequence[StreamRecord]) -> tuple[list[StreamRecord], list[StreamRecord]]:
-    """Streams that calibrators are fitted on, and those that give thresholds; no object is in both.
+    """Streams that are fitted to, and those that give thresholds; no object is in both.
 
     An object's part follows from its name alone, so that it does not depend on which others there are.
     """
@@ -242,7 +209,7 @@ def loss_free_maxima(
     """
     long = [i for i, record in enumerate(records) if len(record) >= block_frames]
     drawn = [long[i] for i in one_per_object([records[i] for i in long])]
-    free = [i for i in drawn if not (records[i].lost & records[i].watched)[:block_frames].any()]
+    free = [i for i in drawn if not records[i].lost[:block_frames].any()]
     if not free:
         raise ConfigError(
             f"monitor: expected loss-free streams of at least {block_frames} frames to take thresholds from, found "
@@ -272,7 +239,7 @@ def choose(
         ConfigError: the streams have no loss or none without.
     """
     free = [i for i, record in enumerate(records) if record.loss_free]
-    events = [(i, loss) for i, record in enumerate(records) for loss in losses(record) if not loss.too_late]
+    events = [(i, loss) for i, record in enumerate(records) for loss in losses(record) if loss.lasts]
     if not free or not events:
         raise ConfigError(
             f"monitor: expected streams with losses and streams without to fit on, got {len(events)} losses and "

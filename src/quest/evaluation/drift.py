@@ -10,13 +10,13 @@ from jaxtyping import Bool, Float, Int
 from scipy.stats import beta
 
 from quest.evaluation.bootstrap import LEVEL
-from quest.evaluation.stream_record import StreamRecord, runs
+from quest.evaluation.stream_record import StreamRecord, duration_s, runs
 
 DEADLINE_FRAMES = 30
 """A loss is missed if no alarm comes within this many frames of its first, or before it ends if that is later."""
 
-LEAST_FRAMES = 10
-"""A loss that begins with fewer frames left in the stream is not judged: nobody could have said much yet."""
+LASTING_S = 0.5
+"""A loss that does not last so long, or whose stream ends sooner, is not judged: nobody could have said much yet."""
 
 BINS = 15
 """Of the calibration error, equally wide."""
@@ -24,28 +24,29 @@ BINS = 15
 
 @dataclass(frozen=True)
 class Loss:
-    """The first loss of a query's identity in a stream."""
+    """The first lasting loss of a query in a stream, or its first where none lasts."""
 
     query: int
     """Index of the query."""
+    first: int
+    """The first frame in which the query is lost at all."""
     start: int
-    """Its first frame."""
+    """The loss's first frame."""
     deadline: int
     """The frame after the last one in which an alarm still counts."""
-    too_late: bool
-    """Whether it begins so late in the stream that it is not judged."""
+    lasts: bool
+    """Whether it lasts for :data:`LASTING_S`; others are not judged."""
 
 
 def losses(record: StreamRecord) -> list[Loss]:
-    """First losses of the queries of a stream; later ones depend on whether the first alarm was cleared."""
+    """One loss of each query that is ever lost; later ones depend on whether the first alarm was cleared."""
     found = []
-    frames = len(record)
-    for k in range(record.lost.shape[1]):
-        spans = runs((record.lost & record.watched)[:, k])
-        if spans:
-            start, end = spans[0]
-            deadline = min(max(start + DEADLINE_FRAMES, end), frames)
-            found.append(Loss(k, start, deadline, too_late=start + LEAST_FRAMES > frames))
+    for k in range(record.band.shape[1]):
+        spans = runs(record.lost[:, k])
+        lasting = [span for span in spans if duration_s(record.stamp_s, *span) >= LASTING_S]
+        for start, end in (lasting or spans)[:1]:
+            deadline = min(max(start + DEADLINE_FRAMES, end), len(record))
+            found.append(Loss(k, spans[0][0], start, deadline, lasts=bool(lasting)))
     return found
 
 

@@ -29,7 +29,7 @@ from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
 from quest.monitor import Budget
 
-FORMAT = 1
+FORMAT = 2
 """Version of the result file."""
 
 TABLE_WIDTH = 170
@@ -61,10 +61,14 @@ class AlarmRow:
     """All loss-free streams or parts, those of one object dependent on each other."""
     all_false_alarms: int
     """How many of them raised an alarm."""
+    unclear_trials: int
+    """How many of :attr:`trials` are not always right, though never lost."""
+    unclear_false_alarms: int
+    """How many of these raised an alarm."""
     missed: Value | None
     """Share of judged losses that are missed."""
     early: Value | None
-    """Share of judged losses whose query had alarmed before."""
+    """Share of judged losses whose query had alarmed before it was ever lost."""
     delay_median: Value | None
     """Frames from the loss to the alarm; a missed loss has an infinite delay, and the value is None where the median is
     infinite or there are no losses."""
@@ -87,13 +91,15 @@ class DriftRow:
     streams: int
     """How many."""
     frames: int
-    """(frame, query) pairs."""
+    """(frame, query) pairs that are right or lost."""
     lost_frames: int
     """Of these."""
+    unclear_frames: int
+    """Pairs beside these, which are neither."""
     losses: int
-    """First losses of queries that are judged."""
-    too_late: int
-    """First losses that begin too near the end of the stream to be judged."""
+    """Queries with a loss that is judged."""
+    brief: int
+    """Queries that are lost, but never long enough to be judged."""
     auroc: Value | None
     """Per frame."""
     augrc: Value | None
@@ -136,10 +142,10 @@ def _row(
     detector: Detector, records: list[StreamRecord], owner: np.ndarray, draws: np.ndarray, budgets: Sequence[Budget]
 ) -> DriftRow:
     played = play(detector, records)
-    watched = [r.watched for r in records]
-    score = np.concatenate([s[w] for s, w in zip(played.score, watched, strict=True)])
-    lost = np.concatenate([r.lost[w] for r, w in zip(records, watched, strict=True)])
-    weights = _Weights(np.repeat(owner, [int(w.sum()) for w in watched]), draws)
+    judged_frames = [r.judged for r in records]
+    score = np.concatenate([s[j] for s, j in zip(played.score, judged_frames, strict=True)])
+    lost = np.concatenate([r.lost[j] for r, j in zip(records, judged_frames, strict=True)])
+    weights = _Weights(np.repeat(owner, [int(j.sum()) for j in judged_frames]), draws)
     rank = np.unique(score, return_inverse=True)[1]
 
     def area(weight: np.ndarray) -> float:
@@ -148,7 +154,7 @@ def _row(
     def risk(weight: np.ndarray) -> float:
         return augrc(area(weight), float((weight * lost).sum() / weight.sum()))
 
-    judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if not loss.too_late]
+    every = [loss for r in records for loss in losses(r)]
     return DriftRow(
         detector=detector.name,
         part=records[0].part,
@@ -157,8 +163,9 @@ def _row(
         streams=len(records),
         frames=len(lost),
         lost_frames=int(lost.sum()),
-        losses=len(judged),
-        too_late=sum(loss.too_late for r in records for loss in losses(r)),
+        unclear_frames=sum(int((r.watched & ~r.right & ~r.lost).sum()) for r in records),
+        losses=sum(loss.lasts for loss in every),
+        brief=sum(not loss.lasts for loss in every),
         auroc=weights.value(area, len(lost)),
         augrc=weights.value(risk, len(lost)),
         ece=weights.value(lambda w: calibration_error(score, lost, w), len(lost)) if detector.probabilistic else None,
@@ -177,8 +184,8 @@ class _Weights:
 
     def value(self, metric: Callable[[np.ndarray], float], count: int) -> Value | None:
         """The metric and its percentile interval; None where it is not defined or infinite."""
-        mean = metric(np.ones(len(self.owner)))
-        if not count or not math.isfinite(mean):
+        mean = metric(np.ones(len(self.owner))) if count else math.nan
+        if not math.isfinite(mean):
             return None
         if len(np.unique(self.owner)) < 2:
             return Value(mean, None, None, count)
@@ -206,20 +213,21 @@ def _alarm_row(
         (i, n): bool(above[i][first:last].any())
         for i, r in enumerate(records)
         for n, (first, last) in enumerate(parts[i])
-        if not (r.lost & r.watched)[:last].any()
+        if not r.lost[:last].any()
     }
     one_each = [(i, one_part(records[i], len(parts[i]))) for i in one_per_object(records)]
     drawn = [place for place in one_each if place in alarmed]
+    unclear = [(i, n) for i, n in drawn if (records[i].watched & ~records[i].right)[slice(*parts[i][n])].any()]
     false = sum(alarmed[place] for place in drawn)
     low, high = clopper_pearson(false, len(drawn)) if drawn else (None, None)
-    judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if not loss.too_late]
+    judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if loss.lasts]
     delay = np.array([delay_of(loss, above[i][:, loss.query]) for i, loss in judged])
-    early = np.array([above[i][: loss.start, loss.query].any() for i, loss in judged], dtype=np.float64)
+    early = np.array([above[i][: loss.first, loss.query].any() for i, loss in judged], dtype=np.float64)
     weights = _Weights(owner[[i for i, _ in judged]] if judged else np.zeros(0, int), draws)
     missed = np.isinf(delay).astype(np.float64)
 
     def mean(terms: np.ndarray) -> Value | None:
-        return weights.value(lambda w: float((w * terms).sum() / w.sum()), len(judged)) if judged else None
+        return weights.value(lambda w: float((w * terms).sum() / w.sum()), len(judged))
 
     first = limits[0][0]
     return AlarmRow(
@@ -233,6 +241,8 @@ def _alarm_row(
         high=high,
         all_trials=len(alarmed),
         all_false_alarms=sum(alarmed.values()),
+        unclear_trials=len(unclear),
+        unclear_false_alarms=sum(alarmed[place] for place in unclear),
         missed=mean(missed),
         early=mean(early),
         delay_median=weights.value(lambda w: quantile(delay, 0.5, w), len(judged)),
@@ -275,7 +285,8 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
         first = own[0]
         title = (
             f"{source} · {part} objects · {first.objects} objects, {first.streams} streams, {first.frames} frames "
-            f"({first.lost_frames} lost), {first.losses} losses ({first.too_late} too late to judge)"
+            f"({first.lost_frames} lost; {first.unclear_frames} more unclear), {first.losses} losses "
+            f"(and {first.brief} brief)"
         )
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
         headings = (
@@ -286,6 +297,7 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
             "α %",
             "false alarms %",
             "of",
+            "unclear",
             "missed %",
             "early %",
             "delay",
@@ -301,6 +313,7 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
     legend = (
         "below or beside each number its 95 % interval: exact for false alarms (one loss-free stream per object, or "
         "part of it where alpha is for so many frames), bootstrap over objects for the others. "
+        "unclear: alarms in those of these streams that are not always right, though never lost. "
         "~: threshold from a fitted tail. delay in frames; >: not reached"
     )
     return Group(*tables, legend)
@@ -316,6 +329,7 @@ def _alarm_cells(alarm: AlarmRow) -> tuple[str, ...]:
         + ("" if alarm.alpha_frames is None else f" in {alarm.alpha_frames}"),
         share,
         str(alarm.trials),
+        f"{alarm.unclear_false_alarms}/{alarm.unclear_trials}",
         _show(alarm.missed, factor=100, decimals=1),
         _show(alarm.early, factor=100, decimals=1),
         _show(alarm.delay_median, decimals=0, none=none),

@@ -23,7 +23,7 @@ from quest.model.network import QuestNetwork
 from quest.model.observation import FrameBatch
 from quest.model.pieces import PieceHead
 from quest.track import Tracker
-from quest.track.intake import Intake
+from quest.track.finder import Finder
 from quest.types import GRIPS, LABELS, Camera, Frame, Take
 
 _STEPS = 500
@@ -126,8 +126,8 @@ def _lessons(tracker: Tracker, take: Take) -> Iterator[_Lesson]:
 
 def _prepared(tracker: Tracker, camera: Camera, frame: Frame) -> FrameBatch:
     with torch.no_grad():
-        intake = Intake(tracker.network, camera, device=tracker.device)
-        return intake.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)[0]
+        finder = Finder(tracker.network, camera, device=tracker.device)
+        return finder.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
 
 
 def _lesson(tracker: Tracker, frames: FrameBatch, full: FrameBatch, entities: _Entities) -> _Lesson:

@@ -1,4 +1,4 @@
-"""What the monitor is calibrated and judged on: the signals of a stream beside the truth, one file per stream."""
+"""What the monitor is calibrated and judged on: log odds of a loss beside the truth, one file per stream."""
 
 from __future__ import annotations
 
@@ -12,22 +12,34 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int
+from jaxtyping import Bool, Float32, Float64, Int, Int8
 
 from quest.errors import ConfigError, InputError
-from quest.evaluation.metrics import SWITCH_FRAMES, distance_px, identity
+from quest.evaluation.metrics import INPUT_PX, distance_px
 from quest.evaluation.selection import Chosen, Shard
-from quest.monitor import SIGNALS
+from quest.monitor import Inputs
 from quest.monitor.calibration import Unit
 from quest.track import Tracker
 from quest.track.settings import REVISION
 from quest.types import Query, Take
 from quest.whole_file import whole_file
 
-LIFTING_PX = 8.0
-"""A seen entity whose pixel is this near to the true one is not lost, whatever its 3D point: pixels of the input."""
+RIGHT, UNCLEAR, LOST = range(3)
+"""Bands: what an answer is beside the truth."""
 
-FORMAT = 2
+NEAR, FAR = 0.07, 0.14
+"""An answer is right up to the first distance, and lost beyond the second; normalised units."""
+
+NEAR_PX, FAR_PX, WIDTH_PX = 12.0, 32.0, 640
+"""The same for colours alone: pixels of a picture of this width."""
+
+LIFTING_PX = 8.0
+"""A seen entity whose pixel is this near to the true one is right, whatever its 3D point: pixels of the input."""
+
+LEAST_S = 0.1
+"""What is lost for a shorter time is unclear, seconds."""
+
+FORMAT = 3
 """Version of the files."""
 
 
@@ -47,19 +59,21 @@ class StreamRecord:
     """Part of the object split."""
     level: int
     """How many joints move one after the other."""
-    signals: Float32[np.ndarray, "T K S"]
-    """Per frame and query, in the order of :data:`quest.monitor.SIGNALS`; NaN where unknown."""
-    lost: Bool[np.ndarray, "T K"]
-    """Whether the identity is truly lost."""
+    inputs: Inputs
+    """What the frames brought."""
+    stamp_s: Float64[np.ndarray, " T"]
+    """Time of each frame, seconds."""
+    log_odds: Float32[np.ndarray, "T K"]
+    """The tracker's own, that the query is lost; NaN until it is asked."""
+    band: Int8[np.ndarray, "T K"]
+    """:data:`RIGHT`, :data:`UNCLEAR` or :data:`LOST`."""
     asked: Int[np.ndarray, " K"]
     """Frame in which each query was asked."""
     moved: Bool[np.ndarray, " K"]
     """Whether the entity is at some time more than 0.1 from rest."""
-    confidence: Float32[np.ndarray, "T K"]
-    """The network's own probability that the identity is right."""
 
     def __len__(self) -> int:
-        return len(self.lost)
+        return len(self.band)
 
     @property
     def watched(self) -> Bool[np.ndarray, "T K"]:
@@ -67,22 +81,41 @@ class StreamRecord:
         return np.arange(len(self))[:, None] >= self.asked
 
     @property
+    def lost(self) -> Bool[np.ndarray, "T K"]:
+        """Where a query that is followed is truly lost."""
+        return self.watched & (self.band == LOST)
+
+    @property
+    def right(self) -> Bool[np.ndarray, "T K"]:
+        """Where a query that is followed is right."""
+        return self.watched & (self.band == RIGHT)
+
+    @property
+    def judged(self) -> Bool[np.ndarray, "T K"]:
+        """Where a query has log odds, and is right or lost."""
+        return (self.right | self.lost) & np.isfinite(self.log_odds)
+
+    @property
     def loss_free(self) -> bool:
-        """Whether no identity is ever lost."""
-        return not (self.lost & self.watched).any()
+        """Whether no query is ever lost."""
+        return not self.lost.any()
 
 
-def lost(
+def bands(
     take: Take,
     view: int,
     uv_px: Float32[np.ndarray, "T K 2"],
     point_world: Float32[np.ndarray, "T K 3"],
     entities: Int[np.ndarray, " K"],
-) -> Bool[np.ndarray, "T K"]:
-    """Whether an identity is lost: its answer is nearest to another entity, or within 0.1 of none, for 3 frames.
+    *,
+    inputs: Inputs,
+) -> Int8[np.ndarray, "T K"]:
+    """The band of every answer; a missing answer is as far off as can be.
 
-    A frame in which the entity is seen and the answer's pixel is within :data:`LIFTING_PX` of the true one is no loss:
-    that is an error of lifting.
+    With depth an answer is right whose 3D point is at most :data:`NEAR` from the true one and nearest to its own
+    entity; so is one whose entity is seen and whose pixel is within :data:`LIFTING_PX`. It is lost beyond :data:`FAR`,
+    and beyond :data:`NEAR` where another entity is less than half as far away. Of colours alone pixels tell the same,
+    while the entity is in view. What is lost for less than :data:`LEAST_S` is unclear.
 
     Args:
         take: the truth.
@@ -90,23 +123,52 @@ def lost(
         uv_px: answers, pixels of the source image.
         point_world: answers, metres.
         entities: index in the take of the entity that each query asked for; all of them followable.
+        inputs: what the tracker saw.
     """
     truth, camera = take.views[view], take.views[view].clip.camera
+    answer_px, true_px = np.broadcast_arrays(uv_px[:, :, None], truth.uv_px[:, None, take.tracked])
+    gap_px = distance_px(answer_px, true_px, width=camera.width, height=camera.height)
+    if inputs == "depth":
+        gap = np.linalg.norm(
+            point_world[:, :, None].astype(np.float64) - take.point_world[:, None, take.tracked], axis=-1
+        )
+        near, far, unit = NEAR, FAR, take.info.half_diagonal_m
+    else:
+        gap, near, far, unit = gap_px, NEAR_PX, FAR_PX, INPUT_PX / WIDTH_PX
+    gap = np.where(np.isfinite(gap), gap / unit, np.inf)
     rank = np.searchsorted(take.tracked, entities)
-    nearest = identity(point_world, take.point_world[:, take.tracked], rank, half_diagonal_m=take.info.half_diagonal_m)
-    gap_px = distance_px(uv_px, truth.uv_px[:, entities], width=camera.width, height=camera.height)
-    on_it = truth.visible[:, entities] & (gap_px <= LIFTING_PX)
-    return lasting((nearest != rank) & ~on_it)
+    own_is = np.arange(len(take.tracked)) == rank[:, None]
+    own, other = gap[:, own_is], np.where(own_is, np.inf, gap).min(axis=-1)
+    if inputs == "depth":
+        right = (own <= near) & (own <= other) | truth.visible[:, entities] & (gap_px[:, own_is] <= LIFTING_PX)
+        known = np.ones_like(right)
+    else:
+        right = own <= near
+        at = truth.uv_px[:, entities]
+        known = ((at >= 0) & (at <= [camera.width, camera.height])).all(axis=-1)
+    lost = lasting(known & ~right & ((own > far) | (own > near) & (other < own / 2)), take.stamp_s, LEAST_S)
+    return np.select([known & right, lost], [RIGHT, LOST], UNCLEAR).astype(np.int8)
 
 
-def lasting(wrong: Bool[np.ndarray, "T K"], frames: int = SWITCH_FRAMES) -> Bool[np.ndarray, "T K"]:
-    """The runs of True that are at least so many frames long."""
+def lasting(
+    wrong: Bool[np.ndarray, "T K"], stamp_s: Float64[np.ndarray, " T"], least_s: float
+) -> Bool[np.ndarray, "T K"]:
+    """The runs of True that last at least so many seconds; see :func:`duration_s`."""
     kept = np.zeros_like(wrong)
     for k in range(wrong.shape[1]):
         for first, last in runs(wrong[:, k]):
-            if last - first >= frames:
-                kept[first:last, k] = True
+            kept[first:last, k] = duration_s(stamp_s, first, last) >= least_s
     return kept
+
+
+def duration_s(stamp_s: Float64[np.ndarray, " T"], first: int, last: int) -> float:
+    """Seconds from a frame to the one after the last; the last frame of a stream lasts as long as others do.
+
+    Rounded, because stamps are: three 30ths of a second are a tenth, however they were written down.
+    """
+    mean_s = float(np.diff(stamp_s).mean()) if len(stamp_s) > 1 else 0.0
+    end_s = stamp_s[last] if last < len(stamp_s) else stamp_s[-1] + mean_s
+    return round(float(end_s - stamp_s[first]), 3)
 
 
 def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
@@ -115,7 +177,7 @@ def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> StreamRecord | None:
+def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs: Inputs) -> StreamRecord | None:
     """Ask for every entity that is visible in frame 0 by its true pixel, and step through the view.
 
     Args:
@@ -123,6 +185,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
         take: with ground truth.
         view: index of the view.
         part: part of the object split.
+        inputs: what the tracker sees of the frames.
 
     Returns:
         None if no entity is visible in frame 0.
@@ -137,14 +200,15 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
     ]
     stream = tracker.stream(truth.clip.camera, queries, alpha=None)
     t, k = len(take), len(entities)
-    signals = np.full((t, k, len(SIGNALS)), np.nan, np.float32)
+    log_odds = np.full((t, k), np.nan, np.float32)
     uv_px = np.full((t, k, 2), np.nan, np.float32)
     point_world = np.full((t, k, 3), np.nan, np.float32)
     for i in range(t):
         frame = truth.clip.frame(i)
-        state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        depth_m = frame.depth_m if inputs == "depth" else None
+        state = stream.step(frame.rgb, depth_m, frame.stamp_s, frame.cam_from_world)
         rows = list(state.query)
-        signals[i, rows], uv_px[i, rows], point_world[i, rows] = state.signals.values, state.uv_px, state.point_world
+        log_odds[i, rows], uv_px[i, rows], point_world[i, rows] = state.lost_log_odds, state.uv_px, state.point_world
     return StreamRecord(
         take=take.info.name,
         view=view,
@@ -152,11 +216,12 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str) -> Stre
         source=take.info.source,
         part=part,
         level=take.info.level,
-        signals=signals,
-        lost=lost(take, view, uv_px, point_world, entities),
+        inputs=inputs,
+        stamp_s=take.stamp_s,
+        log_odds=log_odds,
+        band=bands(take, view, uv_px, point_world, entities, inputs=inputs),
         asked=np.zeros(k, np.int64),
         moved=take.moved[entities],
-        confidence=_confidence(signals),
     )
 
 
@@ -166,23 +231,12 @@ def by_unit(records: Sequence[StreamRecord], unit: Unit) -> tuple[StreamRecord, 
 
 
 def tracker_id(tracker: Tracker) -> str:
-    """Twelve hexadecimal digits that tell apart networks, ways and settings of following given points, and signals.
+    """Twelve hexadecimal digits that tell apart the noise parameters and code of trackers, and versions of records.
 
-    Streams are asked for by points. So a better affordance map or flow head, another threshold of discovery, or what
-    else is in a weights file leaves records, and with them the monitor's calibration, as good as they were.
+    Streams are asked for by points, which the filter follows by itself: no network has a part in it.
     """
-    # Networks once said how their queries and head work; with that, records made before keep their name.
-    said = {"flow": None, "queries": "anchored", "head": "heatmap"}
-    config, settings = asdict(tracker.network.config) | said, asdict(tracker.config)
-    del config["pieces"]
-    settings = {name: value for name, value in settings.items() if not name.startswith(("slot_", "prompt_"))}
-    digest = hashlib.sha256(json.dumps([config, settings, REVISION, SIGNALS], sort_keys=True).encode())
-    for name, tensor in sorted(tracker.network.state_dict().items()):
-        if name.startswith(("flow.", "affordance")):
-            continue
-        digest.update(name.encode())
-        digest.update(tensor.detach().cpu().float().numpy().tobytes())
-    return digest.hexdigest()[:12]
+    made_of = json.dumps([asdict(tracker.noise), REVISION, FORMAT], sort_keys=True)
+    return hashlib.sha256(made_of.encode()).hexdigest()[:12]
 
 
 @dataclass(frozen=True)
@@ -200,6 +254,7 @@ def record_streams(
     takes: Chosen,
     folder: Path,
     *,
+    inputs: Inputs,
     shard: Shard,
     progress: Callable[[str, int, int], None] = lambda name, done, total: None,
 ) -> Recorded:
@@ -210,6 +265,7 @@ def record_streams(
             again since, are recorded again.
         takes: stores with the takes to use and their part of the object split.
         folder: one ``.npz`` per stream, written whole or not at all.
+        inputs: what the tracker sees of the frames.
         shard: the part of the streams that this process records.
         progress: told of every stream before it is recorded: its name, how many come before it, how many there are.
 
@@ -229,14 +285,16 @@ def record_streams(
         streams += [(store, n, part, v) for n, part in chosen.items() for v in range(len(headers[n].cameras))]
     take: Take | None = None
     for i, (store, name, part, view) in enumerate(streams):
-        path, of = folder / f"{name}-view{view}.npz", _Origin(made_by, hashes[name])
+        path, of = folder / f"{name}-view{view}-{inputs}.npz", _Origin(made_by, hashes[name])
         if i not in shard or _origin(path) == of:
             continue
-        progress(f"{name} view {view}", i, len(streams))
+        progress(f"{name} view {view}, {inputs}", i, len(streams))
         take = take if take is not None and take.info.name == name else store.read(name)
-        write_record(record_stream(tracker, take, view, part=part), path, made_by=made_by, take_hash=hashes[name])
+        write_record(
+            record_stream(tracker, take, view, part=part, inputs=inputs), path, made_by=made_by, take_hash=hashes[name]
+        )
     # Only now, since other shards went on meanwhile.
-    paths = [(folder / f"{name}-view{view}.npz", part, hashes[name]) for _, name, part, view in streams]
+    paths = [(folder / f"{name}-view{view}-{inputs}.npz", part, hashes[name]) for _, name, part, view in streams]
     own = [(_read(path), part) for path, part, of in paths if _origin(path) == _Origin(made_by, of)]
     records = tuple(replace(record, part=part) for record, part in own if record is not None)
     return Recorded(records, len(streams) - len(own))
@@ -251,23 +309,24 @@ def write_record(record: StreamRecord | None, path: Path, *, made_by: str, take_
         np.savez_compressed(file, **values)
 
 
-def read_records(folder: str | Path, *, made_by: str) -> tuple[StreamRecord, ...]:
-    """All records of a folder that one tracker made, by file name.
+def read_records(folder: str | Path, *, inputs: Inputs, made_by: str) -> tuple[StreamRecord, ...]:
+    """All records of a folder that one tracker made of one kind of frames, by file name.
 
     Args:
         folder: that :func:`record_streams` filled.
+        inputs: what the frames brought.
         made_by: from :func:`tracker_id`.
 
     Raises:
         InputError: there are none, or one is damaged.
     """
-    paths = sorted(Path(folder).glob("*.npz"))
+    paths = sorted(Path(folder).glob(f"*-{inputs}.npz"))
     own = [_read(path) for path in paths if (origin := _origin(path)) is not None and origin.made_by == made_by]
     records = tuple(record for record in own if record is not None)
     if not records:
         raise InputError(
-            f"records {folder}: expected streams of the tracker {made_by}, found none among {len(paths)} files; "
-            "record them with `quest weights calibrate`"
+            f"records {folder}: expected streams of the tracker {made_by}, found none among {len(paths)} files of "
+            f"{inputs}; record them with `quest calibrate`"
         )
     return records
 
@@ -297,8 +356,6 @@ def _read(path: Path) -> StreamRecord | None:
             return None
         raw: dict[str, Any] = {f.name: file[f.name] for f in fields(StreamRecord)}
     plain = {name: value.item() if value.ndim == 0 else value for name, value in raw.items()}
-    if plain["signals"].shape[-1] != len(SIGNALS):
-        raise InputError(f"record {path}: it has other signals than this version of quest; delete it and record again")
     return StreamRecord(**plain)
 
 
@@ -309,9 +366,3 @@ def _opened(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
             yield file
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"record {path}: not a whole record ({error}); delete it and record again") from error
-
-
-def _confidence(signals: Float32[np.ndarray, "T K S"]) -> Float32[np.ndarray, "T K"]:
-    """The network's own probability that the identity is right."""
-    logit = signals[..., SIGNALS.index("right_logit")].astype(np.float64)
-    return (1.0 / (1.0 + np.exp(-logit))).astype(np.float32)

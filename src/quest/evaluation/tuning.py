@@ -1,115 +1,57 @@
-"""Choose the tracker's settings on validation objects.
+"""Choose the threshold of discovery on validation objects.
 
-One setting after the other is varied and the best kept, by the mean 3D distance of moved entities (protocol ``point``;
-PartNet-Mobility and procedural objects, ordinary takes and those of every suite alike); the threshold of discovery by
-its F2 in the first frame, in which recall counts twice as much as precision (a false entity costs one more track, a
-missed one is not followed at all), in the mean over the sources of the objects.
+It is the one with the best F2 in the first frame, in which recall counts twice as much as precision (a false entity
+costs one more track, a missed one is not followed at all), in the mean over the sources of the objects.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from quest.baselines.memory import remember_frames
 from quest.errors import ConfigError
-from quest.evaluation.records import EntityRecord
-from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import Chosen
-from quest.evaluation.take_suite import TakeSuite
 from quest.geometry import transform
 from quest.model.discovery import Peaks, match_peaks
-from quest.track import Tracker, TrackerConfig
+from quest.track import Tracker
 from quest.types import LABELS, Take
 
-GRID: dict[str, tuple[float, ...]] = {
-    "hold_below": (0.3, 0.5),
-    "off_joint": (-2.0, -1.0),
-    "joint_sigma": (0.06, 0.1),
-    "point_sigma": (0.04, 0.06),
-}
-"""Values that are tried, in this order of settings; the others matter less and keep what an earlier search found."""
-
 _BETA = 2.0
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One setting that was tried."""
-
-    name: str
-    """Which setting."""
-    value: float
-    """Its value."""
-    ape: float
-    """Mean 3D distance of moved entities, normalised units."""
 
 
 @dataclass(frozen=True)
 class Tuned:
     """What came of it."""
 
-    config: TrackerConfig
-    """The chosen settings."""
-    trials: tuple[Trial, ...]
-    """Everything that was tried."""
+    slot_bias: float
+    """Bias of the affordance logit."""
     precision: float
-    """Of discovery at the chosen threshold."""
+    """Of discovery with it."""
     recall: float
-    """Of discovery there."""
+    """Of discovery with it."""
 
 
-def tune(
-    tracker: Tracker,
-    takes: Chosen,
-    *,
-    report: Callable[[Trial], None],
-    discovery_only: bool = False,
-) -> Tuned:
-    """Choose settings for a tracker's network.
-
-    Args:
-        tracker: network and settings to start from.
-        takes: stores with takes of validation objects.
-        report: told of every trial.
-        discovery_only: leave all settings but the threshold of discovery as they are, as after training the affordance
-            map alone.
-
-    Raises:
-        ConfigError: a take is not of a validation object, or nothing moves in them.
-    """
-    parts = [item for _, chosen in takes for item in chosen.items()]
-    wrong = [name for name, part in parts if part != "validation"]
-    if wrong or not parts:
-        raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
-    config, trials = tracker.config, []
-    remember_frames(tracker.network, capacity=10_000)
-    bias, precision, recall = discovery_bias(tracker, takes)
-    config = replace(config, slot_bias=bias)
-    known: dict[TrackerConfig, float] = {}
-    for name, values in () if discovery_only else GRID.items():
-        configs = [replace(config, **{name: v}) for v in values]
-        new = [c for c in configs if c not in known]
-        known |= zip(new, _scores(tracker, new, takes) if new else (), strict=True)
-        tried = [Trial(name, v, known[c]) for v, c in zip(values, configs, strict=True)]
-        for trial in tried:
-            report(trial)
-        trials += tried
-        config = replace(config, **{name: min(tried, key=lambda t: t.ape).value})
-    return Tuned(config, tuple(trials), precision, recall)
-
-
-def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float]:
+def discovery_bias(tracker: Tracker, takes: Chosen) -> Tuned:
     """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
 
     A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D. Where none is, no
     threshold is best, and the bias stays what it is. F2, precision and recall are means over the sources of the objects
     (PartNet-Mobility, procedural, your own), each of which counts the same however many takes it has.
+
+    Args:
+        tracker: with the network, and the bias to start from.
+        takes: stores with takes of validation objects.
+
+    Raises:
+        ConfigError: a take is not of a validation object, or there are none.
     """
+    parts = [item for _, chosen in takes for item in chosen.items()]
+    wrong = [name for name, part in parts if part != "validation"]
+    if wrong or not parts:
+        raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
     seen: dict[str, _Found] = {}
     for store, name in ((store, name) for store, chosen in takes for name in chosen):
         take = store.read(name, frames=slice(0, 1))
@@ -119,13 +61,13 @@ def discovery_bias(tracker: Tracker, takes: Chosen) -> tuple[float, float, float
             found.add(tracker.candidates(clip.camera, clip.frame(0)), take, view)
     sources = [found for found in seen.values() if found.present]
     if not any(any(found.hits) for found in sources):
-        return tracker.config.slot_bias, 0.0, 0.0
+        return Tuned(tracker.config.slot_bias, 0.0, 0.0)
     logits = np.unique([logit for found in sources for logit in found.logits])[::-1]
     rates = np.array([found.at(logits) for found in sources])
     precision, recall = rates.mean(axis=0)
     best = int(np.mean([_f_beta(*each) for each in rates], axis=0).argmax())
     threshold = logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2
-    return -float(threshold), float(precision[best]), float(recall[best])
+    return Tuned(-float(threshold), float(precision[best]), float(recall[best]))
 
 
 @dataclass
@@ -172,20 +114,3 @@ def _match(take: Take, view: int, peaks: Peaks) -> tuple[list[bool], int]:
         half_diagonal_m=take.info.half_diagonal_m,
     )
     return (found >= 0).tolist(), len(entities)
-
-
-def _scores(tracker: Tracker, configs: Sequence[TrackerConfig], takes: Chosen) -> list[float]:
-    """Mean over sources and suites of the mean 3D distance of moved entities, for every configuration."""
-    trials = [tracker.with_config(config, name=f"{i}") for i, config in enumerate(configs)]
-    records = [r for store, chosen in takes for r in evaluate(store, chosen, trials, protocols=("point",)).records]
-    return [_ape([r for r in records if r.subject.tracker == trial.name]) for trial in trials]
-
-
-def _ape(records: list[EntityRecord]) -> float:
-    alike: dict[tuple[str, str], list[np.ndarray]] = {}
-    for r in records:
-        if r.moved:
-            alike.setdefault((r.subject.source, TakeSuite.of(r.take).name), []).append(r.distance[r.first_frame :])
-    if not alike:
-        raise ConfigError("tuning: no entity moves in these takes")
-    return float(np.mean([np.concatenate(d).mean() for d in alike.values()]))

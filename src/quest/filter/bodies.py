@@ -34,11 +34,17 @@ class Bodies:
     """Of a rotation vector about the middle, a shift, and :attr:`velocity`."""
     moment: Float[np.ndarray, "B 6 6"]
     """Sum of the products of the twists that the body went through: one large eigenvalue is a joint's screw."""
+    seen_s: Float[np.ndarray, " B"]
+    """For how long these were gathered, seconds."""
+    screw: Float[np.ndarray, "B 6"]
+    """That screw, of length 1 in metres at :attr:`Noise.arm_m`; positive where the body went farthest from rest."""
+    reach: Float[np.ndarray, "B 2"]
+    """How far along it the body has been, least and farthest, metres at :attr:`Noise.arm_m`."""
 
     @classmethod
     def world(cls) -> Bodies:
         """Nothing but the world."""
-        shapes = ((1, 3), (1, 6), (1, 12, 12), (1, 6, 6))
+        shapes = ((1, 3), (1, 6), (1, 12, 12), (1, 6, 6), (1,), (1, 6), (1, 2))
         return cls(np.eye(4)[None], *(np.zeros(shape) for shape in shapes))
 
     def __len__(self) -> int:
@@ -48,7 +54,7 @@ class Bodies:
         """One body more, that began to move."""
         spread = np.array([noise.turn_rad_s] * 3 + [noise.speed_m_s] * 3)
         covariance = np.diag(np.concatenate([np.full(6, 1e-6), spread**2]))
-        new = (pose, middle, np.zeros(6), covariance, np.zeros((6, 6)))
+        new = (pose, middle, np.zeros(6), covariance, np.zeros((6, 6)), np.zeros(()), np.zeros(6), np.zeros(2))
         return Bodies(*(np.concatenate([old, one[None]]) for old, one in zip(vars(self).values(), new, strict=True)))
 
 
@@ -103,7 +109,7 @@ def update(
         dt_s: time since the frame before, seconds.
         noise: parameters.
     """
-    new = {name: getattr(bodies, name).copy() for name in ("pose", "middle", "velocity", "covariance", "moment")}
+    new = {name: value.copy() for name, value in vars(bodies).items()}
     predicted = bodies.covariance[index]
     step = pose @ np.linalg.inv(bodies.pose[index])
     there = move(step, bodies.middle[index])
@@ -115,7 +121,20 @@ def update(
     way = twist(pose)
     unsure = np.trace(new["covariance"][index][3:6, 3:6]) / noise.joint_m**2
     new["moment"][index] += np.outer(way, way) * dt_s / (1 + unsure)
+    new["seen_s"][index] += dt_s / (1 + unsure)
+    size = at_arm(noise)
+    _, vector = np.linalg.eigh(new["moment"][index] * np.outer(size, size))
+    direction = vector[:, -1] * (1 if vector[:, -1] @ bodies.screw[index] >= 0 else -1)
+    along = direction @ (way * size)
+    least, most = min(along, bodies.reach[index, 0]), max(along, bodies.reach[index, 1])
+    new["screw"][index] = direction if most >= -least else -direction
+    new["reach"][index] = (least, most) if most >= -least else (-most, -least)
     return replace(bodies, **new)
+
+
+def at_arm(noise: Noise) -> Float[np.ndarray, "6"]:
+    """By which a twist is multiplied so that all of it is in metres."""
+    return np.array([noise.arm_m] * 3 + [1.0] * 3)
 
 
 def on_joint(bodies: Bodies, index: int, noise: Noise) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
@@ -124,7 +143,7 @@ def on_joint(bodies: Bodies, index: int, noise: Noise) -> tuple[Float[np.ndarray
     Returns:
         A turn about the middle and a shift that bring it back, and the information of that.
     """
-    size = np.array([noise.arm_m] * 3 + [1.0] * 3)
+    size = at_arm(noise)
     value, vector = np.linalg.eigh(bodies.moment[index] * np.outer(size, size))
     if value[-1] <= 0:
         return np.zeros(6), np.zeros((6, 6))

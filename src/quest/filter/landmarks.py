@@ -18,7 +18,7 @@ from quest.filter.camera_motion import estimate_pose, picture_motion, stands_sti
 from quest.filter.local_motion import corners, follow
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
-from quest.filter.rigid_motion import GATE, Seen, Surface, common_motion, fit, misfit_unsure
+from quest.filter.rigid_motion import GATE, Seen, Surface, common_motion, fit, misfit_unsure, predicted_spread
 from quest.filter.surfaces import Surfaces, depth_error, measure, sow_surfaces
 from quest.filter.view import View, move, move_back
 
@@ -47,6 +47,8 @@ class Landmarks:
     """Log-odds of being carried by each body, against being on none of them."""
     surfaces: Surfaces
     bodies: Bodies
+    world_px2: float = 0.0
+    """Variance of where the world's points are seen in the newest frame with depth: poses and lenses err too."""
 
     @classmethod
     def none(cls) -> Landmarks:
@@ -85,6 +87,22 @@ class Landmarks:
     def rest(self) -> Float[np.ndarray, "N 3"]:
         """Where each was before its most probable body moved, metres."""
         return self.place[np.arange(len(self.body)), self.body]
+
+    def ride_px2(
+        self, place: Float[np.ndarray, "K B 3"], error: Float[np.ndarray, "K 3"], view: View
+    ) -> Float[np.ndarray, "K B"]:
+        """Variance of where each body brings some places, pixels squared.
+
+        Args:
+            place: on each body, metres.
+            error: standard deviation of the places, along the rays on which they were seen, metres in the world.
+            view: of the frame.
+        """
+        bodies, spread = self.bodies, []
+        for b, pose in enumerate(bodies.pose):
+            turned, covariance = error @ pose[:3, :3].T, bodies.covariance[b, :6, :6]
+            spread.append(predicted_spread(move(pose, place[:, b]), bodies.middle[b], covariance, turned, view))
+        return self.world_px2 + np.trace(np.stack(spread, axis=1)[..., :2, :2], axis1=-2, axis2=-1) / 2
 
     def share(self, point: Float[np.ndarray, "K 3"], around: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K B"]:
         """Share of each body in the points near some places.
@@ -160,23 +178,21 @@ def observe(
             moved = moved.only(~refuted)
     view = View(old.matrix, pose, depth_m)
     if depth_m is not None:
-        moved = _observe_bodies(moved, view, known, dt_s, noise)
+        # What was sown without depth has no place; it is sown anew.
+        placed = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
+        moved = _observe_bodies(placed, view, known, dt_s, noise)
     return moved, CameraMotion(pose, warp)
 
 
 def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
     """The pose of each moving body, and which of them carries each point."""
-    depth_m, error_m = _depth(view, landmarks.uv_px, noise)
-    # Poses, lenses and stamps err too: the world's points say by how much they do here (median of chi-square: ln 4).
+    depth_m, error_m = layer_depth(view, landmarks.uv_px, noise)
     rests, _ = view.project(landmarks.place[landmarks.body == 0, 0])
     off = ((rests - landmarks.uv_px[landmarks.body == 0]) ** 2).sum(axis=-1)
+    # The median of chi-square is ln 4.
     spread = max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) if len(off) else noise.point_px**2
-    seen = Seen(
-        landmarks.uv_px,
-        depth_m,
-        landmarks.covariance + spread * np.eye(2),
-        error_m,
-    )
+    landmarks = replace(landmarks, world_px2=spread)
+    seen = Seen(landmarks.uv_px, depth_m, landmarks.covariance + spread * np.eye(2), error_m)
     told = (GATE - np.minimum(_misfits(landmarks, seen, view), 3 * GATE)) / 2
     told += np.log(landmarks.share(landmarks.point_world, landmarks.point_world) + noise.stray)
     weight = landmarks.log_weight + (told - landmarks.log_weight) * min(dt_s / noise.points_s, 1.0)
@@ -295,7 +311,7 @@ def sow(
     return _born(landmarks, np.concatenate(new), view, noise)
 
 
-def _depth(
+def layer_depth(
     view: View, uv_px: Float[np.ndarray, "N 2"], noise: Noise
 ) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
     """Depth and its error: at an edge of the nearer surface, to which the edge belongs, give or take the relief."""
@@ -304,13 +320,24 @@ def _depth(
     return depth_m, np.where(flat, depth_error(depth_m, noise), noise.relief_m)
 
 
+def ray_error(
+    view: View, uv_px: Float[np.ndarray, "N 2"], point: Float[np.ndarray, "N 3"], noise: Noise
+) -> Float[np.ndarray, "N 3"]:
+    """Standard deviation of points that are seen at some pixels, along their rays, metres in the world."""
+    return _along(view, point, layer_depth(view, uv_px, noise)[1])
+
+
+def _along(view: View, point: Float[np.ndarray, "N 3"], error_m: Float[np.ndarray, " N"]) -> Float[np.ndarray, "N 3"]:
+    ray = point - view.centre
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True) * error_m[:, None]
+
+
 def _born(landmarks: Landmarks, uv_px: Float[np.ndarray, "M 2"], view: View, noise: Noise) -> Landmarks:
-    depth_m, error_m = _depth(view, uv_px, noise)
+    depth_m, error_m = layer_depth(view, uv_px, noise)
     if view.depth_m is not None:
         uv_px, depth_m, error_m = (each[np.isfinite(depth_m)] for each in (uv_px, depth_m, error_m))
     point = view.lift(uv_px, depth_m)
-    ray = point - view.centre
-    error = ray / np.linalg.norm(ray, axis=-1, keepdims=True) * error_m[:, None]
+    error = _along(view, point, error_m)
     bodies = len(landmarks.pose)
     share = landmarks.share(point, landmarks.point_world)
     place = move_back(landmarks.pose, np.repeat(point[:, None], bodies, axis=1))

@@ -17,8 +17,6 @@ class Noise:
     """Error of the anchor's patch found again under another view, pixels."""
     like_anchor: float = 0.7
     """Normalised cross-correlation with the anchor's patch below which a place found by it does not count."""
-    world_px: float = 10.0
-    """Error of where an entity that rests is seen: of the camera's pose and of the depth, pixels."""
     moved_px: float = 60.0
     """How far from there an entity that moves is seen, pixels."""
     look_wide: float = 3.28
@@ -46,7 +44,7 @@ class Noise:
     depths_m: float = 0.5
     """Over how wide a range the depth of another surface is spread, metres."""
     stray: float = 0.05
-    """Share of depths that are of something else: edges, thin handles, flying pixels."""
+    """Share of what is measured that is of something else: depths at edges and thin handles, patches that slipped."""
     point_px: float = 0.7
     """Least error of a landmark that is followed, besides what its patch says, pixels."""
     points_s: float = 0.1

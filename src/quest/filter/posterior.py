@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from quest.filter.appearance import PATCH_PX, Likeness
-from quest.filter.landmarks import Landmarks
+from quest.filter.landmarks import Landmarks, ray_error
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.queries import GATE, SURE, Queries
@@ -39,6 +39,8 @@ class _Places:
 
     uv_px: Float[np.ndarray, "K P 2"]
     depth_m: Float[np.ndarray, "K B"]
+    ride_px2: Float[np.ndarray, "K B"]
+    """Variance of where each body brings it, pixels squared."""
     possible: Bool[np.ndarray, "K B"]
     """Whether a body can bring it anywhere: its place is known, and in front of the camera."""
     seen: Float[np.ndarray, "K P"]
@@ -65,7 +67,7 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     likeness = Likeness.of(picture, queries.descriptor, queries.patch)
     places = _places(queries, landmarks, likeness, view, noise)
     apart = ((queries.own_px[:, None] - places.uv_px[:, 1:]) ** 2).sum(axis=-1)
-    near = queries.own_variance + noise.world_px**2
+    near = queries.own_variance[:, None] + places.ride_px2
     # Evidence repeats itself from frame to frame: however long it lasts, it counts once.
     new = min(dt_s / noise.correlated_s, 1.0)
     told = _carriers(queries, places, apart, near, landmarks, noise) - queries.log_odds
@@ -77,7 +79,7 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     judged = _judged(queries, places, here, likeness, dt_s, noise)
 
     jumps = judged.rival_log_odds > 0
-    far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near)
+    far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near[each, best])
     caught = rides & places.possible[each, best] & (~queries.own_found | far_off) & ~jumps
     own_px = np.where(jumps[:, None], judged.rival_px, np.where(caught[:, None], at_px, queries.own_px))
     depth_m = view.near_depth_at(own_px)
@@ -89,9 +91,12 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     return replace(
         _viewed(judged, confirmed, at_px, picture),
         own_px=own_px,
-        own_variance=np.where(jumps, noise.anchor_px**2, np.where(caught, noise.world_px**2, queries.own_variance)),
+        own_variance=np.where(
+            jumps, noise.anchor_px**2, np.where(caught, places.ride_px2[each, best], queries.own_variance)
+        ),
         own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
         place=np.where(anew[:, None, None], move_back(landmarks.pose, point), queries.place),
+        error=np.where(anew[:, None], ray_error(view, own_px, point[:, 0], noise), queries.error),
         log_odds=np.where(anew[:, None], 0.0, np.clip(log_odds, -SURE, SURE)),
         seen_log_odds=np.where(jumps, judged.rival_log_odds, judged.seen_log_odds),
         lost_log_odds=np.where(jumps, -judged.rival_log_odds, judged.lost_log_odds),
@@ -145,6 +150,7 @@ def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: Vi
     return _Places(
         uv_px=uv_px,
         depth_m=depth_m,
+        ride_px2=np.nan_to_num(landmarks.ride_px2(queries.place, queries.error, view), nan=1.0),
         possible=possible,
         seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,
         occluded=np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0) + _HALF,
@@ -157,13 +163,15 @@ def _carriers(
     queries: Queries,
     places: _Places,
     apart: Float[np.ndarray, "K B"],
-    near: Float[np.ndarray, " K"],
+    near: Float[np.ndarray, "K B"],
     landmarks: Landmarks,
     noise: Noise,
 ) -> Float[np.ndarray, "K B"]:
     """Log-odds of this frame that each body carries it, against that it goes with its patch."""
     far = near + noise.moved_px**2
-    parted = apart / 2 * (1 / far - 1 / near)[:, None] + np.log(far / near)[:, None]
+    parted = apart / 2 * (1 / far - 1 / near) + np.log(far / near)
+    # Its patch may have slipped off it, to anywhere.
+    parted = np.logaddexp(np.log(1 - noise.stray) + parted, np.log(noise.stray))
     there = np.logaddexp(places.seen, places.occluded)
     share = landmarks.share(queries.rest, landmarks.rest)
     around = np.log(share + np.where(np.arange(share.shape[1]) > 0, 1e-3, 0.1))

@@ -40,6 +40,8 @@ class Queries:
     """Whether that patch was found in this frame, with nothing in front of it."""
     place: Float[np.ndarray, "K B 3"]
     """On each body, metres; NaN without depth."""
+    error: Float[np.ndarray, "K 3"]
+    """Standard deviation of the place, along the ray on which it was seen, metres in the world; NaN without depth."""
     log_odds: Float[np.ndarray, "K B"]
     """That each body carries it, against that it goes with its patch."""
     seen_log_odds: Float[np.ndarray, " K"]
@@ -60,6 +62,7 @@ class Queries:
         uv_px: Float[np.ndarray, "K 2"],
         depth_m: Float[np.ndarray, " K"],
         place: Float[np.ndarray, "K B 3"],
+        error: Float[np.ndarray, "K 3"],
     ) -> Queries:
         """Pixels of a frame that are named in it."""
         count, bodies = place.shape[:2]
@@ -72,6 +75,7 @@ class Queries:
             own_depth=depth_m,
             own_found=np.ones(count, dtype=bool),
             place=place,
+            error=error,
             log_odds=np.zeros((count, bodies)),
             seen_log_odds=np.full(count, SURE),
             lost_log_odds=np.full(count, -SURE),
@@ -82,6 +86,14 @@ class Queries:
 
     def __len__(self) -> int:
         return len(self.anchor)
+
+    def only(self, rows: Int[np.ndarray, " M"]) -> Queries:
+        """Some of them."""
+        return Queries(**{name: value[rows] for name, value in vars(self).items()})
+
+    def join(self, other: Queries) -> Queries:
+        """These and others."""
+        return Queries(**{name: np.concatenate([value, getattr(other, name)]) for name, value in vars(self).items()})
 
     @property
     def known(self) -> Bool[np.ndarray, " K"]:

@@ -87,11 +87,26 @@ def misfit_unsure(
         seen: where they are.
         view: of the frame.
     """
-    off, jacobian = _linearise(point_world, middle, seen, view)
-    own = (jacobian[..., 3:] @ error_world[..., None])[..., 0]
-    spread = seen.spread + jacobian @ covariance @ np.swapaxes(jacobian, -1, -2) + own[:, :, None] * own[:, None]
+    off, _ = _linearise(point_world, middle, seen, view)
+    spread = seen.spread + predicted_spread(point_world, middle, covariance, error_world, view)
     value = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
     return np.where(np.isfinite(value), value, np.inf)
+
+
+def predicted_spread(
+    point_world: Float[np.ndarray, "N 3"],
+    middle: Float[np.ndarray, "3"],
+    covariance: Float[np.ndarray, "6 6"],
+    error_world: Float[np.ndarray, "N 3"],
+    view: View,
+) -> Float[np.ndarray, "N 3 3"]:
+    """Covariance of pixel and depth of points whose body's pose and places are known up to some error.
+
+    The arguments are those of :func:`misfit_unsure`.
+    """
+    jacobian = _derivatives(point_world, middle, view)[1]
+    own = (jacobian[..., 3:] @ error_world[..., None])[..., 0]
+    return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2) + own[:, :, None] * own[:, None]
 
 
 @dataclass(frozen=True)
@@ -172,6 +187,14 @@ def _linearise(
     point: Float[np.ndarray, "N 3"], middle: Float[np.ndarray, "3"], seen: Seen, view: View
 ) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 6"]]:
     """From predicted to seen (x, y, depth), and its derivatives by a turn about the middle and a shift."""
+    predicted, jacobian = _derivatives(point, middle, view)
+    return seen.off(predicted[:, :2], predicted[:, 2]), jacobian
+
+
+def _derivatives(
+    point: Float[np.ndarray, "N 3"], middle: Float[np.ndarray, "3"], view: View
+) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3 6"]]:
+    """Where points are seen (x, y, depth), and the derivatives of that by a turn about the middle and a shift."""
     rotate = view.cam_from_world[:3, :3]
     cam = point @ rotate.T + view.cam_from_world[:3, 3]
     depth = np.maximum(cam[:, 2], 1e-6)
@@ -185,7 +208,7 @@ def _linearise(
     by_motion[:, 1, 0], by_motion[:, 1, 2] = -arm[:, 2], arm[:, 0]
     by_motion[:, 2, 0], by_motion[:, 2, 1] = arm[:, 1], -arm[:, 0]
     by_motion[:, :, 3:] = np.eye(3)
-    return seen.off(uv_px, cam[:, 2]), by_cam @ rotate @ by_motion
+    return np.concatenate([uv_px, cam[:, 2:]], axis=1), by_cam @ rotate @ by_motion
 
 
 def align(start: Float[np.ndarray, "*B N 3"], end: Float[np.ndarray, "*B N 3"]) -> Float[np.ndarray, "*B 4 4"]:

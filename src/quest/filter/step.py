@@ -7,13 +7,15 @@ Without depth nothing is known to ride, and the own patch, guided by the camera'
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from quest.filter.landmarks import CameraMotion, Landmarks, observe, sow
+from quest.filter.joints import Joint, joints_of
+from quest.filter.landmarks import CameraMotion, Landmarks, observe, ray_error, sow
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.posterior import weigh
@@ -38,7 +40,11 @@ def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterS
     nowhere = np.zeros((0, 2))
     landmarks = sow(Landmarks.none(), picture, view, nowhere, noise)
     return FilterState(
-        picture, view, stamp_s, landmarks, Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)))
+        picture,
+        view,
+        stamp_s,
+        landmarks,
+        Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3))),
     )
 
 
@@ -83,11 +89,16 @@ def _at(queries: Queries, landmarks: Landmarks, view: View) -> Float[np.ndarray,
 def ask(state: FilterState, uv_px: Float[np.ndarray, "K 2"], noise: Noise) -> FilterState:
     """Follow some pixels of the newest frame as well."""
     depth_m, pose = state.view.near_depth_at(uv_px), state.landmarks.pose
-    point = np.repeat(state.view.lift(uv_px, depth_m)[:, None], len(pose), axis=1)
-    new = Queries.named(state.picture, uv_px, depth_m, move_back(pose, point))
-    both = {name: np.concatenate([value, getattr(new, name)]) for name, value in vars(state.queries).items()}
+    point = state.view.lift(uv_px, depth_m)
+    place = move_back(pose, np.repeat(point[:, None], len(pose), axis=1))
+    new = Queries.named(state.picture, uv_px, depth_m, place, ray_error(state.view, uv_px, point, noise))
     landmarks = sow(state.landmarks, state.picture, state.view, uv_px, noise)
-    return replace(state, landmarks=landmarks, queries=Queries(**both))
+    return replace(state, landmarks=landmarks, queries=state.queries.join(new))
+
+
+def keep(state: FilterState, rows: Sequence[int]) -> FilterState:
+    """Follow some of the queries alone."""
+    return replace(state, queries=state.queries.only(np.array(rows, dtype=np.int64)))
 
 
 def _expect(
@@ -110,8 +121,10 @@ class Answer:
     point_world: Float[np.ndarray, "K 3"]
     """Metres; NaN without depth."""
     visible: Bool[np.ndarray, " K"]
-    lost_p: Float[np.ndarray, " K"]
+    lost_log_odds: Float[np.ndarray, " K"]
     """That it is not there."""
+    joint: tuple[Joint | None, ...]
+    """What moves it, in the filter's world; None where that is not known."""
 
 
 def read_off(state: FilterState, noise: Noise) -> Answer:
@@ -125,4 +138,4 @@ def read_off(state: FilterState, noise: Noise) -> Answer:
     point = np.where(rides[:, None], ride, view.lift(uv_px, measured))
     hidden = rides & (measured < ride_depth - 3 * depth_error(ride_depth, noise))
     visible = in_image(uv_px, state.picture.size) & ~hidden & (queries.seen_log_odds > 0)
-    return Answer(uv_px, point, visible, 1 / (1 + np.exp(-queries.lost_log_odds)))
+    return Answer(uv_px, point, visible, queries.lost_log_odds, joints_of(queries, state.landmarks, noise))

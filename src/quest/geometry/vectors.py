@@ -17,12 +17,6 @@ def cross(a: Float[np.ndarray, "*#B 3"], b: Float[np.ndarray, "*#B 3"]) -> Float
     return a.take(_NEXT, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_NEXT, -1)
 
 
-def rotated(vector: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"], angle: float) -> Float[np.ndarray, "3"]:
-    """A vector turned about a unit axis through the origin, right-handed, by an angle in radians."""
-    along = (vector @ axis) * axis
-    return along + np.cos(angle) * (vector - along) + np.sin(angle) * cross(axis, vector)
-
-
 def perpendicular(axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 2"]:
     """Two unit vectors across an axis and each other, the same for the same axis."""
     other = np.eye(3)[int(np.abs(axis).argmin())]

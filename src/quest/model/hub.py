@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -176,7 +175,6 @@ def model_card(
     config: NetworkConfig,
     about: str,
     settings: str,
-    monitor: str | None,
     licence: str,
     version: str,
     load_as: str,
@@ -189,7 +187,6 @@ def model_card(
         config: of the network.
         about: where the weights come from.
         settings: of the tracker, as JSON text.
-        monitor: calibration of the monitor, as JSON text; None without.
         licence: of the weights; empty if unknown.
         version: of the weights; empty if unknown.
         load_as: what to pass to ``quest.load``.
@@ -201,7 +198,6 @@ def model_card(
             ("encoder", f"ViT of depth {config.encoder.depth}, {config.encoder.image_size} px input"),
             ("window", f"{config.window} frames"),
             ("training", about or "not said"),
-            ("monitor", _monitor(monitor)),
             ("licence", licence or "not said"),
             ("version", version or "not said"),
         ]
@@ -213,8 +209,8 @@ def model_card(
     use = (
         f"## Use\n\n```sh\npip install {DISTRIBUTION}\nquest track path/to/recording --weights {load_as} "
         f'--out outputs\n```\n\n```python\nimport quest\n\ntracker = quest.load("{load_as}")\n```\n\n'
-        "The file is safetensors: tensors in half precision, with configuration, tracker settings and the monitor's "
-        "calibration in its metadata. No pickle is needed or loaded.\n"
+        "The file is safetensors: tensors in half precision, with configuration and tracker settings in its metadata. "
+        "No pickle is needed or loaded.\n"
     )
     return ModelCard(f"---\n{header.to_yaml()}\n---\n\n{text.rstrip()}\n\n{use}", ignore_metadata_errors=True)
 
@@ -226,7 +222,3 @@ def _licence(licence: str) -> dict[str, str]:
     if licence.lower() in HUB_LICENCES:
         return {"license": licence.lower()}
     return {"license": "other", "license_name": re.sub(r"[^a-z0-9.]+", "-", licence.lower()).strip("-")}
-
-
-def _monitor(monitor: str | None) -> str:
-    return json.loads(monitor).get("about", "calibrated") if monitor else "not calibrated: no alarms"

@@ -1,6 +1,6 @@
 """What the network believes of the joint that a query hangs on: kind, axis and place of the axis, each with its spread.
 
-Doors and drawers show how they will open before anything moves; the belief is the prior that grounding starts from.
+Doors and drawers show how they will open before anything moves.
 
 References: Jiang et al., OPD: Single-view 3D Openable Part Detection, ECCV 2022, for the parameters; Kendall and Gal,
 What Uncertainties Do We Need in Bayesian Deep Learning, NeurIPS 2017, section 3.1, for learning the spreads.

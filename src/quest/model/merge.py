@@ -25,10 +25,9 @@ def merge(
 
     The licences of all parts are joined, one that is not said among them; the version is left open.
 
-    Neither takes part in following what a query is bound to, so settings and the monitor's calibration stay good, but
-    for the threshold of discovery (``quest weights tune --discovery-only``). The mean of the maps of one training's
-    checkpoints, or of trainings that began with the same map, is often better than each. What ranks pieces goes with
-    one map; the mean of several has to learn it anew (``quest weights pieces``).
+    The threshold of discovery belongs to one map: choose it anew afterwards (``quest weights tune``). The mean of the
+    maps of one training's checkpoints, or of trainings that began with the same map, is often better than each. What
+    ranks pieces goes with one map; the mean of several has to learn it anew (``quest weights pieces``).
 
     Reference: Wortsman et al., Model soups, ICML 2022, section 2, for the mean.
 

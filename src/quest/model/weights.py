@@ -50,8 +50,6 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
     """Where the weights come from."""
     sha256: str
     """Of the file."""
-    monitor: str | None = None
-    """Calibration of the monitor that was fitted with these weights, as JSON text; None without."""
     licence: str = ""
     """Under which the weights may be used; empty if the file does not say."""
     version: str = ""
@@ -72,7 +70,6 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
             self.network,
             settings=self.settings,
             about=self.about,
-            monitor=self.monitor,
             licence=self.licence,
             version=self.version,
             beside=beside,
@@ -148,7 +145,6 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
             config=self.network.config,
             about=self.about,
             settings=self.settings,
-            monitor=self.monitor,
             licence=self.licence,
             version=self.version,
             load_as=repo_id or "path/to/this/folder",
@@ -166,7 +162,6 @@ def save_network(
     *,
     settings: str,
     about: str,
-    monitor: str | None = None,
     licence: str = "",
     version: str = "",
     beside: Path | None = None,
@@ -178,7 +173,6 @@ def save_network(
         network: the network with its encoder.
         settings: settings of the tracker, as JSON text.
         about: where the weights come from, a line for people.
-        monitor: calibration of the monitor, as JSON text; None without.
         licence: under which the weights may be used, such as ``Apache-2.0``; empty to say nothing.
         version: of the weights; empty to say nothing.
         beside: file of another network that will lie in the same folder or ships; parts that both have, such as the
@@ -189,7 +183,6 @@ def save_network(
     """
     tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
-    metadata |= {} if monitor is None else {"monitor": monitor}
     metadata |= {key: value for key, value in (("licence", licence), ("version", version)) if value}
     if beside is not None:
         tensors, shared = leave_out(tensors, beside)
@@ -289,7 +282,6 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
         settings=metadata.get("settings", "{}"),
         about=metadata.get("about", ""),
         sha256=sha256,
-        monitor=metadata.get("monitor"),
         licence=metadata.get("licence", ""),
         version=metadata.get("version", ""),
     )

@@ -1,9 +1,20 @@
-"""Drift signals, calibration, sequential alarms: knows when a query silently follows something else."""
+"""Calibration, a sequential statistic, alarms: knows when a query silently follows something else."""
 
 from quest.monitor.alarm import Alarm, Verdict
-from quest.monitor.calibration import Calibration
+from quest.monitor.calibration import Calibration, probability
+from quest.monitor.calibration_file import Inputs, read_calibrations, write_calibrations
 from quest.monitor.conformal import Budget
 from quest.monitor.monitor import Monitor, MonitorState
-from quest.monitor.signals import SIGNALS, Signals
 
-__all__ = ["SIGNALS", "Alarm", "Budget", "Calibration", "Monitor", "MonitorState", "Signals", "Verdict"]
+__all__ = [
+    "Alarm",
+    "Budget",
+    "Calibration",
+    "Inputs",
+    "Monitor",
+    "MonitorState",
+    "Verdict",
+    "probability",
+    "read_calibrations",
+    "write_calibrations",
+]

@@ -27,7 +27,7 @@ class Alarm:
     alpha: float
     """The share of loss-free streams that may alarm; how the threshold was chosen."""
     reason: str
-    """The signals that speak most for a loss, in words."""
+    """What speaks for a loss, in words."""
     extrapolated: bool = False
     """Whether the threshold lies beyond what the calibration streams can support by themselves and was read off a
     fitted tail."""
@@ -38,10 +38,12 @@ class Verdict:
     """What the monitor makes of one frame; rows in the order of the keys that were asked."""
 
     lost_p: Float32[np.ndarray, " K"]
-    """Calibrated probability that the identity is lost."""
+    """Calibrated probability that the identity is lost; NaN of queries that rest."""
     statistic: Float32[np.ndarray, " K"]
     """The sequential statistic, which an alarm compares with its threshold."""
     open: tuple[Alarm | None, ...]
     """The alarm of each query that has been raised and not cleared, or None."""
     raised: tuple[Alarm, ...]
     """Alarms raised in this frame."""
+    cleared: tuple[Alarm, ...]
+    """Alarms that ended in this frame."""

@@ -1,30 +1,28 @@
-"""What the monitor knows from calibration streams; stored with the weights as one JSON text."""
+"""What the monitor knows from calibration streams, as one line of JSON."""
 
 from __future__ import annotations
 
 import bisect
 import json
-from dataclasses import dataclass, fields
-from typing import Any, Literal, get_args
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float, Float64
 
 from quest.errors import ConfigError, WeightsError
-from quest.monitor import memory as memories
-from quest.monitor.calibrator import LOGIT_LIMIT, Calibrator
 from quest.monitor.conformal import Budget, Threshold, least_alpha, threshold
-from quest.monitor.signals import SIGNALS
 from quest.monitor.statistic import Cusum
 
-FORMAT = 3
+FORMAT = 4
 """Version of the text."""
 
 Unit = Literal["object", "take"]
 """What a promise is about: other objects, or other takes of the same objects."""
 
-_DIGITS = 4
-"""Significant digits of the calibrator's numbers."""
+LOGIT_LIMIT = 8.0
+"""Log odds are kept within this: no single frame is surer than 0.99966."""
 
 _DECIMALS = 4
 """Decimals of the maxima."""
@@ -35,12 +33,17 @@ _MANY_BLOCKS = 100_000
 
 @dataclass(frozen=True)
 class Calibration:
-    """A calibrator, a statistic, and how large the statistic gets where nothing is lost."""
+    """Log odds made right, a statistic, and how large the statistic gets where nothing is lost.
 
-    calibrator: Calibrator
-    """From signals to log odds of a loss."""
+    Reference: Platt, Probabilistic outputs for support vector machines, 1999, for slope and shift.
+    """
+
+    slope: float
+    """What the tracker's own log odds of a loss are multiplied by."""
+    shift: float
+    """What is added to them then."""
     statistic: Cusum
-    """Collects these over frames."""
+    """Collects these log odds over frames."""
     maxima: Float64[np.ndarray, " n"]
     """Of the statistic in each loss-free calibration stream, over queries and frames; ascending."""
     block_frames: int
@@ -48,17 +51,30 @@ class Calibration:
     about: str
     """What it was calibrated on, a line for people."""
     revision: int
-    """Of the tracker whose signals these are (``quest.track.settings.REVISION``)."""
+    """Of the tracker whose log odds these are (``quest.track.settings.REVISION``)."""
     unit: Unit = "object"
     """What each of the maxima is of, and so what the promise is about."""
 
     def __post_init__(self) -> None:
+        if not (math.isfinite(self.slope) and self.slope > 0 and math.isfinite(self.shift)):
+            raise WeightsError(
+                f"monitor: expected a positive slope and a finite shift, got {self.slope} and {self.shift}; "
+                "calibrate again"
+            )
         if not len(self.maxima) or not np.isfinite(self.maxima).all() or (np.diff(self.maxima) < 0).any():
             raise WeightsError("monitor: expected at least one maximum, finite and ascending; calibrate again")
         if self.unit not in get_args(Unit):
             raise WeightsError(f"monitor: expected unit object or take, got {self.unit!r}; calibrate again")
         if self.block_frames < 1:
             raise WeightsError(f"monitor: expected block_frames >= 1, got {self.block_frames}; calibrate again")
+
+    def logit(self, log_odds: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
+        """Calibrated log odds that a query is lost, within plus and minus :data:`LOGIT_LIMIT`.
+
+        Args:
+            log_odds: the tracker's own; NaN stays NaN.
+        """
+        return adjusted(log_odds, slope=self.slope, shift=self.shift)
 
     def threshold(self, alpha: float) -> Threshold:
         """What loss-free streams of the calibration's length exceed with a probability of at most alpha.
@@ -101,16 +117,11 @@ class Calibration:
         )
 
     def to_json(self) -> str:
-        """One line of text, stored with the weights.
-
-        The calibrator's numbers are rounded to four significant digits and the maxima up to four decimals, so fit the
-        maxima with a calibrator that has been through the text (:func:`rounded`).
-        """
+        """One line of text; maxima are rounded up to four decimals, so that no threshold becomes more eager."""
         raw = {
             "format": FORMAT,
-            "signals": SIGNALS,
-            "features": memories.FEATURES,
-            "calibrator": {f.name: _plain(getattr(self.calibrator, f.name)) for f in fields(Calibrator)},
+            "slope": self.slope,
+            "shift": self.shift,
             "statistic": {"drift": self.statistic.drift, "keep": self.statistic.keep},
             "maxima": (np.ceil(np.round(self.maxima * 10**_DECIMALS, 6)) / 10**_DECIMALS).tolist(),
             "block_frames": self.block_frames,
@@ -125,18 +136,18 @@ class Calibration:
         """Read what :meth:`to_json` wrote.
 
         Raises:
-            WeightsError: the text is damaged, or was written for other signals.
+            WeightsError: the text is damaged, or of another version.
         """
         try:
             raw = json.loads(text)
-            if (raw["format"], tuple(raw["signals"]), raw["features"]) != (FORMAT, SIGNALS, memories.FEATURES):
+            if raw["format"] != FORMAT:
                 raise WeightsError(
-                    "monitor stored with the weights: it was calibrated on other signals than this version of quest "
-                    "has; run `quest weights calibrate` again"
+                    f"monitor: expected a calibration of format {FORMAT}, got {raw['format']!r}; "
+                    "run `quest calibrate` again"
                 )
-            values = raw["calibrator"]
             return cls(
-                calibrator=Calibrator(**{name: np.array(value, np.float64) for name, value in values.items()}),
+                slope=float(raw["slope"]),
+                shift=float(raw["shift"]),
                 statistic=Cusum(**raw["statistic"]),
                 maxima=np.array(raw["maxima"], np.float64),
                 block_frames=int(raw["block_frames"]),
@@ -146,21 +157,16 @@ class Calibration:
             )
         except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
             raise WeightsError(
-                f"monitor stored with the weights cannot be read ({type(error).__name__}: {error}); "
-                "run `quest weights calibrate` again"
+                f"monitor: its calibration cannot be read ({type(error).__name__}: {error}); "
+                "run `quest calibrate` again"
             ) from error
 
 
-def rounded(calibrator: Calibrator) -> Calibrator:
-    """The calibrator as it is after being written and read: what thresholds must be computed with."""
-    return Calibrator(**{f.name: _round(getattr(calibrator, f.name)) for f in fields(Calibrator)})
+def adjusted(log_odds: Float[np.ndarray, "*N"], *, slope: float, shift: float) -> Float64[np.ndarray, "*N"]:
+    """Log odds on another scale, within plus and minus :data:`LOGIT_LIMIT`; NaN stays NaN."""
+    return np.clip(slope * log_odds.astype(np.float64) + shift, -LOGIT_LIMIT, LOGIT_LIMIT)
 
 
-def _round(values: Float64[np.ndarray, "..."]) -> Float64[np.ndarray, "..."]:
-    """Every number with four significant digits."""
-    texts = [f"{value:.{_DIGITS}g}" for value in values.ravel()]
-    return np.array([float(text) for text in texts]).reshape(values.shape)
-
-
-def _plain(values: np.ndarray) -> Any:
-    return _round(values).tolist()
+def probability(logit: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
+    """Probability of log odds."""
+    return 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))

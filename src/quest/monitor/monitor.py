@@ -1,21 +1,17 @@
-"""The monitor of one stream: signals in, probabilities and alarms out."""
+"""The monitor of one stream: log odds in, probabilities and alarms out."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 
 from quest.errors import InputError
-from quest.monitor import memory as memories
 from quest.monitor.alarm import Alarm, Verdict
-from quest.monitor.calibration import Calibration
-from quest.monitor.calibrator import probability
+from quest.monitor.calibration import Calibration, probability
 from quest.monitor.conformal import Budget, Threshold
-from quest.monitor.reason import reason
-from quest.monitor.signals import Signals
 
 _KNOWN_THRESHOLDS = 1000
 
@@ -24,33 +20,31 @@ _KNOWN_THRESHOLDS = 1000
 class MonitorState:
     """What the next verdict depends on; rows are queries, in the order of ``name``."""
 
-    statistic: Float64[np.ndarray, "N Z"]
+    statistic: Float64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0))
     """Of each query."""
     name: dict[int, str] = field(default_factory=dict)
     """By key, of the queries that are being watched."""
     open: dict[int, Alarm] = field(default_factory=dict)
     """Alarms by key."""
-    memory: Float64[np.ndarray, "N R S"] = field(default_factory=lambda: memories.start(0))
-    """Of each query's signals."""
     restart: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
-    """Number, over the stream, of each query's last alarm that was cleared; 0 without any."""
+    """Number, over the stream, of each query's last restart; 0 without any."""
     origin: Int64[np.ndarray, " N"] = field(default_factory=lambda: np.zeros(0, np.int64))
     """The frame from which each query's blocks count."""
     frames: int = 0
     """That were seen."""
     restarts: int = 0
-    """Alarms that were cleared."""
+    """Alarms that ended, and switches to another calibration."""
 
 
 class Monitor:
     """Watches the queries of one stream.
 
     On a stream in which no identity is lost, the probability that any query raises any alarm is at most alpha, as far
-    as the stream is like the calibration streams; ``docs/monitor.md`` says what that means. An alarm stays open until
-    it is cleared.
+    as the stream is like the calibration streams; ``docs/monitor.md`` says what that means. An alarm ends when its
+    statistic has fallen back to zero.
 
     Args:
-        calibration: what is stored with the weights.
+        calibration: for what the frames bring.
         alpha: in (0, 1).
         alpha_frames: alpha is for every so many frames, in a stream without an end; None for the whole stream.
 
@@ -62,7 +56,7 @@ class Monitor:
         self.calibration = calibration
         self.budget = Budget(alpha, alpha_frames)
         self._thresholds: dict[tuple[int, int], Threshold] = {}
-        self.state = MonitorState(statistic=np.zeros((0, calibration.statistic.size)))
+        self.state = MonitorState()
 
     def watch(self, key: int, name: str) -> None:
         """Begin to watch a query; its next frame is its first.
@@ -78,8 +72,7 @@ class Monitor:
             raise InputError(f"monitor: query {key} is being watched already; forget it first")
         self.state.name[key] = name
         state = self.state
-        state.memory = np.concatenate([state.memory, memories.start(1)])
-        state.statistic = np.concatenate([state.statistic, np.zeros((1, state.statistic.shape[1]))])
+        state.statistic = np.append(state.statistic, 0.0)
         state.restart, state.origin = np.append(state.restart, 0), np.append(state.origin, 0)
 
     def forget(self, key: int) -> None:
@@ -89,8 +82,8 @@ class Monitor:
             InputError: it is not being watched.
         """
         row = self._find(key)
-        for name in ("memory", "statistic", "restart", "origin"):
-            setattr(self.state, name, np.delete(getattr(self.state, name), row, axis=0))
+        for name in ("statistic", "restart", "origin"):
+            setattr(self.state, name, np.delete(getattr(self.state, name), row))
         del self.state.name[key]
         self.state.open.pop(key, None)
 
@@ -121,80 +114,114 @@ class Monitor:
         """
         row = self._find(key)
         if self.state.open.pop(key, None) is not None:
-            self.state.restarts += 1
-            self.state.restart[row] = self.state.restarts
-            if self.budget.frames is None:
-                self.state.origin[row] = self.state.frames
-        self.state.memory[row] = memories.forgive(self.state.memory[row])
+            self._restart(np.array([row]))
         self.state.statistic[row] = 0.0
 
-    def step(self, keys: Sequence[int], signals: Signals, *, frame: int, stamp_s: float) -> Verdict:
+    def switch(self, calibration: Calibration) -> None:
+        """Go on with another calibration, as where depth begins: statistics start anew, open alarms stay.
+
+        It spends of alpha what a cleared alarm does.
+        """
+        self.calibration = calibration
+        self._thresholds.clear()
+        if self.state.frames:
+            self._restart(np.arange(len(self.state.statistic)))
+        self.state.statistic[:] = 0.0
+
+    def step(
+        self,
+        keys: Sequence[int],
+        log_odds: Float[np.ndarray, " K"],
+        why: Callable[[int], str],
+        *,
+        frame: int,
+        stamp_s: float,
+    ) -> Verdict:
         """Take in one frame.
 
+        What comes after a loss must not make its alarm harder to end: while an alarm is open, the sum goes on from
+        no more than its threshold. The alarm ends in the frame in which the statistic is zero again, as if it
+        were cleared.
+
         Args:
-            keys: queries that are answered in this frame, in the order of the rows of ``signals``. Others that are
-                being watched rest: their memory stays as it is.
-            signals: what the tracker measured.
+            keys: queries that are answered in this frame, in the order of the rows of ``log_odds``. Others that are
+                being watched rest: their statistic stays as it is.
+            log_odds: the tracker's own, that each query is lost. A query whose log odds are NaN rests too.
+            why: gives the reason for the alarm of a row in words; called only where one is raised.
             frame: index of the frame, for alarms.
             stamp_s: its time in seconds, for alarms.
 
         Raises:
             InputError: a key is not being watched or comes twice, or there are not as many rows as keys.
         """
-        if len(keys) != len(signals) or len(set(keys)) != len(keys):
-            raise InputError(
-                f"monitor: expected one row of signals per query, got {len(signals)} for keys {list(keys)}"
-            )
+        if len(keys) != len(log_odds) or len(set(keys)) != len(keys):
+            raise InputError(f"monitor: expected log odds of each query, got {len(log_odds)} for keys {list(keys)}")
+        state = self.state
         rows = np.array([self._find(key) for key in keys], dtype=np.int64)
-        calibrator = self.calibration.calibrator
-        values = signals.values.astype(np.float64)
-        memory, features = calibrator.step(self.state.memory[rows], values)
-        logit = calibrator.logit(features)
-        lost_p = probability(logit)
-        age = self.budget.since(self.state.frames - self.state.origin)
-        # A block begins as a calibration stream did, from nothing: only so are its maxima comparable; also who rests.
-        self.state.statistic[age % self.calibration.block_frames == 0] = 0.0
-        state, statistic = self.calibration.statistic.update(self.state.statistic[rows], logit)
-        self.state.memory[rows], self.state.statistic[rows] = memory, state
-        block = age[rows] // self.calibration.block_frames + 1
-        raised = []
-        for i, key in enumerate(keys):
-            limit = self._threshold(int(block[i]), int(self.state.restart[rows[i]]))
-            if key not in self.state.open and statistic[i] > limit.value:
-                why = self._reason(features[i], memory[i], values[i], float(lost_p[i]))
+        logit = self.calibration.logit(log_odds)
+        known = ~np.isnan(logit)
+        self._begin_blocks()
+        told = state.statistic[rows]
+        told[known] = self.calibration.statistic.update(told[known, None], logit[known])[1]
+        state.statistic[rows] = told
+        raised, over = [], []
+        for i in np.flatnonzero(known).tolist():
+            key, row, value, limit = keys[i], rows[i], float(told[i]), self._limit(rows[i])
+            alarm = state.open.get(key)
+            if alarm is None and value > limit.value:
                 alarm = Alarm(
-                    self.state.name[key], int(key), int(frame), float(stamp_s), float(statistic[i]), limit.value,
-                    limit.alpha, why, limit.extrapolated,
+                    state.name[key], int(key), int(frame), float(stamp_s), value, limit.value, limit.alpha,
+                    why(i), limit.extrapolated,
                 )  # fmt: skip
-                self.state.open[key] = alarm
+                state.open[key] = alarm
                 raised.append(alarm)
-        self.state.frames += 1
+            elif alarm is not None and value == 0.0:
+                over.append(alarm)
+            if alarm is not None:
+                state.statistic[row] = min(value, alarm.threshold, limit.value)
+        state.frames += 1
+        for alarm in over:
+            self.clear(alarm.query)
         return Verdict(
-            lost_p=lost_p.astype(np.float32),
-            statistic=statistic.astype(np.float32),
-            open=tuple(self.state.open.get(key) for key in keys),
+            lost_p=probability(logit).astype(np.float32),
+            statistic=told.astype(np.float32),
+            open=tuple(state.open.get(key) for key in keys),
             raised=tuple(raised),
+            cleared=tuple(over),
         )
+
+    def _begin_blocks(self) -> None:
+        """A block begins as a calibration stream did, from nothing: only so are its maxima comparable.
+
+        That holds for queries that rest too, but not where an alarm is open, which ends by what is seen alone.
+        """
+        begins = self._age() % self.calibration.block_frames == 0
+        begins &= np.array([key not in self.state.open for key in self.state.name], dtype=bool)
+        self.state.statistic[begins] = 0.0
+
+    def _age(self) -> Int64[np.ndarray, " N"]:
+        """Frames since the first block of each query began."""
+        return self.budget.since(self.state.frames - self.state.origin)
+
+    def _restart(self, rows: Int64[np.ndarray, " M"]) -> None:
+        """Queries whose blocks begin anew, where alpha is for the whole stream, with less of it."""
+        self.state.restarts += 1
+        self.state.restart[rows] = self.state.restarts
+        if self.budget.frames is None:
+            self.state.origin[rows] = self.state.frames
 
     def _find(self, key: int) -> int:
         if key not in self.state.name:
             raise InputError(f"monitor: query {key} is not being watched; call watch({key}, name) first")
         return list(self.state.name).index(key)
 
-    def _threshold(self, block: int, restart: int) -> Threshold:
+    def _limit(self, row: np.int64) -> Threshold:
+        """What the statistic of a query has to exceed in this frame."""
         if len(self._thresholds) > _KNOWN_THRESHOLDS:  # a stream has no end
             self._thresholds.clear()
-        if (block, restart) not in self._thresholds:
-            part = self.budget.part(block=block, restart=restart, block_frames=self.calibration.block_frames)
-            self._thresholds[block, restart] = self.calibration.threshold(part)
-        return self._thresholds[block, restart]
-
-    def _reason(self, features: np.ndarray, memory: np.ndarray, values: np.ndarray, lost_p: float) -> str:
-        calibrator = self.calibration.calibrator
-        return reason(
-            calibrator.shares(features, memory),
-            np.where(np.isfinite(values), values, calibrator.unsquash(memory[memories.FAST])),
-            calibrator.unsquash(memory[memories.LEVEL]),
-            memory[memories.OFF],
-            lost_p=lost_p,
-        )
+        block_frames = self.calibration.block_frames
+        at = int(self._age()[row]) // block_frames + 1, int(self.state.restart[row])
+        if at not in self._thresholds:
+            part = self.budget.part(block=at[0], restart=at[1], block_frames=block_frames)
+            self._thresholds[at] = self.calibration.threshold(part)
+        return self._thresholds[at]

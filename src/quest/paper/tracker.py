@@ -169,13 +169,15 @@ class _Choice:
     frame: int
 
 
-def load(name: str | Path = "quest-s16", *, device: str = "auto", monitor: bool = True) -> Tracker | PaperTracker:
+def load(
+    name: str | Path = "quest-s16", *, device: str = "auto", monitor: bool | str | Path = True
+) -> Tracker | PaperTracker:
     """The tracker of any weights: ours (see :func:`quest.track.load`), or the published one where they are its.
 
     Args:
         name: as for :func:`quest.track.load`.
         device: as for :func:`quest.track.load`.
-        monitor: whether to read our monitor's calibration.
+        monitor: as for :func:`quest.track.load`.
 
     Raises:
         WeightsError: no such weights, or they cannot be read.

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from quest.errors import InputError
 
-FORMAT = "quest-stream-11"
+FORMAT = "quest-stream-12"
 _KEY = "quest-stream"
 _T = TypeVar("_T")
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from quest.grounding import Joint
-from quest.monitor import Alarm, Signals
+from quest.filter.joints import Joint
+from quest.monitor import Alarm
 from quest.types import State
 
 
@@ -25,7 +26,7 @@ class StreamState:
     point_world: Float32[np.ndarray, "K 3"]
     """World point in metres, NaN where it cannot be lifted."""
     confidence: Float32[np.ndarray, " K"]
-    """The network's own belief that the identity is right."""
+    """Probability that the entity is where the answer says, by the filter, before calibration."""
     visible: Bool[np.ndarray, " K"]
     """Whether the entity is seen."""
     state: tuple[State, ...]
@@ -37,21 +38,30 @@ class StreamState:
     query: tuple[int, ...]
     """The number of the query that each row answers; discovered slots count up."""
     joint: tuple[Joint | None, ...]
-    """The joint that explains each track so far, in the world, metres; None before the first seen point and without
-    depth."""
+    """The joint that moves each entity, in the world, metres; None where no body carries it, and without depth."""
     q: Float32[np.ndarray, " K"]
     """Where on its joint each query is, radians or metres; NaN without a joint, on one that does not move, and where
-    the point is unknown. Of a query that was asked for by a pixel, it is that of the network's own point, which may lie
-    beside the pixel."""
+    the point is unknown."""
+    lost_log_odds: Float32[np.ndarray, " K"]
+    """That the identity is lost, by the filter."""
     lost_p: Float32[np.ndarray, " K"]
-    """Calibrated probability that the identity is lost; NaN where nothing is watched."""
+    """The same as a calibrated probability; NaN where nothing is watched."""
     alarm: tuple[Alarm | None, ...]
     """The open alarm of each query, or None."""
-    signals: Signals
-    """What the monitor judged by."""
     flags: tuple[str, ...] = ()
     """Degradations of this frame in words, such as missing depth; a late or duplicate frame repeats the answer
     before."""
+
+    def only(self, rows: Sequence[int]) -> StreamState:
+        """Some of the queries."""
+        each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("stamp_s", "has_depth", "flags")}
+        return replace(
+            self,
+            **{
+                name: value[list(rows)] if isinstance(value, np.ndarray) else tuple(value[row] for row in rows)
+                for name, value in each.items()
+            },
+        )
 
     def __repr__(self) -> str:
         lines = [

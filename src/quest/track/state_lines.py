@@ -14,7 +14,7 @@ from typing import Any, TextIO
 import numpy as np
 
 from quest.errors import InputError
-from quest.grounding import Joint, JointKind
+from quest.filter.joints import Joint, JointKind
 from quest.track.state import StreamState
 
 STANDARD_OUTPUT = Path("-")

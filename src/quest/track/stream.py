@@ -2,110 +2,106 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float, Float32, UInt8
-from torch import Tensor
 
-from quest.errors import InputError
-from quest.grounding import LinkGroups
-from quest.model.decoder import Prediction
+from quest.filter import step as filtering
+from quest.filter.joints import Joint, JointKind
+from quest.filter.noise import Noise
+from quest.filter.step import Answer, FilterState
+from quest.filter.view import View, move
 from quest.model.network import QuestNetwork
-from quest.model.observation import FrameBatch, Observation
-from quest.monitor import SIGNALS, Alarm, Budget, Monitor, MonitorState, Signals, Verdict
-from quest.track.binding import Binding, BindingState
-from quest.track.expectation import joint_rows
-from quest.track.following import Answer, Following
-from quest.track.intake import Arrival, Intake, IntakeState
-from quest.track.lifting import lift_near
-from quest.track.marks import beside, marked
-from quest.track.matching import match
-from quest.track.measuring import measure
-from quest.track.placing import LOST_BELOW, Placed, Placer, as_array
+from quest.model.xfeat import XFeat
+from quest.monitor import Alarm, Budget, Calibration, Inputs, Monitor, MonitorState, probability
+from quest.track.finder import Finder
+from quest.track.preprocess import Arrival, Prepared, Preprocessor, PreprocessorState, to_picture
+from quest.track.queries import QueriesState, StreamQueries
+from quest.track.reasons import reason
 from quest.track.settings import TrackerConfig
-from quest.track.sharing import SIGMA, share
 from quest.track.state import StreamState
-from quest.track.world import along_joint, to_world, world_joint
 from quest.types import Camera, Query, State
 
-WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is calibrated on frames with depth, and none had any so far"
-
-_LOST_ABOVE = 0.5
-_DOUBTED_ABOVE = 0.95
-"""Probability of a loss above which a query goes back to where it was right. Below it the answer of the newest frame is
-nearer in the mean, wrong as it may be: what is lost has often only drifted, and what is taken back is left behind."""
+WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is not calibrated for frames without depth, and none had any yet"
+POSES_BEGIN_FLAG = "poses begin: world points were in the first camera's axes before"
 
 
 @dataclass
 class Memory:
     """Everything that the next answers depend on, in bounded size; callbacks are left out."""
 
-    intake: IntakeState
+    preprocessor: PreprocessorState
     """Of the frames that came."""
-    binding: BindingState
-    """Of the queries' anchors, and of queries without one."""
-    ring: deque[Observation]
-    """The newest T frames as observed."""
+    queries: QueriesState
+    """What is followed, and what waits."""
     monitor: MonitorState | None
     """None where nothing is watched."""
-    following: list[Following] = field(default_factory=list)
-    """Queries that have found their entity."""
-    links: LinkGroups = field(default_factory=lambda: LinkGroups(SIGMA))
-    """Which of them share a joint."""
+    filter: FilterState | None = None
+    """None before the first frame."""
+    world_from_filter: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
+    """From the world of the filter, the first camera's axes, to that of the poses."""
     frame: int = 0
     """Index of the next frame."""
     stamp_s: float = 0.0
     """Time of the newest frame."""
     has_depth: bool = False
     """Whether the newest frame brought any depth."""
+    inputs: Inputs | None = None
+    """What the monitor judges by."""
+    flags: tuple[str, ...] = ()
+    """Degradations of the newest frame, in words."""
+    answer: StreamState | None = None
+    """What was answered in the newest frame."""
 
 
 class Stream:
     """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
 
     Args:
-        network: trained network in evaluation mode.
+        network: finds entities, in evaluation mode.
+        features: dense features, by which the filter finds again what it follows.
+        noise: parameters of the filter.
         config: settings of tracking.
         camera: intrinsics of the frames.
         queries: what to follow; None discovers entities in the first frame.
-        device: where the network runs.
-        autocast: whether the network computes in bfloat16.
-        monitor: watches for lost identities; None for no alarms and no recovery.
+        device: where the networks run.
+        calibrations: of the monitor, by what frames bring.
+        budget: how often alarms may be false; None for no alarms.
 
     Raises:
-        InputError: a point query lies outside the image.
+        InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
     """
 
     def __init__(
         self,
         network: QuestNetwork,
+        features: XFeat,
+        noise: Noise,
         config: TrackerConfig,
         camera: Camera,
         queries: Sequence[Query] | None,
         *,
         device: torch.device,
-        autocast: bool,
-        monitor: Monitor | None = None,
+        calibrations: Mapping[Inputs, Calibration],
+        budget: Budget | None,
     ) -> None:
-        self._network = network
+        self._features = features
+        self._noise = noise
         self._config = config
-        self._device = device
-        self._autocast = autocast
-        self._monitor = monitor
-        self._intake = Intake(network, camera, device=device)
-        self._binding = Binding(network, config, self._intake.letterbox, queries)
-        self._memory = Memory(
-            self._intake.state,
-            self._binding.state,
-            deque(maxlen=network.config.window),
-            None if monitor is None else monitor.state,
-        )
+        self._calibrations = calibrations
+        self._preprocessor = Preprocessor(camera)
+        self._finder = Finder(network, camera, device=device)
+        self._queries = StreamQueries(network.config, config, self._finder.letterbox, queries)
+        self._monitor = None
+        if budget is not None and calibrations:
+            first = next(iter(calibrations.values()))
+            self._monitor = Monitor(first, alpha=budget.alpha, alpha_frames=budget.frames)
+        state = None if self._monitor is None else self._monitor.state
+        self._memory = Memory(self._preprocessor.state, self._queries.state, state)
         self._callbacks: list[Callable[[Alarm], None]] = []
-        self._raised: tuple[Alarm, ...] = ()
 
     @property
     def memory(self) -> Memory:
@@ -114,14 +110,16 @@ class Stream:
 
     @memory.setter
     def memory(self, memory: Memory) -> None:
-        self._memory, self._intake.state, self._binding.state = memory, memory.intake, memory.binding
+        self._memory, self._preprocessor.state, self._queries.state = memory, memory.preprocessor, memory.queries
         if self._monitor is not None and memory.monitor is not None:
+            if memory.inputs is not None and memory.inputs in self._calibrations:
+                self._monitor.calibration = self._calibrations[memory.inputs]
             self._monitor.state = memory.monitor
 
     @property
     def camera(self) -> Camera:
         """Intrinsics of the frames."""
-        return self._intake.letterbox.source
+        return self._preprocessor.camera
 
     @property
     def budget(self) -> Budget | None:
@@ -136,12 +134,12 @@ class Stream:
     @property
     def unbound(self) -> tuple[Query, ...]:
         """Queries that have not found their entity, and point queries whose frame has not come."""
-        return tuple(w.query for w in self._binding.state.waiting)
+        return tuple(w.query for w in self._queries.state.waiting)
 
     @property
     def looking(self) -> bool:
-        """Whether a query may still find its entity: labels and slots look for it in the first frames alone."""
-        return self._binding.looking(self._memory.frame)
+        """Whether a query may still find its entity: labels and slots look for it for a quarter of a second."""
+        return self._queries.looking(self._preprocessor.state.now_s)
 
     def add(self, query: Query) -> int:
         """Follow one more entity from the next frame on; returns the query's number.
@@ -149,7 +147,7 @@ class Stream:
         Raises:
             InputError: a point query lies outside the image or in a frame that has passed, or its name is taken.
         """
-        return self._binding.ask(query, frame=self._memory.frame, following=self._memory.following)
+        return self._queries.ask(query, frame=self._memory.frame)
 
     def retire(self, query: int | str) -> None:
         """Follow a query no longer, by its number or name.
@@ -157,15 +155,14 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits.
         """
-        number = self._binding.find(query, self._memory.following)
-        rows = [i for i, f in enumerate(self._memory.following) if f.query != number]
-        if len(rows) < len(self._memory.following):
-            self._binding.keep(rows)
-            self._memory.links.forget(number)
+        number = self._queries.find(query)
+        followed = {f.number for f in self._queries.state.following}
+        rows = self._queries.retire(number)
+        if number in followed:
+            assert self._memory.filter is not None
+            self._memory.filter = filtering.keep(self._memory.filter, rows)
             if self._monitor is not None:
                 self._monitor.forget(number)
-        self._memory.following = [self._memory.following[i] for i in rows]
-        self._binding.state.waiting = [w for w in self._binding.state.waiting if w.number != number]
 
     def rename(self, query: int | str, name: str) -> None:
         """Call a query by another name in all answers from now on.
@@ -173,18 +170,10 @@ class Stream:
         Raises:
             InputError: no query of that number or name is followed or waits, or another has the new name.
         """
-        number = self._binding.find(query, self._memory.following)
-        if name in {other for k, other in self._binding.names(self._memory.following).items() if k != number}:
-            raise InputError(f"query {query!r}: another query is called {name!r} already; choose another name")
-        for following in self._memory.following:
-            if following.query == number:
-                following.name = name
-                if self._monitor is not None:
-                    self._monitor.rename(number, name)
-        self._binding.state.waiting = [
-            replace(w, query=replace(w.query, name=name)) if w.number == number else w
-            for w in self._binding.state.waiting
-        ]
+        number = self._queries.find(query)
+        self._queries.rename(number, name)
+        if self._monitor is not None and any(f.number == number for f in self._queries.state.following):
+            self._monitor.rename(number, name)
 
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
         """Call a function with every alarm at the end of the step that raises it; it may save the stream."""
@@ -206,185 +195,126 @@ class Stream:
             rgb: colours.
             depth_m: metres along +z; 0 or NaN where missing, None without depth.
             stamp_s: time in seconds.
-            cam_from_world: pose of the camera; the last one if None, and if there was none, the world is the camera.
+            cam_from_world: pose of the camera. It is estimated from picture and depth if None, and as long as the poses
+                that are given never change; the world is then the first camera.
 
         Raises:
             InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
                 rigid; the stream stays as it was.
         """
-        intake, memory, self._raised = self._intake, self._memory, ()
-        stamp_s = float(stamp_s)
-        intake.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
-        if intake.admit(rgb, stamp_s) is not Arrival.NEW:
-            memory.frame += 1
-            self._binding.wait()
-            return self._state()
-        with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=self._autocast):
-            frames, renewed = intake.prepare(rgb, depth_m, cam_from_world)
-            if renewed:
-                # Coordinates change with the reference, so nothing observed before may be mixed with it.
-                memory.ring.clear()
-                memory.links = LinkGroups(SIGMA)
-                for following in memory.following:
-                    following.forget_places(self._config)
-            observed = self._network.observe(frames)
-            if renewed:
-                self._binding.bind_again(observed, frames, memory.following)
-            while len(memory.ring) < self._network.config.window - 1:
-                memory.ring.append(observed)
-            memory.ring.append(observed)
-            for found in self._binding.bind(memory.frame, observed, frames, memory.following):
-                memory.following.append(found)
-                if self._monitor is not None:
-                    self._monitor.watch(found.query, found.name)
-            memory.stamp_s, memory.has_depth = stamp_s, bool((frames.depth_m > 0).any())
-            self._answer(frames)
-        self._memory.frame += 1
-        for alarm in self._raised:
+        preprocessor, memory, stamp_s = self._preprocessor, self._memory, float(stamp_s)
+        preprocessor.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
+        arrival = preprocessor.accept(rgb, stamp_s)
+        memory.frame += 1
+        if arrival is not Arrival.NEW:
+            memory.flags = preprocessor.state.flags
+            return self._repeated()
+        frame = preprocessor.prepare(rgb, depth_m, cam_from_world)
+        memory.flags, memory.stamp_s = preprocessor.state.flags, stamp_s
+        memory.has_depth = frame.depth_m is not None
+        state = self._filter(frame)
+        at_px = filtering.read_off(state, self._noise).uv_px
+        new_px = self._queries.bind(
+            memory.frame - 1, preprocessor.state.now_s, at_px,
+            lambda: self._finder.find(rgb, frame.depth_m, radius_cells=self._config.slot_radius_cells),
+        )  # fmt: skip
+        memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
+        if self._monitor is not None:
+            for following in self._queries.state.following[len(at_px) :]:
+                self._monitor.watch(following.number, following.name)
+        memory.answer, raised = self._answer(memory.filter)
+        for alarm in raised:
             for callback in self._callbacks:
                 callback(alarm)
-        return self._state()
+        return memory.answer
 
-    def _answer(self, frames: FrameBatch) -> None:
-        """Place every query in the newest frame, judge it, and keep the answers."""
-        memory, following = self._memory, self._memory.following
-        if not following or memory.binding.anchor is None:
-            return
-        window = Observation.stack(list(memory.ring))
-        prediction = match(
-            self._network,
-            self._config,
-            memory.binding.anchor,
-            window,
-            frames,
-            following,
-            elapsed=memory.intake.elapsed,
-        )
-        candidate = as_array(lift_near(prediction, frames, self._config.lift_tolerance))
-        placer = Placer(
-            following, prediction, frames, network=self._network.config, config=self._config,
-            picture_px=self._intake.letterbox.picture_px, elapsed=memory.intake.elapsed, now=memory.intake.now,
-        )  # fmt: skip
-        placed = placer.place(candidate, joint_rows(self._network.joint(prediction.embedding)))
-        if self._config.ground:
-            share(memory.links, memory.frame, following, placed)
-        placed = replace(placed, room=placer.room(placed.judged))
-        shown = replace(placed, point=marked(following, placed.point, prediction, frames))
-        uv, judged_uv = (self._project(p, frames, prediction) for p in (shown.point, placed.judged))
-        uv = beside(following, uv, shown.point, size=self._network.config.encoder.image_size)
-        signals = measure(
-            self._network, memory.binding.anchor, memory.ring[-1], prediction, placed, judged_uv, following
-        )
-        for k, query in enumerate(following):
-            query.move(placed.point[k], held=bool(placed.held[k]), embedding=prediction.embedding[0, 0, k])
-        self._keep(uv, shown, as_array(prediction.right_logit[0, 0].sigmoid()), signals)
+    def _filter(self, frame: Prepared) -> FilterState:
+        """The filter's state after a frame."""
+        memory, now_s = self._memory, self._preprocessor.state.now_s
+        picture = to_picture(frame.grey, self._features)
+        if memory.filter is None:
+            # In the first camera's axes, so that answers do not depend on where the world has its origin.
+            view = View(self.camera.matrix.astype(np.float64), np.eye(4), frame.depth_m)
+            state = filtering.begin(picture, view, now_s, self._noise)
+        else:
+            given = None if frame.cam_from_world is None else frame.cam_from_world @ memory.world_from_filter
+            state = filtering.step(memory.filter, picture, frame.depth_m, now_s, given, self._noise)
+        if frame.first_pose is not None:
+            memory.world_from_filter = np.linalg.inv(frame.first_pose) @ state.view.cam_from_world
+            memory.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
+        return state
 
-    def _project(self, point: np.ndarray, frames: FrameBatch, prediction: Prediction) -> Float[Tensor, "K 2"]:
-        """Points in [0, 1]^2 of the input; where they are unknown, what the network sees."""
-        at = torch.from_numpy(point).to(frames.depth_m)
-        uv = frames.from_reference(at[None, None])[0, 0] / self._network.config.encoder.image_size
-        return torch.where(torch.isfinite(uv).all(dim=-1, keepdim=True), uv, prediction.uv[0, 0])
-
-    def _keep(
-        self,
-        uv: Float[Tensor, "K 2"],
-        placed: Placed,
-        right: Float[np.ndarray, " K"],
-        signals: Signals,
-    ) -> None:
-        """Judge the answers and keep them; begin or end recoveries; note what alarms were raised."""
-        size, following = self._network.config.encoder.image_size, self._memory.following
-        uv_px = self._intake.letterbox.to_source(uv.float().cpu().numpy() * size).astype(np.float32)
-        inside = np.all((uv_px >= 0) & (uv_px <= (self.camera.width, self.camera.height)), axis=-1)
-        assert self._intake.state.reference is not None
-        world = to_world(placed.point, self._intake.state.reference)
-        world = world if self._memory.has_depth else np.full_like(world, np.nan)
-        verdict = None
-        # Also of those that are found in this very frame: the answer is where they were held.
-        doubted = [query.doubted for query in following]
-        if self._monitor is not None and not self._withheld:
-            verdict = self._monitor.step(
-                [f.query for f in following], signals, frame=self._memory.frame, stamp_s=self._memory.stamp_s
-            )
-            self._recover(verdict, placed)
-        for k, query in enumerate(following):
-            visible = bool(placed.seen[k] > 0.5 and inside[k] and not (doubted[k] or query.doubted))
-            lost_p = float("nan") if verdict is None else float(verdict.lost_p[k])
-            # The network's belief in a single frame only counts where nothing is calibrated.
-            lost = lost_p > _LOST_ABOVE or self._alarm(query) is not None or (verdict is None and right[k] < LOST_BELOW)
-            query.answer = Answer(
-                uv_px=uv_px[k],
-                point_world=world[k],
-                confidence=float(right[k]),
-                visible=visible,
-                state=State.LOST if lost else State.TRACKING if visible else State.HELD,
-                lost_p=lost_p,
-                signals=signals.values[k],
-            )
-        self._raised = () if verdict is None else tuple(verdict.raised)
-
-    def _recover(self, verdict: Verdict, placed: Placed) -> None:
-        """Search for what an alarm says is lost; end the alarm where what is seen matches the anchor again.
-
-        What is held on its joint, unseen, is held on; what is surely seen in a wrong place goes back to where it was
-        right.
-        """
-        assert self._monitor is not None
-        for k, query in enumerate(self._memory.following):
-            right = bool(verdict.lost_p[k] < self._config.found_below) and not placed.held[k]
-            alarm = verdict.open[k]
-            if alarm is None:
-                if right:
-                    query.keep()
-                continue
-            if alarm in verdict.raised:
-                query.good = 0
-                if not placed.held[k] and verdict.lost_p[k] > _DOUBTED_ABOVE:
-                    query.doubt()
-                continue
-            known = np.isfinite(placed.judged[k]).all() or not self._memory.has_depth
-            query.good = query.good + 1 if right and known else 0
-            if query.good >= self._config.found_frames:
-                query.trust(placed.judged[k])
-                self._monitor.clear(query.query)
-
-    @property
-    def _withheld(self) -> bool:
-        """Whether P(lost) would say nothing: it is calibrated for streams with depth, and there was none so far."""
-        reference = self._intake.state.reference
-        return self._monitor is not None and reference is not None and not reference.has_depth
-
-    def _alarm(self, query: Following) -> Alarm | None:
-        return None if self._monitor is None else self._monitor.alarm(query.query)
-
-    def _state(self) -> StreamState:
-        """The newest answers of all queries."""
-        rows = [(f, f.answer) for f in self._memory.following if f.answer is not None]
-        answers = [answer for _, answer in rows]
-        reference, flags = self._intake.state.reference, self._intake.state.flags
-        flags = (*flags, WITHHELD_FLAG) if self._withheld else flags
-        joints = tuple(world_joint(self._memory.links.joint(f.query) or f.ground.joint, reference) for f, _ in rows)
-
-        def stacked(name: str, *shape: int) -> np.ndarray:
-            return np.array([getattr(a, name) for a in answers], np.float32).reshape(len(answers), *shape)
-
-        return StreamState(
-            names=tuple(f.name for f, _ in rows),
-            labels=tuple(f.label for f, _ in rows),
-            uv_px=stacked("uv_px", 2),
-            point_world=stacked("point_world", 3),
-            confidence=stacked("confidence"),
-            visible=np.array([a.visible for a in answers], bool),
-            state=tuple(a.state for a in answers),
-            stamp_s=self._memory.stamp_s,
-            has_depth=self._memory.has_depth,
-            query=tuple(f.query for f, _ in rows),
-            joint=joints,
-            q=np.array(
-                [along_joint(f, joint, reference) for (f, _), joint in zip(rows, joints, strict=True)], np.float32
+    def _answer(self, state: FilterState) -> tuple[StreamState, tuple[Alarm, ...]]:
+        """What is said of the newest frame, and the alarms that are raised in it."""
+        memory, following = self._memory, self._queries.state.following
+        answer, numbers = filtering.read_off(state, self._noise), [f.number for f in following]
+        lost_p, alarms, raised = self._watch(numbers, answer, state)
+        doubt = probability(answer.lost_log_odds)
+        lost = [
+            (p if np.isfinite(p) else d) > 0.5 or alarm is not None
+            for p, d, alarm in zip(lost_p, doubt, alarms, strict=True)
+        ]
+        visible = answer.visible & ~np.array([alarm is not None for alarm in alarms], bool)
+        joints = tuple(None if j is None else j.moved(memory.world_from_filter) for j in answer.joint)
+        point = move(memory.world_from_filter, answer.point_world)
+        told = StreamState(
+            names=tuple(f.name for f in following),
+            labels=tuple(f.label for f in following),
+            uv_px=answer.uv_px.astype(np.float32),
+            point_world=point.astype(np.float32),
+            confidence=(1 - doubt).astype(np.float32),
+            visible=visible,
+            state=tuple(
+                State.LOST if gone else State.TRACKING if seen else State.HELD
+                for gone, seen in zip(lost, visible, strict=True)
             ),
-            lost_p=stacked("lost_p"),
-            alarm=tuple(self._alarm(f) for f, _ in rows),
-            signals=Signals(stacked("signals", len(SIGNALS))),
-            flags=flags,
+            stamp_s=memory.stamp_s,
+            has_depth=memory.has_depth,
+            query=tuple(numbers),
+            joint=joints,
+            q=np.array([_coordinate(j, p) for j, p in zip(joints, point, strict=True)], np.float32),
+            lost_log_odds=answer.lost_log_odds.astype(np.float32),
+            lost_p=lost_p.astype(np.float32),
+            alarm=alarms,
+            flags=memory.flags,
         )
+        return told, raised
+
+    def _watch(
+        self, numbers: list[int], answer: Answer, state: FilterState
+    ) -> tuple[np.ndarray, tuple[Alarm | None, ...], tuple[Alarm, ...]]:
+        """Calibrated P(lost), open alarms, and those that are raised now."""
+        memory, monitor = self._memory, self._monitor
+        nothing = np.full(len(numbers), np.nan), (None,) * len(numbers), ()
+        if monitor is None:
+            return nothing
+        inputs: Inputs = "depth" if self._preprocessor.state.has_depth else "colours"
+        if inputs not in self._calibrations:
+            memory.flags += (WITHHELD_FLAG,)
+            return nothing
+        if inputs != memory.inputs:
+            monitor.switch(self._calibrations[inputs])
+            memory.inputs = inputs
+        verdict = monitor.step(
+            numbers,
+            answer.lost_log_odds,
+            lambda row: reason(state.queries, row, answer.uv_px[row]),
+            frame=memory.frame - 1,
+            stamp_s=memory.stamp_s,
+        )
+        return verdict.lost_p, verdict.open, verdict.raised
+
+    def _repeated(self) -> StreamState:
+        """The answer before, of the queries that are still followed, flagged."""
+        memory, following = self._memory, self._queries.state.following
+        if memory.answer is None:
+            raise AssertionError("the first frame is always new")
+        rows = [memory.answer.query.index(f.number) for f in following]
+        return replace(memory.answer.only(rows), names=tuple(f.name for f in following), flags=memory.flags)
+
+
+def _coordinate(joint: Joint | None, point: Float[np.ndarray, "3"]) -> float:
+    """Where on its joint a point is, radians or metres; NaN without a joint that moves."""
+    if joint is None or joint.kind is JointKind.STATIC:
+        return float("nan")
+    return float(joint.locate(point[None])[0])

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float32
 
 from quest.data.recording import read_recording
 from quest.errors import ConfigError, InputError, WeightsError
-from quest.grounding import Joint, JointKind
-from quest.model.discovery import Peaks, find_peaks
+from quest.filter.joints import Joint, JointKind
+from quest.filter.noise import Noise
+from quest.model.discovery import Peaks
 from quest.model.network import QuestNetwork
-from quest.model.precision import fast_bfloat16
 from quest.model.weights import load_network
-from quest.monitor import Budget, Calibration, Monitor
-from quest.track.intake import NO_DEPTH_FLAG, Intake
+from quest.model.xfeat import XFeat
+from quest.monitor import Budget, Calibration, Inputs, read_calibrations
+from quest.track.finder import Finder
+from quest.track.preprocess import NO_DEPTH_FLAG, Preprocessor
 from quest.track.saving import load as restored
 from quest.track.saving import save
 from quest.track.settings import REVISION, TrackerConfig
@@ -29,7 +32,7 @@ from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
-PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are NaN"
+PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are where the bodies carry them, NaN at first"
 PARTLY_WITHHELD_FLAG = "no P(lost) and no alarms in the frames until depth began: the monitor is calibrated for depth"
 NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
 
@@ -40,6 +43,7 @@ class Maker:
 
     weights_hash: str | None
     settings: TrackerConfig
+    noise: Noise
     revision: int
     calibration_hash: str
     camera: Camera
@@ -58,11 +62,12 @@ class Tracker:
     """Follows entities through clips and streams; make one with :func:`load`.
 
     Args:
-        network: trained network.
-        config: settings of tracking.
-        device: where the network runs.
+        network: finds entities; what it finds, and points that are given, the filter follows.
+        config: settings of discovery.
+        device: where the networks run.
         weights_hash: SHA-256 of the file that the network came from, for result files and saved streams.
-        calibration: of the monitor; None for no alarms.
+        calibrations: of the monitor, by what frames bring; without any there are no alarms.
+        noise: parameters of the filter.
     """
 
     name = "quest"
@@ -74,32 +79,21 @@ class Tracker:
         *,
         device: torch.device,
         weights_hash: str | None = None,
-        calibration: Calibration | None = None,
+        calibrations: Mapping[Inputs, Calibration] | None = None,
+        noise: Noise | None = None,
     ) -> None:
         self.network = network.to(device).eval()
         self.config = config
         self.device = device
         self.weights_hash = weights_hash
-        self.calibration = calibration
-        self._autocast = fast_bfloat16(device)
+        self.calibrations: dict[Inputs, Calibration] = dict(calibrations or {})
+        self.noise = Noise() if noise is None else noise
+        self.features = XFeat.from_package().to(device)
 
     def __repr__(self) -> str:
         weights = "unnamed weights" if self.weights_hash is None else f"weights {self.weights_hash[:8]}"
-        monitor = "no monitor" if self.calibration is None else "monitored"
+        monitor = f"monitored with {' and '.join(self.calibrations)}" if self.calibrations else "no monitor"
         return f"Tracker({self.name!r}, {weights}, on {self.device}, {monitor})"
-
-    def with_config(self, config: TrackerConfig, *, name: str) -> Tracker:
-        """A tracker that shares this one's network under other settings.
-
-        Args:
-            config: its settings.
-            name: what tables call it.
-        """
-        other = Tracker(
-            self.network, config, device=self.device, weights_hash=self.weights_hash, calibration=self.calibration
-        )
-        other.name, other._autocast = name, self._autocast
-        return other
 
     def stream(
         self,
@@ -115,21 +109,24 @@ class Tracker:
             camera: intrinsics of the frames.
             queries: what to follow; None discovers entities in the first frame.
             alpha: probability of any alarm in a stream in which no identity is lost (``docs/monitor.md`` says what is
-                promised); None for no alarms and no recovery. Weights without a calibration raise no alarms.
+                promised); None for no alarms. Without a calibration for what the frames bring there are none either.
             alpha_frames: alpha is for every so many frames instead, such as 300 for ten seconds at 30 frames a second:
                 alarms then come as readily late in a stream as early.
 
         Raises:
-            InputError: a point query lies outside the image.
+            InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
             ConfigError: alpha is no probability, or there are no frames.
         """
-        monitor = None
-        if alpha is not None:
-            Budget(alpha, alpha_frames)  # refused in words whether or not it is of use
-            if self.calibration is not None:
-                monitor = Monitor(self.calibration, alpha=alpha, alpha_frames=alpha_frames)
         return Stream(
-            self.network, self.config, camera, queries, device=self.device, autocast=self._autocast, monitor=monitor
+            self.network,
+            self.features,
+            self.noise,
+            self.config,
+            camera,
+            queries,
+            device=self.device,
+            calibrations=self.calibrations,
+            budget=None if alpha is None else Budget(alpha, alpha_frames),
         )
 
     def candidates(self, camera: Camera, frame: Frame) -> Peaks:
@@ -142,12 +139,13 @@ class Tracker:
         Raises:
             InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
         """
-        intake = Intake(self.network, camera, device=self.device)
-        intake.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self._autocast):
-            frames, _ = intake.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
-            observed = self.network.observe(frames)
-            return find_peaks(self.network, frames, observed, radius_cells=self.config.slot_radius_cells)
+        preprocessor = Preprocessor(camera)
+        preprocessor.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
+        depth_m = preprocessor.prepare(frame.rgb, frame.depth_m, frame.cam_from_world).depth_m
+        found = Finder(self.network, camera, device=self.device).find(
+            frame.rgb, depth_m, radius_cells=self.config.slot_radius_cells
+        )
+        return found.peaks.select(found.apart()[: self.network.config.slots])
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
@@ -217,39 +215,40 @@ class Tracker:
         return tracks if stream.budget is not None else replace(tracks, lost_p=None, alarm=None)
 
     def _maker(self, camera: Camera, alpha: float | None) -> Maker:
-        watched = "" if alpha is None or self.calibration is None else self.calibration.to_json()
-        monitor = hashlib.sha256(watched.encode()).hexdigest()
-        return Maker(self.weights_hash, self.config, REVISION, monitor, camera)
+        watched = {} if alpha is None else {inputs: each.to_json() for inputs, each in self.calibrations.items()}
+        monitor = hashlib.sha256(repr(watched).encode()).hexdigest()
+        return Maker(self.weights_hash, self.config, self.noise, REVISION, monitor, camera)
 
 
-def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool = True) -> Tracker:
+def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool | str | Path = True) -> Tracker:
     """A tracker from shipped weights, from a file, or from the Hugging Face hub.
 
     Args:
         name: name of shipped weights; path of a safetensors file or of a folder of a run; or ``owner/name`` of a model
             repository on the hub, optionally ``owner/name@revision``. What was fetched once works without a network.
         device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto``: CUDA if there is any, else the CPU.
-        monitor: whether to read the monitor's calibration, without which there are no alarms. One that is about to be
-            made anew may be of signals that are no more.
+        monitor: whether to read the packaged calibrations of the monitor, without which there are no alarms; or the
+            file of others that ``quest calibrate`` made.
 
     Raises:
-        WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or the
+        WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or a
             file is torn, foreign, or of another shape.
         ConfigError: no such device.
     """
     loaded = load_network(name)
-    calibration = Calibration.from_json(loaded.monitor) if loaded.monitor and monitor else None
-    if calibration is not None and calibration.revision != REVISION:
-        raise WeightsError(
-            f"weights {name}: their monitor knows the signals of another tracker (revision {calibration.revision}, "
-            f"this is {REVISION}) and would promise nothing; run `quest weights calibrate`, or load without it"
-        )
+    calibrations = {} if monitor is False else read_calibrations(None if monitor is True else Path(monitor))
+    for inputs, calibration in calibrations.items():
+        if calibration.revision != REVISION:
+            raise WeightsError(
+                f"monitor: its calibration for {inputs} is of another filter (revision {calibration.revision}, this is "
+                f"{REVISION}) and would promise nothing; run `quest calibrate`, or load without it"
+            )
     return Tracker(
         loaded.network,
         TrackerConfig.from_json(loaded.settings),
         device=pick_device(device),
         weights_hash=loaded.sha256,
-        calibration=calibration,
+        calibrations=calibrations,
     )
 
 
@@ -318,29 +317,19 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
         frame_flags=tuple(flags),
         lost_p=lost_p,
         alarm=alarm,
-        joints=_joints(states, k),
+        joints=_joints(dict(zip(last.query, last.joint, strict=True)), point),
     )
 
 
-def _joints(states: Sequence[StreamState], queries: int) -> Joints:
-    """The joints of the last frame as arrays in the order of the queries, and where on them each frame was."""
-    last, found = states[-1], Joints.unknown(len(states), queries)
+def _joints(joints: Mapping[int, Joint | None], point_world: Float32[np.ndarray, "T K 3"]) -> Joints:
+    """The joints of the last frame by query as arrays, and where on them each frame was."""
+    found = Joints.unknown(*point_world.shape[:2])
     kind = list(found.kind)
-    for k, joint in zip(last.query, last.joint, strict=True):
+    for k, joint in joints.items():
         if joint is None:
             continue
         kind[k], found.origin[k], found.covariance[k] = joint.kind.value, joint.origin, joint.line_covariance
         if joint.kind is not JointKind.STATIC:
             found.axis[k], found.q_min_seen[k], found.q_max_seen[k] = joint.axis, joint.lower, joint.upper
-            found.q[:, k] = [_coordinate(joint, state, k) for state in states]
+            found.q[:, k] = joint.locate(point_world[:, k].astype(np.float64))
     return replace(found, kind=tuple(kind))
-
-
-def _coordinate(joint: Joint, state: StreamState, query: int) -> float:
-    """Where a query was in a frame, on a joint that became known later: from where it was on the joint of then."""
-    row = state.query.index(query) if query in state.query else None
-    then = None if row is None else state.joint[row]
-    if row is None or then is None or not np.isfinite(state.point_world[row]).all():
-        return float("nan")
-    place = then.rest[None] if then.kind is JointKind.STATIC else then.at(state.q[row : row + 1].astype(np.float64))
-    return float(joint.locate(place)[0])

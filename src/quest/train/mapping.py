@@ -1,7 +1,7 @@
 """Stage map: the affordance map learns what could be taken hold of, from single frames.
 
-Its trunk shares nothing with what follows entities, so this stage changes no track of a given query and leaves the
-monitor's calibration as it was. It needs many objects rather than many frames of each.
+Its trunk shares nothing with what follows entities, so this stage changes no track of a given query. It needs
+many objects rather than many frames of each.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from quest.grounding import Joint
+from quest.filter.joints import Joint
 from quest.monitor import Budget
 from quest.track import StreamState
 from quest.track.events import Event, Events, Happening
@@ -142,7 +142,7 @@ class LiveView:
             f"in {seconds:.1f} s ({frames / seconds:.1f} per s)"
         )
         if self._budget is None:
-            text.append("; no alarms, because the weights carry no calibration", style="yellow")
+            text.append("; no alarms, because the monitor has no calibration", style="yellow")
         else:
             raised, cleared = self._events.raised, self._events.cleared
             open_now = raised - cleared
@@ -162,7 +162,7 @@ class LiveView:
         if self._behind_s > REFRESH_S:
             text.append(f"   {self._behind_s:.1f} s behind", style="not bold yellow")
         if self._budget is None:
-            text.append("   no alarms: weights without calibration", style="not bold yellow")
+            text.append("   no alarms: monitor without calibration", style="not bold yellow")
         else:
             text.append(f"   {self._budget}", style="not bold")
         return text

@@ -1,0 +1,218 @@
+"""What comes in: frames are checked, put in order, and made ready for the filter."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from enum import Enum
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Float32, UInt8
+
+from quest.depth import PLAUSIBLE_DEPTH_M
+from quest.errors import InputError
+from quest.filter.picture import Picture
+from quest.geometry.poses import is_rigid, nearest_rigid
+from quest.model.xfeat import MULTIPLE, XFeat
+from quest.types import Camera
+
+NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
+DEPTH_BEGINS_FLAG = "depth begins: world points from here on"
+
+_CLOCK_RESTART_S = 5.0
+_LEAST_DEPTHS = 16
+
+
+class Arrival(Enum):
+    """What a frame is to the stream."""
+
+    NEW = "new"
+    LATE = "late"
+    DUPLICATE = "duplicate"
+
+
+@dataclass
+class PreprocessorState:
+    """What the next frame of a stream depends on."""
+
+    flags: tuple[str, ...] = ()
+    """Degradations of the newest frame, in words."""
+    stamp_s: float | None = None
+    """Of the newest frame; None before the first."""
+    step_s: float = 0.0
+    """Between the newest frame and the one before."""
+    now_s: float = 0.0
+    """Time of the newest frame, by a clock that never goes back."""
+    digest: str = ""
+    """Of the colours of the newest frame."""
+    pose: Float[np.ndarray, "4 4"] | None = None
+    """``cam_from_world`` of the newest frame that had one."""
+    posed: bool = False
+    """Whether the poses that were given tell how the camera moves: they have changed."""
+    has_depth: bool = False
+    """Whether a frame so far brought depth."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A frame as the filter takes it."""
+
+    grey: UInt8[np.ndarray, "H W"]
+    """Grey values."""
+    depth_m: Float[np.ndarray, "H W"] | None
+    """Metres, 0 where missing; None without any."""
+    cam_from_world: Float[np.ndarray, "4 4"] | None
+    """Pose of the camera; None where none is given, and before those that are given change."""
+    first_pose: Float[np.ndarray, "4 4"] | None
+    """That of the first frame of the stream that has one; None in all others."""
+
+
+class Preprocessor:
+    """Checks the frames of one stream and prepares them.
+
+    Args:
+        camera: intrinsics of the frames.
+
+    Attributes:
+        camera: the same.
+        state: what the next frame depends on.
+
+    Raises:
+        InputError: pictures with a side below 32 pixels.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        if min(camera.width, camera.height) < MULTIPLE:
+            raise InputError(
+                f"camera: expected pictures with sides of at least {MULTIPLE} pixels, got {camera.width} x "
+                f"{camera.height}; enlarge them"
+            )
+        self.camera = camera
+        self.state = PreprocessorState()
+
+    def check(
+        self,
+        frame: int,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+        stamp_s: float,
+        cam_from_world: Float[np.ndarray, "4 4"] | None,
+    ) -> None:
+        """Refuse what no camera sends.
+
+        Raises:
+            InputError: the frame does not have the camera's size or type, its stamp is not finite, its pose is not
+                rigid, or the first depth is not in metres.
+        """
+        expected = (self.camera.height, self.camera.width, 3)
+        if rgb.shape != expected or rgb.dtype != np.uint8:
+            raise InputError(f"frame {frame}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
+        if depth_m is not None and depth_m.shape != expected[:2]:
+            raise InputError(f"frame {frame}: expected depth of the colours' size {expected[:2]}, got {depth_m.shape}")
+        if depth_m is not None and not np.issubdtype(depth_m.dtype, np.floating):
+            raise InputError(
+                f"frame {frame}: expected depth in metres as float, got {depth_m.dtype}; multiply raw units by their "
+                "size in metres"
+            )
+        median_m = None if depth_m is None or self.state.has_depth else _implausible(depth_m)
+        if median_m is not None:
+            raise InputError(f"frame {frame}: expected depth in metres, got {median_m:.3g} in the median")
+        if not np.isfinite(stamp_s):
+            raise InputError(f"frame {frame}: expected a finite time stamp in seconds, got {stamp_s}")
+        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
+        if pose.shape != (4, 4) or not is_rigid(pose):
+            raise InputError(
+                f"frame {frame}: expected cam_from_world as a rigid 4 x 4 transform (rotation, translation in metres, "
+                f"last row 0 0 0 1), got {pose.tolist()}; None where it is unknown"
+            )
+
+    def accept(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> Arrival:
+        """Whether a frame is the next one; what comes too late or twice changes nothing.
+
+        A stamp that lies more than five seconds back means that the clock began anew: as much time passed as between
+        the two frames before.
+        """
+        state, before = self.state, self.state.stamp_s
+        state.flags = ()
+        if before is not None and stamp_s < before:
+            if before - stamp_s <= _CLOCK_RESTART_S:
+                state.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
+                return Arrival.LATE
+            state.flags = (f"clock went back by {before - stamp_s:.1f} s",)
+        digest = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16).hexdigest()
+        if digest == state.digest and stamp_s == before:
+            state.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
+            return Arrival.DUPLICATE
+        if before is not None and stamp_s >= before:
+            state.step_s = stamp_s - before
+        state.now_s += state.step_s
+        state.stamp_s, state.digest = stamp_s, digest
+        return Arrival.NEW
+
+    def prepare(
+        self,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+        cam_from_world: Float[np.ndarray, "4 4"] | None,
+    ) -> Prepared:
+        """The frame that was accepted last."""
+        state = self.state
+        median_m = None if depth_m is None else _implausible(depth_m)
+        if median_m is not None:
+            state.flags += (f"depth ignored: {median_m:.3g} m in the median",)
+            depth_m = None
+        if depth_m is not None:
+            depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+        if depth_m is None or not depth_m.any():
+            state.flags += (NO_DEPTH_FLAG,)
+            depth_m = None
+        elif not state.has_depth:
+            if state.pose is not None or state.now_s > 0:
+                state.flags += (DEPTH_BEGINS_FLAG,)
+            state.has_depth = True
+        return Prepared(grey_of(rgb), depth_m, *self._poses(cam_from_world))
+
+    def _poses(self, cam_from_world: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """The frame's pose, and the same if it is the stream's first.
+
+        Poses that never change, such as an identity where nothing is known, tell nothing.
+        """
+        state = self.state
+        if cam_from_world is None:
+            if state.posed:
+                state.flags += ("no pose: estimated from the picture",)
+            return None, None
+        pose, before = nearest_rigid(cam_from_world), state.pose
+        state.pose = pose
+        state.posed |= before is not None and not np.array_equal(pose, before)
+        return pose if state.posed else None, pose if before is None else None
+
+
+def grey_of(rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
+    """Luminance."""
+    return cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
+
+
+@torch.inference_mode()
+def to_picture(grey: UInt8[np.ndarray, "H W"], features: XFeat) -> Picture:
+    """What the filter reads of a frame.
+
+    Args:
+        grey: of :func:`grey_of`.
+        features: the network of the descriptors.
+    """
+    device = next(features.parameters()).device
+    descriptors, _ = features.features(torch.from_numpy(grey).to(device))
+    return Picture(grey, descriptors.float().cpu().numpy())
+
+
+def _implausible(depth_m: Float32[np.ndarray, "H W"]) -> float | None:
+    """The median of depth that no camera sees in metres; None where it is plausible, or hardly any is there."""
+    sample = depth_m[::8, ::8]
+    valid = sample[np.isfinite(sample) & (sample > 0)]
+    if len(valid) < _LEAST_DEPTHS:
+        return None
+    median_m, (low, high) = float(np.median(valid)), PLAUSIBLE_DEPTH_M
+    return None if low <= median_m <= high else median_m

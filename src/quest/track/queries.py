@@ -1,0 +1,262 @@
+"""What is asked for, and how it finds its entity: points directly, labels and slots among what the finder sees."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.errors import InputError
+from quest.geometry.letterbox import Letterbox
+from quest.model.config import NetworkConfig
+from quest.model.discovery import Candidates, Peaks
+from quest.model.network import UNKNOWN_INTENT
+from quest.track.settings import TrackerConfig
+from quest.types import INTENTS, LABELS, Query
+
+PATIENCE_S = 0.25
+"""For how long a label or slot looks for its entity, seconds."""
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A query that has not found its entity."""
+
+    number: int
+    """Its number."""
+    query: Query
+    """What was asked."""
+    frame: int
+    """The frame from which it looks."""
+    until_s: float | None = None
+    """The time up to which a label or slot looks, by the stream's clock; None before it began, and of points."""
+
+
+@dataclass(frozen=True)
+class Following:
+    """A query that has found its entity."""
+
+    number: int
+    """Its number."""
+    name: str
+    """What to call it."""
+    label: str | None
+    """Its label, if known."""
+    intent: str | None
+    """What it is taken hold of for, if known."""
+
+
+@dataclass
+class QueriesState:
+    """The queries of a stream."""
+
+    following: list[Following] = field(default_factory=list)
+    """Those that are followed, in the order of the filter's."""
+    waiting: list[Waiting] = field(default_factory=list)
+    """Those that have not found their entity."""
+    discover: bool = False
+    """Whether everything in the next frame is to be discovered."""
+    numbered: int = 0
+    """How many numbers have been given."""
+
+    @property
+    def names(self) -> dict[int, str]:
+        """By number, of all of them; empty where a name is not made up yet."""
+        return {w.number: w.query.name for w in self.waiting} | {f.number: f.name for f in self.following}
+
+
+class StreamQueries:
+    """Asks, renames and retires the queries of one stream, and binds them to entities.
+
+    Args:
+        network: configuration of the network that finds entities.
+        config: settings of tracking.
+        letterbox: between the source image and the network's input.
+        queries: what to follow; None discovers entities in the first frame.
+
+    Attributes:
+        state: the queries.
+
+    Raises:
+        InputError: a point query lies outside the image, or asks for an intent of a network that knows none.
+    """
+
+    def __init__(
+        self, network: NetworkConfig, config: TrackerConfig, letterbox: Letterbox, queries: Sequence[Query] | None
+    ) -> None:
+        self.state = QueriesState(discover=queries is None)
+        self._network = network
+        self._config = config
+        self._letterbox = letterbox
+        if isinstance(queries, Query | str):
+            raise InputError(f"queries: expected a list of them, got {queries!r}")
+        for query in queries or ():
+            self.ask(query, frame=0)
+
+    def ask(self, query: Query, *, frame: int) -> int:
+        """Ask for one more entity from a frame on; returns the query's number.
+
+        Raises:
+            InputError: a point query lies outside the image or in a frame that has passed, a query asks for an intent
+                of a network that knows none, has the name of another one, or is none.
+        """
+        if not isinstance(query, Query):
+            raise InputError(f"queries: expected Query.point(…), Query.semantic(…) or Query.slot(), got {query!r}")
+        if query.name and query.name in self.state.names.values():
+            raise InputError(f"query {query.name!r}: another query is called so already; choose another name")
+        if query.intent is not None and not self._network.intents:
+            raise InputError(
+                f"query {query.name or query.kind!r}: these weights cannot tell what to {query.intent}; leave the "
+                "intent away or use weights of the default preset"
+            )
+        if query.uv_px is not None:
+            (x, y), camera = query.uv_px, self._letterbox.source
+            if not (0 <= x <= camera.width and 0 <= y <= camera.height):
+                raise InputError(
+                    f"query {query.name!r}: expected a pixel within {camera.width} x {camera.height}, "
+                    f"got ({x:.1f}, {y:.1f})"
+                )
+            if query.frame < frame:
+                raise InputError(
+                    f"query {query.name!r}: frame {query.frame} has passed; the next frame is number {frame}"
+                )
+        self.state.waiting.append(Waiting(self._next_number(), query, max(frame, query.frame)))
+        return self.state.numbered - 1
+
+    def find(self, query: int | str) -> int:
+        """The number of a query, by its number or name.
+
+        Raises:
+            InputError: no query of that number or name is followed or waits.
+        """
+        names = self.state.names
+        found = [number for number, name in names.items() if query in (number, name) and query != ""]
+        if not found:
+            raise InputError(f"query {query!r}: no such number or name; there are {names}")
+        return found[0]
+
+    def rename(self, number: int, name: str) -> None:
+        """Call a query by another name.
+
+        Raises:
+            InputError: another query has that name.
+        """
+        state = self.state
+        if name in {other for k, other in state.names.items() if k != number}:
+            raise InputError(f"query {number}: another query is called {name!r} already; choose another name")
+        state.following = [replace(f, name=name) if f.number == number else f for f in state.following]
+        state.waiting = [
+            replace(w, query=replace(w.query, name=name)) if w.number == number else w for w in state.waiting
+        ]
+
+    def retire(self, number: int) -> list[int]:
+        """Follow a query no longer; returns the rows of the others among those that were followed."""
+        state = self.state
+        rows = [i for i, f in enumerate(state.following) if f.number != number]
+        state.following = [state.following[i] for i in rows]
+        state.waiting = [w for w in state.waiting if w.number != number]
+        return rows
+
+    def looking(self, now_s: float) -> bool:
+        """Whether a query may still find its entity at a time or after it."""
+        return self.state.discover or any(w.until_s is None or w.until_s > now_s for w in self.state.waiting)
+
+    def bind(
+        self, frame: int, now_s: float, at_px: Float[np.ndarray, "K 2"], see: Callable[[], Candidates]
+    ) -> Float[np.ndarray, "M 2"]:
+        """Queries that find their entity in this frame join those that are followed.
+
+        Args:
+            frame: its index.
+            now_s: its time, seconds.
+            at_px: where the queries are that are followed, pixels of the source.
+            see: gives what the finder sees in it; asked only where a query looks for an entity.
+
+        Returns:
+            Pixels of the new ones.
+        """
+        state = self.state
+        state.waiting = [
+            replace(w, until_s=now_s + PATIENCE_S)
+            if w.until_s is None and w.frame <= frame and w.query.kind != "point"
+            else w
+            for w in state.waiting
+        ]
+        looking = [w for w in state.waiting if w.until_s is not None and w.until_s > now_s]
+        found, pixels = self._among(looking, at_px, see()) if looking or state.discover else ([], [])
+        for waiting in [w for w in state.waiting if w.query.kind == "point" and w.frame <= frame]:
+            query = waiting.query
+            found.append(self._begin(waiting, query.name or f"point {waiting.number}", query.label, query.intent))
+            pixels.append(np.array(query.uv_px, np.float64))
+        state.following += found
+        return np.array(pixels, np.float64).reshape(-1, 2)
+
+    def _next_number(self) -> int:
+        self.state.numbered += 1
+        return self.state.numbered - 1
+
+    def _begin(self, waiting: Waiting, name: str, label: str | None, intent: str | None) -> Following:
+        self.state.waiting = [w for w in self.state.waiting if w is not waiting]
+        return Following(waiting.number, name, label, waiting.query.intent or intent)
+
+    def _among(
+        self, looking: Sequence[Waiting], at_px: Float[np.ndarray, "K 2"], candidates: Candidates
+    ) -> tuple[list[Following], list[np.ndarray]]:
+        """Discovered entities, labels and slots, and their pixels."""
+        config, following = self._config, self.state.following
+        peaks, clash = candidates.peaks, candidates.clash.tolist()
+        existence = (config.slot_gain * (peaks.logit + config.slot_bias)).sigmoid().tolist()
+        label, intent = [LABELS[int(n)] for n in peaks.label], _intents(peaks)
+        canvas_px = peaks.uv.float().cpu().numpy().astype(np.float64) * self._network.encoder.image_size
+        near = self._near(canvas_px, at_px)
+        found: list[Following] = []
+        chosen: list[int] = []
+        if self.state.discover:
+            apart = candidates.apart()[: self._network.slots]
+            chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
+            for i in chosen:
+                number = self._next_number()
+                # What is followed at the same place is the same thing under another label, or a part of it.
+                others = [f"{label[j]} {f.number}" for f, j in zip(found, chosen, strict=False) if clash[i][j]]
+                notes = ["lift"] * (intent[i] == "lift") + [f"or {other}" for other in others[:1]]
+                name = " ".join([f"{label[i]} {number}", *(f"({note})" for note in notes)])
+                found.append(Following(number, name, label[i], intent[i]))
+            self.state.discover = False
+        for waiting in looking:
+            query = waiting.query
+            fits = [
+                i
+                for i in candidates.apart(_asked_for(query, label, intent))
+                if i not in chosen
+                and not any(clash[i][j] for j in chosen if query.label in (None, label[j]))
+                and not any(close and _same(query, f) for close, f in zip(near[i], following, strict=True))
+            ]
+            if fits and existence[fits[0]] > config.prompt_threshold:
+                chosen.append(fits[0])
+                name = query.name or f"{label[fits[0]]} {waiting.number}"
+                found.append(self._begin(waiting, name, label[fits[0]], intent[fits[0]]))
+        return found, list(self._letterbox.to_source(canvas_px[chosen]))
+
+    def _near(self, canvas_px: Float[np.ndarray, "N 2"], at_px: Float[np.ndarray, "K 2"]) -> list[list[bool]]:
+        """For every peak, which queries follow what is seen there."""
+        gap_px = np.linalg.norm(canvas_px[:, None] - self._letterbox.to_canvas(at_px), axis=-1)
+        return (gap_px < self._config.slot_radius_cells * self._network.cell_px).tolist()
+
+
+def _asked_for(query: Query, label: Sequence[str], intent: Sequence[str | None]) -> list[int]:
+    """The peaks that a prompt may mean."""
+    return [i for i in range(len(label)) if query.label in (None, label[i]) and query.intent in (None, intent[i])]
+
+
+def _same(query: Query, following: Following) -> bool:
+    """Whether what another query follows, at the place of a prompt's peak, may be what the prompt means."""
+    if query.label is not None and following.label not in (None, query.label):
+        return False
+    return query.intent in (None, following.intent or "open")
+
+
+def _intents(peaks: Peaks) -> list[str | None]:
+    """What each peak is for; None where the network does not tell."""
+    return [None if n == UNKNOWN_INTENT else INTENTS[n] for n in peaks.intent.tolist()]
