@@ -131,6 +131,9 @@ PIECES = (
 )
 """What the ranking of pieces that stand out learns from: objects that the map has not seen."""
 
+CAMERA = "--mix broad --size 480 --sensor stereo"
+"""Of the streams that the monitor is calibrated and judged on: any objects, pictures and depth as of a real camera."""
+
 MAP_CHOICE = f"{_WIDE} --views 4"
 """The same of validation objects, by which the map's checkpoint and the threshold of discovery are chosen."""
 
@@ -323,7 +326,7 @@ class Release:
         """Takes of procedural objects of a part of the split that figures of tracking do not rest on."""
         takes = self._takes_of(f"streams_{part}")
         _quest("generate", "--out", takes, "--split", part, "--no-partnet", "--seeds", f"{first}..{first + count - 1}",
-               "--views", 1)  # fmt: skip
+               "--views", 1, *CAMERA.split())  # fmt: skip
         return takes
 
     def _generate_whole(self, part: str) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -16,6 +18,7 @@ from quest.filter.queries import Queries
 NOISE = Noise()
 MIDDLE = np.array([0.1, 0.0, 1.0])
 REST = np.array([[0.3, 0.1, 0.9]])
+PICTURE = Picture(np.zeros((64, 64), np.uint8), np.ones((2, 8, 8), np.float32))
 
 
 def opened(twist: np.ndarray, way: np.ndarray, *, jitter: float = 0.0) -> Landmarks:
@@ -24,15 +27,14 @@ def opened(twist: np.ndarray, way: np.ndarray, *, jitter: float = 0.0) -> Landma
     for q in way:
         pose = screw(q * twist + jitter * rng.normal(size=6))
         bodies = update(bodies, 1, pose, 1e6 * np.eye(6), 1 / 30, NOISE)
-    return Landmarks(**{**vars(Landmarks.none()), "bodies": bodies})
+    return replace(Landmarks.none(), bodies=bodies)
 
 
 def joint(landmarks: Landmarks) -> Joint:
     """Of a query that rides on that body."""
     place = np.repeat(REST[:, None], len(landmarks.pose), axis=1)
-    picture = Picture(np.zeros((64, 64), np.uint8), np.ones((2, 8, 8), np.float32))
-    queries = Queries.named(picture, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST)
-    riding = Queries(**{**vars(queries), "log_odds": np.array([[-5.0, 5.0]])})
+    named = Queries.named(PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST)
+    riding = replace(named, log_odds=np.array([[-5.0, 5.0]]))
     (found,) = joints_of(riding, landmarks, NOISE)
     assert found is not None
     return found
@@ -82,3 +84,10 @@ def test_the_world_is_static() -> None:
     assert found.kind is JointKind.STATIC
     np.testing.assert_array_equal(found.at(np.zeros(2)), np.repeat(REST, 2, axis=0))
     assert np.isnan(found.axis_sigma_rad)
+
+
+def test_what_was_found_again_elsewhere_has_no_joint() -> None:
+    place = np.repeat(REST[:, None], 2, axis=1)
+    named = Queries.named(PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST)
+    there = replace(named, log_odds=np.array([[5.0, -5.0]]), anew=np.ones(1, dtype=bool))
+    assert joints_of(there, opened(np.zeros(6), np.zeros(0)), NOISE) == (None,)

@@ -16,6 +16,7 @@ from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
+    from quest.monitor import Inputs
     from quest.track import Tracker
     from quest.types import Clip, Query
 
@@ -137,20 +138,23 @@ class Source:
         if self.alpha_frames is not None and self.alpha_frames < 1:
             raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
 
-    def say_shortfall(self, tracker: Tracker, console: Console, *, frames: int | None) -> None:
+    def say_shortfall(
+        self, tracker: Tracker, console: Console, *, frames: int | None, inputs: Inputs | None = None
+    ) -> None:
         """Print which alarms there will never be, if the monitor's calibration is too small for some.
 
         Args:
             tracker: with its calibrations.
             console: to print on.
             frames: length of the recording, if it is known.
+            inputs: what its frames bring, if that is known.
         """
         from quest.monitor import Budget
 
         budget = Budget(self.alpha, self.alpha_frames)
-        calibration = tracker.calibrations.get("depth")
-        if calibration is not None and (why := calibration.shortfall(budget, frames=frames)):
-            console.print(f"[yellow]note:[/] monitor: {why}; `quest calibrate`")
+        for brings, calibration in tracker.calibrations.items():
+            if inputs in (None, brings) and (why := calibration.shortfall(budget, frames=frames)):
+                console.print(f"[yellow]note:[/] monitor, {brings}: {why}; `quest calibrate`")
 
     def tracker(self) -> Tracker:
         """The tracker of the weights.

@@ -57,7 +57,7 @@ class Track(Source):
         tracks.save(out)
         console.print(_summary(clip, tracks))
         console.print("\n".join(map(escape, narrate(tracks))))
-        self.say_shortfall(tracker, console, frames=len(clip))
+        self.say_shortfall(tracker, console, frames=len(clip), inputs="colours" if clip.depth_m is None else "depth")
         for flag in tracks.frame_flags[len(clip.notes) :]:  # those of the clip were said when it was read
             console.print(f"[yellow]note:[/] {escape(flag)}")
         console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")

@@ -51,7 +51,7 @@ class ListWeights:
 
 @dataclass(frozen=True)
 class ShowWeights:
-    """Print the content of a file of weights: network, training, tracker settings, licence, hash."""
+    """Print the content of a file of weights: network, training, settings of discovery, licence, hash."""
 
     weights: tyro.conf.Positional[str]
     """Shipped name, file, folder, or owner/name on the Hugging Face hub (fetched if the cache has no copy)."""
@@ -249,6 +249,8 @@ def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedN
 
 def _facts(loaded: LoadedNetwork) -> dict[str, str]:
     """The content of a file of weights by name, for people."""
+    from quest.track.settings import TrackerConfig
+
     config = asdict(loaded.network.config)
     encoder, preset = config.pop("encoder"), config.pop("preset")
     count = sum(p.numel() for p in loaded.network.parameters())
@@ -263,7 +265,7 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
         "parameters": f"{count / 1e6:.1f} million, {trained / 1e6:.1f} of them outside the encoder",
         "network": f"preset {preset}: {_pairs(config)}",
         "encoder": _pairs(encoder),
-        "tracker": _pairs(json.loads(loaded.settings)) or "the usual settings",
+        "discovery": _pairs(asdict(TrackerConfig.from_json(loaded.settings))),
     }
 
 

@@ -112,13 +112,14 @@ class Joint:
 
 
 def joints_of(queries: Queries, landmarks: Landmarks, noise: Noise) -> tuple[Joint | None, ...]:
-    """The joint of each query; None of what no body carries, and without depth."""
+    """The joint of each query; None of what no body carries, of what rests elsewhere now, and without depth."""
     bodies = landmarks.bodies
     screws = {int(b): _screw(bodies, int(b), noise) for b in np.unique(queries.body[queries.rides])}
+    known = queries.rides & ~(queries.anew & (queries.body == 0))
     error_m = depth_error(queries.own_depth, noise)
     return tuple(
-        _joint(screws[int(b)], rest, float(error)) if rides else None
-        for b, rest, error, rides in zip(queries.body, queries.rest, error_m, queries.rides, strict=True)
+        _joint(screws[int(b)], rest, float(error)) if told else None
+        for b, rest, error, told in zip(queries.body, queries.rest, error_m, known, strict=True)
     )
 
 

@@ -42,6 +42,8 @@ class Queries:
     """On each body, metres; NaN without depth."""
     error: Float[np.ndarray, "K 3"]
     """Standard deviation of the place, along the ray on which it was seen, metres in the world; NaN without depth."""
+    anew: Bool[np.ndarray, " K"]
+    """Whether the place was told anew since it was first known: how it came there is not known."""
     log_odds: Float[np.ndarray, "K B"]
     """That each body carries it, against that it goes with its patch."""
     seen_log_odds: Float[np.ndarray, " K"]
@@ -76,6 +78,7 @@ class Queries:
             own_found=np.ones(count, dtype=bool),
             place=place,
             error=error,
+            anew=np.zeros(count, dtype=bool),
             log_odds=np.zeros((count, bodies)),
             seen_log_odds=np.full(count, SURE),
             lost_log_odds=np.full(count, -SURE),
