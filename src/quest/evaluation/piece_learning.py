@@ -127,7 +127,7 @@ def _lessons(tracker: Tracker, take: Take) -> Iterator[_Lesson]:
 def _prepared(tracker: Tracker, camera: Camera, frame: Frame) -> FrameBatch:
     with torch.no_grad():
         finder = Finder(tracker.network, camera, device=tracker.device)
-        return finder.prepare(frame.rgb, frame.depth_m, frame.cam_from_world)
+        return finder.prepare(frame.rgb, frame.depth_m)
 
 
 def _lesson(tracker: Tracker, frames: FrameBatch, full: FrameBatch, entities: _Entities) -> _Lesson:

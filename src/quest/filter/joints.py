@@ -112,10 +112,10 @@ class Joint:
 
 
 def joints_of(queries: Queries, landmarks: Landmarks, noise: Noise) -> tuple[Joint | None, ...]:
-    """The joint of each query; None of what no body carries, of what rests elsewhere now, and without depth."""
+    """The joint of each query; None of what no body carries, of what was found again, and without depth."""
     bodies = landmarks.bodies
     screws = {int(b): _screw(bodies, int(b), noise) for b in np.unique(queries.body[queries.rides])}
-    known = queries.rides & ~(queries.anew & (queries.body == 0))
+    known = queries.rides & ~queries.anew
     error_m = depth_error(queries.own_depth, noise)
     return tuple(
         _joint(screws[int(b)], rest, float(error)) if told else None

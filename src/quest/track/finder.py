@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 
 from quest.geometry.letterbox import Letterbox
 from quest.model.discovery import Candidates, find_candidates
@@ -37,17 +37,15 @@ class Finder:
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
         depth_m: Float32[np.ndarray, "H W"] | None,
-        cam_from_world: Float[np.ndarray, "4 4"] | None = None,
     ) -> FrameBatch:
         """A frame (B = T = 1) as the network takes it, in a reference frame of its own.
 
         Args:
             rgb: colours.
             depth_m: metres, 0 where missing; None without depth.
-            cam_from_world: pose of the camera; the identity if None.
         """
         depth = self._framer.depth(None if depth_m is None else self.letterbox.depth(depth_m))
-        pose = torch.from_numpy(np.eye(4) if cam_from_world is None else np.asarray(cam_from_world, np.float64))
+        pose = torch.eye(4, dtype=torch.float64)
         return self._framer.frame(self.letterbox.rgb(rgb), depth, pose, self._framer.reference(depth, pose))
 
     def find(
@@ -64,7 +62,3 @@ class Finder:
         with torch.inference_mode(), torch.autocast(self._device.type, torch.bfloat16, enabled=autocast):
             frames = self.prepare(rgb, depth_m)
             return find_candidates(self._network, frames, self._network.observe(frames), radius_cells=radius_cells)
-
-    def to_source(self, uv: Float[np.ndarray, "K 2"]) -> Float[np.ndarray, "K 2"]:
-        """Pixels of the source image, of coordinates in [0, 1]^2 of the network's input."""
-        return self.letterbox.to_source(uv * self._network.config.encoder.image_size)

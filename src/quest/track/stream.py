@@ -25,7 +25,7 @@ from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
 from quest.types import Camera, Query, State
 
-WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is not calibrated for frames without depth, and none had any yet"
+WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is not calibrated for what the frames bring so far"
 POSES_BEGIN_FLAG = "poses begin: world points were in the first camera's axes before"
 
 
