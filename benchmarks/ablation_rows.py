@@ -28,7 +28,7 @@ class Answers:
     """What one variant answered in one seed.
 
     Attributes:
-        variant: its name in the table; ``PRESET: what`` where there are several presets.
+        variant: its name in the table.
         seed: of its training.
         records: per take, view and entity.
         discoveries: per take and view of the semantic protocol.

@@ -1,22 +1,22 @@
-"""Rebuild the ablation tables: train every variant for a fixed number of steps on frozen features, evaluate, tabulate.
+"""Ablation tables of the published network: train every variant for a fixed number of steps, evaluate, tabulate.
 
     python benchmarks/ablations.py --train TAKES/train --validation TAKES/validation --test TAKES/test \
         --work runs/ablations --encoder encoder.safetensors --steps 1500
 
-One run is one variant and seed: a folder with checkpoints and `weights.safetensors`. One feature cache serves all
-variants, in training and in evaluation. Everything goes on where it stopped: interrupt the script and run it again with
-the same arguments, or run it for some --tables, --presets or --seeds first and for all of them in the end.
+One run is one variant and seed: a folder with checkpoints and `weights.safetensors`. The encoder is frozen and all
+variants share its features, in training and in evaluation. Everything goes on where it stopped: interrupt the script
+and run it again with the same arguments, or run it for some --tables or --seeds first and for all of them in the end.
 
-Every run has the same steps, windows and schedule, and its last weights count: nothing is chosen by validation but the
-threshold of discovery, for every run alike (best F2 in the first frames of the validation takes). docs/metrics.md says
-what every row is. The tables rest on the runs that are there: rows and seeds that were not asked for are left out.
+Every run has the same steps, windows and schedule, and its last weights count: nothing is chosen by validation.
+docs/metrics.md says what every row is. The tables rest on the runs that are there: rows and seeds that were not asked
+for are left out.
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -25,15 +25,11 @@ from typing import Any, Literal
 import torch
 import tyro
 from ablation_rows import Answers, ablation_rows
-from ablation_variants import TABLES, Line, PresetName, TableName, Variant, chosen_lines
+from ablation_variants import TABLES, Line, TableName, Variant, chosen_lines
 from cached_encoder import CachedEncoder
 from rich.console import Console
 
-import quest
-from quest.baselines import TRACKERS, Shared
-from quest.baselines.flow_chain import units_of
-from quest.baselines.memory import remember_frames
-from quest.baselines.pixels_only import PixelsOnly
+from quest.baselines import TRACKERS
 from quest.data.provenance import code_commit, combined_hash, file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
@@ -43,57 +39,40 @@ from quest.evaluation.report import provenance, write_report
 from quest.evaluation.results import Results, Run, read_results, records_path, write_results
 from quest.evaluation.runner import evaluate, has_protocol
 from quest.evaluation.selection import SplitPart, select_takes
-from quest.evaluation.tuning import discovery_bias
-from quest.model.config import DecoderConfig, NetworkConfig
-from quest.model.network import QuestNetwork, WindowNetwork
-from quest.model.weights import load_network, save_network
-from quest.paper.network import PaperConfig, PaperNetwork
+from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne
-from quest.track import Tracker, TrackerConfig
-from quest.track.settings import REVISION
+from quest.paper.tracker import PaperTracker
 from quest.track.tracker import pick_device
 from quest.train.checkpoint import load_checkpoint
-from quest.train.dataset import Dataset, load_initial_encoder, open_dataset
-from quest.train.feature_cache import FeatureCache
-from quest.train.flow import StageTwo, with_flow_head
+from quest.train.dataset import load_initial_encoder, open_dataset
 from quest.train.loop import StepReport, fit
 from quest.train.settings import TrainingConfig
-from quest.train.stage import Objective, StageOne
 
 ROOT = Path(__file__).parents[1]
-
-_TRACKER = f"tracker revision {REVISION}"
-"""Answers of an older tracker are no answers of this one."""
 
 
 @dataclass(frozen=True)
 class Ablations:
-    """Train, evaluate and tabulate variants of the network and of its training."""
+    """Train, evaluate and tabulate variants of the published network and of its training."""
 
     train: tuple[str, ...]
     """Stores with takes of training objects; thinned ones will do."""
     validation: tuple[str, ...]
-    """Stores with takes of validation objects, for the threshold of discovery."""
+    """Stores with takes of validation objects, for the score that the last step prints."""
     test: tuple[str, ...]
     """Stores with whole takes to evaluate on."""
-    mirrored: tuple[str, ...] = ()
-    """Stores whose training takes teach by their mirror images; name a store in --train too to use both."""
+    encoder: Path
+    """Weights of the frozen encoder (quest weights import-encoder)."""
     work: Path = ROOT / "runs" / "ablations"
     """Folder for features, runs and answers."""
-    encoder: Path | None = None
-    """Initial weights of the frozen encoder (quest weights import-encoder); by default those in the shipped weights."""
     tables: tuple[TableName, ...] = TABLES
     """Tables to rebuild."""
-    presets: tuple[PresetName, ...] = ("default", "paper")
-    """Presets whose variants take part."""
     variants: tuple[str, ...] = ()
     """Names of variants (folders of their runs) to make rows of; all by default."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of every variant."""
     steps: int = 1500
     """Steps of every run."""
-    flow_steps: int = 500
-    """Steps of stage 2, for the flow head that is chained."""
     batch: int = 16
     """Windows per step."""
     optimizer: Literal["muon", "adamw"] = "muon"
@@ -116,17 +95,15 @@ class Ablations:
     def run(self) -> int:
         """Every run, every answer, every table."""
         console = Console(highlight=False)
-        lines = chosen_lines(self.tables, self.presets, self.variants)
+        lines = chosen_lines(self.tables, self.variants)
         test = TestTakes.open(self)
-        encoder = self._first_network().encoder.state_dict()
-        cached = self._test_features(test, console)
-        needed = list(dict.fromkeys(line.variant for each in lines.values() for line in each))
+        needed = {line.variant.name: line.variant for each in lines.values() for line in each}
         for seed in self.seeds:
-            for number, item in enumerate(needed, start=1):
+            for number, item in enumerate(needed.values(), start=1):
                 console.print(f"seed {seed}, variant {number}/{len(needed)}: {item.name}")
-                weights = self._trained(item, seed, encoder, console)
+                weights = self._trained(item, seed, console)
                 names = {line.tracker for each in lines.values() for line in each if line.variant == item}
-                self._answer(item, seed, weights, sorted(names), test, cached, console)
+                self._answer(item, seed, weights, sorted(names), test, console)
         for table, each in lines.items():
             self._write(table, each, test)
             console.print(f"wrote {self.out / f'{table}.json'}")
@@ -134,99 +111,58 @@ class Ablations:
 
     # Training
 
-    def _first_network(self) -> QuestNetwork:
-        """A network whose encoder is the frozen one of all runs."""
-        if self.encoder is None:
-            return load_network("quest-s16").network
-        network = QuestNetwork(load_network("quest-s16").network.config)
-        load_initial_encoder(network, self.encoder)
-        return network
-
-    def _trained(self, item: Variant, seed: int, encoder: dict[str, torch.Tensor], console: Console) -> Path:
-        """The weights of one run, trained as far as they are not yet."""
+    def _trained(self, item: Variant, seed: int, console: Console) -> Path:
+        """The weights of one run, trained as far as they are not yet: the last ones, whatever their score."""
         folder = self.work / "runs" / item.name / f"seed-{seed}"
         weights = folder / "weights.safetensors"
         self._check(folder, self._settings(item, seed))
         if weights.exists():
             return weights
         torch.manual_seed(seed)
-        about = f"ablation {item.name}, seed {seed}, {self.steps} steps of {self.batch} windows"
-        if isinstance(item.network, PaperConfig):
-            paper = PaperNetwork(item.network)
-            paper.encoder.load_state_dict(encoder)
-            dataset = self._dataset(paper, item)
-            self._fit(PaperStageOne(paper, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
-            paper.save(weights, about=about)
-            return weights
-        assert isinstance(item.network, NetworkConfig)
-        network = QuestNetwork(item.network)
-        network.encoder.load_state_dict(encoder)
-        dataset = self._dataset(network, item)
-        self._fit(StageOne(network, item.losses), dataset, self.steps, seed, folder / "stage-1", console)
-        if item.flow:
-            torch.manual_seed(seed)
-            network = with_flow_head(network)
-            second = StageTwo(network, StageOne(network).answered)
-            self._fit(second, dataset, self.flow_steps, seed, folder / "stage-2", console)
-        settings = self._settings_of_tracker(network, item)
-        save_network(weights, network, settings=settings.to_json(), about=about)
-        return weights
-
-    def _dataset(self, network: WindowNetwork[DecoderConfig], item: Variant) -> Dataset:
-        return open_dataset(
+        network = PaperNetwork(item.network)
+        load_initial_encoder(network, self.encoder)
+        dataset = open_dataset(
             network,
             stores=self.train,
             validation_stores=self.validation,
-            mirrored_stores=self.mirrored,
             cache=self.work / "features",
             windows=replace(item.windows, batch=self.batch),
             device=pick_device("auto"),
             report=lambda done, total, frames: None,
         )
-
-    def _fit(self, objective: Objective, dataset: Dataset, steps: int, seed: int, out: Path, console: Console) -> None:
-        """Train for so many steps; the only validation is the last step's, so that the best are the last weights."""
+        config = TrainingConfig(
+            steps=self.steps,
+            optimizer=self.optimizer,
+            learning_rate=self.learning_rate,
+            warmup_steps=max(1, min(100, self.steps // 10)),
+            validate_every=self.steps,  # once, so that the best are the last weights
+            validation_batches=2,
+            seed=seed,
+        )
 
         def report(done: StepReport) -> None:
             if done.step % 100 == 0 or done.scores is not None:
-                console.print(f"  {out.name} step {done.step}: loss {done.loss:.3f} {done.scores or ''}")
+                console.print(f"  step {done.step}: loss {done.loss:.3f} {done.scores or ''}")
 
+        objective, out = PaperStageOne(network, item.losses), folder / "stage-1"
         out.mkdir(parents=True, exist_ok=True)
-        config = TrainingConfig(
-            steps=steps,
-            optimizer=self.optimizer,
-            learning_rate=self.learning_rate,
-            warmup_steps=max(1, min(100, steps // 10)),
-            validate_every=steps,
-            validation_batches=2,  # for the eye: nothing is chosen by them
-            seed=seed,
-        )
         best = fit(objective, dataset.training, dataset.validation, config, out=out, report=report)
-        load_checkpoint(best, objective.network.cpu(), None)
-        objective.network.eval()
-
-    def _settings_of_tracker(self, network: QuestNetwork, item: Variant) -> TrackerConfig:
-        """The tracker's settings as they come, but for the threshold of discovery."""
-        config = TrackerConfig()
-        tracker = Tracker(network, config, device=pick_device("auto"))
-        tracker = PixelsOnly.without_depth(tracker) if item.no_depth else tracker
-        stores = [TakeStore(path) for path in self.validation]
-        chosen = [(store, select_takes(store.infos(), split=("validation", "unlisted"))) for store in stores]
-        return replace(config, slot_bias=discovery_bias(tracker, chosen).slot_bias)
+        load_checkpoint(best, network.cpu(), None)
+        network.save(weights, about=f"ablation {item.name}, seed {seed}, {self.steps} steps of {self.batch} windows")
+        return weights
 
     def _settings(self, item: Variant, seed: int) -> dict[str, Any]:
         return {
             "variant": item.name,
             "seed": seed,
             "steps": self.steps,
-            "flow_steps": self.flow_steps if item.flow else 0,
             "batch": self.batch,
             "optimizer": self.optimizer,
             "learning_rate": self.learning_rate,
             "network": json.loads(item.network.to_json()),
             "losses": item.losses,
             "windows": asdict(item.windows),
-            "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
+            "encoder": file_hash(self.encoder),
             "training_hash": self.training_hash,
         }
 
@@ -246,62 +182,35 @@ class Ablations:
 
     # Evaluation
 
-    def _test_features(self, test: TestTakes, console: Console) -> CachedEncoder:
-        """Features of the takes to evaluate on, in the same cache."""
-        network = self._first_network()
-        cache = FeatureCache(self.work / "features", network.config, network.encoder)
-        frames, views = 0, []
-        for store, takes in test.parts:
-            frames += sum(cache.build(store, list(takes), device=pick_device("auto")))
-            views += cache.views(list(takes))
-        console.print(f"features of {frames} frames to evaluate on")
-        return CachedEncoder(views)
-
     def _answer(
-        self,
-        item: Variant,
-        seed: int,
-        weights: Path,
-        names: Sequence[str],
-        test: TestTakes,
-        cached: CachedEncoder,
-        console: Console,
+        self, item: Variant, seed: int, weights: Path, names: Sequence[str], test: TestTakes, console: Console
     ) -> None:
         """Every tracker's answers with these weights, as far as they are not there yet."""
-        missing = [name for name in names if not self._answered(item, seed, name, weights, test)]
-        if not missing:
-            return
-        tracker = quest.load(weights)
-        cached.serve(tracker.network)
-        if isinstance(tracker, Tracker):
-            remember_frames(tracker.network, capacity=1000)
-        for name in missing:
+        for name in names:
+            if self._answered(item, seed, name, weights, test):
+                continue
             start_s = time.monotonic()
-            one = self._tracker(tracker, name, test, seed)
+            one = self._tracker(weights) if name == PaperTracker.name else TRACKERS[name].build(name)
             protocols: list[ProtocolName] = [p for p in self.protocols if has_protocol(one, p)]
             found = [evaluate(s, takes, [one], protocols=protocols) for s, takes in test.parts] if protocols else []
-            made = provenance()
-            run = Run(
-                command=made["command"],
-                commit=made["commit"],
+            run = Run.ended(
+                start_s,
                 data_hash=test.data_hash,
                 weights=item.name,
                 weights_hash=file_hash(weights),
                 resamples=self.resamples,
                 seed=seed,
-                machine=made["machine"],
-                versions=made["versions"],
-                stamp=made["stamp"],
-                seconds=round(time.monotonic() - start_s, 1),
             )
             records = tuple(record for each in found for record in each.records)
             discoveries = tuple(discovery for each in found for discovery in each.discoveries)
-            asked = Results(run, (), discoveries, notes=(*self.protocols, _TRACKER))
+            asked = Results(run, (), discoveries, notes=self.protocols)
             write_results(asked, self._answers_file(item, seed, name), records=records)
             console.print(f"  {name}: {len(records)} answers")
 
-    def _tracker(self, tracker: Tracker, name: str, test: TestTakes, seed: int) -> ClipTracker:
-        return TRACKERS[name].build(name, Shared(tracker, test.unit_m, seed))
+    def _tracker(self, weights: Path) -> ClipTracker:
+        network = read_paper(weights).network
+        CachedEncoder(self.work / "encoded").serve(network)
+        return PaperTracker(network, device=pick_device("auto"))
 
     def _answers_file(self, item: Variant, seed: int, tracker: str) -> Path:
         return self.work / "runs" / item.name / f"seed-{seed}" / "answers" / f"{tracker}.json"
@@ -313,7 +222,7 @@ class Ablations:
         results = read_results(file)
         run, asked = results.run, set(results.notes)
         same = run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
-        return same and asked >= {*self.protocols, _TRACKER}
+        return same and asked >= {*self.protocols}
 
     # Tables
 
@@ -327,7 +236,6 @@ class Ablations:
         rows = ablation_rows(answers, resamples=self.resamples, seed=0)
         report = provenance() | {
             "steps": self.steps,
-            "flow_steps": self.flow_steps,
             "batch": self.batch,
             "optimizer": self.optimizer,
             "learning_rate": self.learning_rate,
@@ -336,7 +244,7 @@ class Ablations:
             "n_takes": test.takes,
             "data_hash": test.data_hash,
             "training_hash": self.training_hash,
-            "encoder": "quest-s16" if self.encoder is None else file_hash(self.encoder),
+            "encoder": file_hash(self.encoder),
             "resamples": self.resamples,
             "rows": [asdict(row) for row in rows],
         }
@@ -349,8 +257,8 @@ class Ablations:
 
     @cached_property
     def training_hash(self) -> str:
-        """One hash over all takes that may teach or choose a threshold."""
-        roles = {"train": self.train, "mirrored": self.mirrored, "validation": self.validation}
+        """One hash over all takes that may teach or be scored in training."""
+        roles = {"train": self.train, "validation": self.validation}
         stores = [(role, TakeStore(path)) for role, paths in roles.items() for path in paths]
         return combined_hash(
             (f"{role}/{name}", store.data_hash(name)) for role, store in stores for name in store.names()
@@ -359,10 +267,9 @@ class Ablations:
 
 @dataclass(frozen=True)
 class TestTakes:
-    """What is evaluated on: takes by store, how large their objects are, and one hash over all."""
+    """What is evaluated on: takes by store, and one hash over all."""
 
     parts: tuple[tuple[TakeStore, dict[str, SplitPart]], ...]
-    unit_m: Callable[..., float]
     data_hash: str
 
     @property
@@ -375,7 +282,7 @@ class TestTakes:
         """Choose the takes.
 
         Raises:
-            ConfigError: none is left.
+            ConfigError: none is left, or one comes twice.
         """
         stores = [TakeStore(path) for path in asked.test]
         infos = {name: info for store in stores for name, info in store.infos().items()}
@@ -384,14 +291,12 @@ class TestTakes:
             (store, {name: chosen[name] for name in store.names() if name in chosen}) for store in stores
         ]
         kept = tuple(part for part in parts if part[1])
-        # The cache of features knows takes by their names.
-        teaching = [name for path in {*asked.train, *asked.validation} for name in TakeStore(path).names()]
         tested = [name for _, takes in kept for name in takes]
-        twice = sorted(name for name in tested if name in teaching or tested.count(name) > 1)
+        twice = sorted(name for name in tested if tested.count(name) > 1)
         if twice:
-            raise ConfigError(f"take {twice[0]}: a store of --test has it and another one too; leave one of them away")
+            raise ConfigError(f"take {twice[0]}: two stores of --test have it; leave one of them away")
         digest = combined_hash((name, store.data_hash(name)) for store, takes in kept for name in takes)
-        return cls(kept, units_of(stores), digest)
+        return cls(kept, digest)
 
 
 if __name__ == "__main__":

@@ -1,49 +1,50 @@
-"""The encoder's answers read from a feature cache, for many networks that share one frozen encoder."""
+"""The encoder's answers kept in files, for many networks that share one frozen encoder."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from quest.model.config import DecoderConfig
-from quest.model.network import WindowNetwork
-from quest.train.feature_cache import CachedView
+from quest.model.weights import weights_digest
+from quest.paper.network import PaperNetwork
+from quest.whole_file import whole_file
 
 
 class CachedEncoder:
-    """Looks frames up by their letterboxed colours.
+    """Looks frames up by their letterboxed colours, and encodes each once.
 
     Args:
-        views: prepared views, made with the encoder of the networks that will use them.
+        root: folder of the files; those of one encoder are in one of its folders.
     """
 
-    def __init__(self, views: Sequence[CachedView]) -> None:
-        self._place: dict[bytes, tuple[CachedView, int]] = {}
-        for view in views:
-            for t, image in enumerate(view.rgb):
-                self._place[_digest(image)] = (view, t)
+    def __init__(self, root: Path) -> None:
+        self._root = root
 
-    def serve(self, network: WindowNetwork[DecoderConfig]) -> None:
-        """Make a network read features instead of computing them; frames that are not there are still encoded.
+    def serve(self, network: PaperNetwork) -> None:
+        """Make a network read tokens instead of computing them, as far as they are there.
 
         Args:
-            network: changed in place. Its encoder must be the one that made the cache.
+            network: changed in place.
         """
-        encode = network.encode
+        encode, folder = network.encode, self._root / weights_digest(network.encoder)[:12]
+        folder.mkdir(parents=True, exist_ok=True)
 
         def read(rgb: Tensor) -> Tensor:
-            places = [self._place.get(_digest(image)) for image in rgb.cpu().numpy()]
-            if any(place is None for place in places):
-                return encode(rgb)
-            features = [view.features[t] for view, t in (place for place in places if place is not None)]
-            return torch.from_numpy(np.stack(features)).to(rgb.device).float()
+            return torch.stack([one(image) for image in rgb])
+
+        def one(image: Tensor) -> Tensor:
+            file = folder / f"{_digest(image)}.npy"
+            if not file.exists():
+                with whole_file(file) as partial, partial.open("wb") as out:
+                    np.save(out, encode(image[None])[0].detach().half().cpu().numpy())
+            return torch.from_numpy(np.load(file)).to(image.device).float()
 
         network.encode = read  # type: ignore[method-assign]
 
 
-def _digest(image: np.ndarray) -> bytes:
-    return hashlib.blake2b(np.ascontiguousarray(image).data, digest_size=16).digest()
+def _digest(image: Tensor) -> str:
+    return hashlib.blake2b(np.ascontiguousarray(image.cpu().numpy()).data, digest_size=16).hexdigest()

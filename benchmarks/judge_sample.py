@@ -34,7 +34,7 @@ class JudgeSample:
 
     clip: tuple[str, ...] = SAMPLES
     """Which clips."""
-    weights: tuple[str, ...] = ("quest-s16-research", "quest-s16-apache")
+    weights: tuple[str, ...] = ("quest-s16",)
     """Which weights."""
 
     def run(self) -> int:

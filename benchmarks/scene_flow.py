@@ -1,4 +1,4 @@
-"""Measure the flow head: EPE3D beside zero flow and beside differences of lifted points.
+"""Measure the flow head of the published network: EPE3D beside zero flow and differences of lifted points.
 
     python benchmarks/scene_flow.py --takes STORE --weights FILE --out benchmarks/results/scene_flow/validation.json
 
@@ -7,8 +7,8 @@ window are apart, which is what training on thinned takes looks like. Features a
 kept. The result file is written anew after each take, and says until the last one that it is not complete.
 
 Every frame of a view is the newest one of a window of the network's T frames, a stride apart, and every scored entity
-is asked for its displacement one stride on. Queries are bound as in the protocol point, at one frame: that of the first
-eight in which most entities are seen. What each answer rests on:
+is asked for its displacement one stride on. Slots are matched to entities at one frame: that of the first eight in
+which most entities are seen. An entity that gets no slot there is not judged. What each answer rests on:
 
 - ``head``: the flow head, which sees the window;
 - ``zero``: nothing moves; sees nothing;
@@ -37,7 +37,7 @@ from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
-from quest.data.provenance import combined_hash
+from quest.data.provenance import combined_hash, file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, WeightsError
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value
@@ -45,12 +45,12 @@ from quest.evaluation.metrics import Sums
 from quest.evaluation.protocols import START_FRAMES
 from quest.evaluation.report import provenance, shown, write_report
 from quest.evaluation.selection import select_takes
-from quest.model.network import QuestNetwork
-from quest.model.observation import FrameBatch
-from quest.model.weights import LoadedNetwork, load_network
+from quest.model.frames import FrameBatch
+from quest.model.weights import find_weights
+from quest.paper.network import PaperNetwork, read_paper
+from quest.paper.objective import PaperStageOne
 from quest.track.tracker import pick_device
 from quest.train.feature_cache import CachedView, FeatureCache
-from quest.train.objective import roll_out
 from quest.train.plan import WindowPlan
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler, WindowTruth
@@ -132,7 +132,7 @@ class ViewFlow:
     Attributes:
         error: per answer, normalised units; NaN where there is nothing to judge.
         length: true displacement, normalised units.
-        scored: entities that are bound.
+        scored: entities that are seen where slots are matched.
         moved: entities that are at some time more than 0.1 from rest.
     """
 
@@ -143,7 +143,7 @@ class ViewFlow:
 
 
 def flow_errors(
-    network: QuestNetwork, view: CachedView, *, stride: int, device: torch.device, batch: int = 8
+    network: PaperNetwork, view: CachedView, *, stride: int, device: torch.device, batch: int = 8
 ) -> ViewFlow | None:
     """Errors of all answers in one view; None where no entity is seen in the first frames, or no frame has a next one.
 
@@ -257,18 +257,18 @@ def _plans(view: CachedView, anchor: int, *, window: int, stride: int, batch: in
             picks=tuple((view, frames) for frames in index),
             following=tuple(end + stride for end in some),
             entities=view.visible.shape[1],
-            disturbance=None,
+            no_depth=np.zeros(len(some), bool),
         )
 
 
-def _answers(network: QuestNetwork, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, "B K"]]:
+def _answers(network: PaperNetwork, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, "B K"]]:
     with torch.inference_mode():
-        answered = roll_out(network, frames, truth)
-        flow = network.displace(answered.embedding, answered.point)
+        answered = PaperStageOne(network).answered(frames, truth)
+        flow = torch.where(answered.asked.unsqueeze(-1), network.displace(answered.embedding), torch.nan)
     newest = frames.during(slice(-2, None))
     uv_px = truth.uv[:, -2:].nan_to_num(-1) * network.config.encoder.image_size
     seen = truth.visible[:, -2:].unsqueeze(-1)
-    at_truth = torch.where(seen, newest.near_point_at(uv_px), torch.nan)
+    at_truth = torch.where(seen, newest.to_reference(uv_px, newest.depth_at(uv_px)), torch.nan)
     answers = {
         "head": flow,
         "zero": torch.zeros_like(flow),
@@ -310,17 +310,17 @@ class SceneFlow:
 
     def run(self) -> int:
         """Measure take by take, print, write."""
-        loaded, device = load_network(self.weights), pick_device("auto")
-        if loaded.network.flow is None:
+        path, device = find_weights(self.weights), pick_device("auto")
+        network = read_paper(path).network.to(device)
+        if network.flow is None:
             raise WeightsError(f"{self.weights}: no flow head in it; train one with `quest train --stage 2`")
-        network = loaded.network.to(device)
         store, console = TakeStore(self.takes), Console(width=170, highlight=False)
         chosen = select_takes(store.infos(), split=self.split, levels=self.level, objects=self.objects)
-        about = self._about(loaded, combined_hash((name, store.data_hash(name)) for name in chosen))
+        about = self._about(path, combined_hash((name, store.data_hash(name)) for name in chosen))
         records: list[FlowRecord] = []
         rows: tuple[FlowRow, ...] = ()
         with nullcontext(self.cache) if self.cache else tempfile.TemporaryDirectory() as folder:
-            features = FeatureCache(Path(folder), network.config, network.encoder)
+            features = FeatureCache(Path(folder), network.encoder)
             for i, (name, part) in enumerate(chosen.items(), start=1):
                 list(features.build(store, [name], device=device))
                 info = store.infos()[name]
@@ -347,10 +347,10 @@ class SceneFlow:
         console.print(_table(rows))
         return 0
 
-    def _about(self, loaded: LoadedNetwork, data_hash: str) -> dict[str, Any]:
+    def _about(self, path: Path, data_hash: str) -> dict[str, Any]:
         return provenance() | {
             "weights": self.weights,
-            "weights_hash": loaded.sha256,
+            "weights_hash": file_hash(path),
             "data_hash": data_hash,
             "moved": MOVED,
             "moving": MOVING,

@@ -1,13 +1,13 @@
-"""Measure how fast the training loop steps, beside bare forward, backward and step of the same network.
+"""Measure how fast the loop trains the published network, beside bare forward, backward and step of the same.
 
     python benchmarks/training_speed.py --data takes/train --out benchmarks/results/speed/training.json
 
-In turn, some steps of each: `loop` is what `quest train` runs (drawing, reading and moving batches, losses, schedule,
-clipping, optimiser, curves, report), timed from report to report; `bare` is losses, backward and optimiser on batches
-that are on the device already, of a copy of the network in the same precision. Checkpoints and validations are neither.
-The first step of every block is left out: the batch that it takes was read while the other had its turn. The network
-is a new one, its features are of an encoder that was never trained: neither matters for speed. Let nothing else run
-meanwhile.
+In turn, some steps of each: `loop` is what `quest train --stage 1` runs (drawing, reading and moving batches, losses,
+schedule, clipping, optimiser, curves, report), timed from report to report; `bare` is losses, backward and optimiser on
+batches that are on the device already, of a copy of the network in the same precision. Checkpoints and validations are
+neither. The first step of every block is left out: the batch that it takes was read while the other had its turn. The
+network is a new one, its features are of an encoder that was never trained: neither matters for speed. Let nothing else
+run meanwhile.
 """
 
 from __future__ import annotations
@@ -32,15 +32,14 @@ from quest.data.provenance import combined_hash
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import device_name, provenance, write_report
-from quest.model.config import DEFAULT
-from quest.model.network import QuestNetwork
+from quest.paper.network import PaperConfig, PaperNetwork
+from quest.paper.objective import PaperStageOne
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
 from quest.train.losses import weighted_sum
 from quest.train.optimizer import make_optimizer
 from quest.train.settings import TrainingConfig, WindowConfig
-from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler
 
 
@@ -68,7 +67,7 @@ class TrainingSpeed:
     def run(self) -> int:
         """Time both in turn and print means with 95 % bootstrap intervals over turns."""
         torch.manual_seed(self.training.seed)
-        network = QuestNetwork(DEFAULT)
+        network = PaperNetwork(PaperConfig())
         fabric = launch(replace(self.training, devices=1))
         with tempfile.TemporaryDirectory() as scratch:
             sampler, data_hash = self._sampler(network, self.cache or Path(scratch) / "cache", fabric.device)
@@ -77,7 +76,7 @@ class TrainingSpeed:
         result = _summary(np.array(turns), frames)
         Console(highlight=False).print_json(data=result)
         if self.out is not None:
-            about = {"preset": "default", "batch": self.windows.batch}
+            about = {"network": "paper", "batch": self.windows.batch}
             about |= {
                 name: getattr(self.training, name) for name in ("precision", "optimizer", "accumulate", "compile")
             }
@@ -85,10 +84,10 @@ class TrainingSpeed:
             write_report(provenance() | about | result, self.out)
         return 0
 
-    def _sampler(self, network: QuestNetwork, cache: Path, device: torch.device) -> tuple[WindowSampler, str]:
+    def _sampler(self, network: PaperNetwork, cache: Path, device: torch.device) -> tuple[WindowSampler, str]:
         stores = [TakeStore(folder) for folder in self.data]
         chosen = [(store, name) for store in stores for name in store.names()][: self.takes]
-        features = FeatureCache(cache, network.config, network.encoder)
+        features = FeatureCache(cache, network.encoder)
         for store, name in chosen:
             list(features.build(store, [name], device=device))
         views = features.views([name for _, name in chosen])
@@ -96,7 +95,7 @@ class TrainingSpeed:
         return WindowSampler(views, network.config, self.windows), data_hash
 
     def _turns(
-        self, network: QuestNetwork, sampler: WindowSampler, scratch: Path, fabric: Fabric
+        self, network: PaperNetwork, sampler: WindowSampler, scratch: Path, fabric: Fabric
     ) -> list[tuple[float, float]]:
         """Seconds of the timed steps of each turn, of the loop and bare."""
         block = self.steps + 1
@@ -118,7 +117,7 @@ class TrainingSpeed:
                 if len(turns) > self.blocks:
                     raise _EnoughError
 
-        objective = StageOne(network)
+        objective = PaperStageOne(network)
         with suppress(_EnoughError):
             fit(objective, sampler, sampler, config, out=scratch / "run", report=stepped, fabric=fabric)
         return turns[1:]  # the first turn warms up
@@ -132,10 +131,10 @@ class _Bare:
     """Losses, backward and optimiser of a network on batches that are there already."""
 
     def __init__(
-        self, network: QuestNetwork, sampler: WindowSampler, config: TrainingConfig, autocast: Callable[[], Any]
+        self, network: PaperNetwork, sampler: WindowSampler, config: TrainingConfig, autocast: Callable[[], Any]
     ) -> None:
         network.encoder.requires_grad_(False)
-        self.objective = StageOne(network.train())
+        self.objective = PaperStageOne(network.train())
         self.optimizer = make_optimizer(network, network.trainable(), replace(config, learning_rate=1e-5))
         self.autocast = autocast
         self.device = next(network.parameters()).device

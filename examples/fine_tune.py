@@ -39,7 +39,7 @@ class FineTune:
     procedural: int = 0
     """Procedural objects to learn from as well, so that the network keeps what it knows of others."""
     steps: int = 300
-    """Training steps of the map of entities."""
+    """Training steps of the finder."""
     learning_rate: float = 1e-4
     """A twentieth of what training anew takes: the weights are good already."""
 
@@ -69,7 +69,7 @@ class FineTune:
             "training.warmup-steps": max(1, min(100, self.steps // 10)),
             "training.validate-every": max(1, self.steps // 6),
         }
-        say("train", stage="map", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
+        say("train", data=data, validation=takes / "choose", weights=self.weights, out=run, **training)
         mine = run / "weights.safetensors"
         say("weights", "tune", str(mine), takes=takes / "choose")
         self.judge(mine, "after")

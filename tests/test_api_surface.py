@@ -37,8 +37,7 @@ MEMBERS = {
     "Stream": "add budget camera frame looking memory on_alarm rename retire step unbound",
     "StreamState": "alarm confidence flags has_depth joint labels lost_log_odds lost_p names only point_world q "
     "query stamp_s state uv_px visible",
-    "Tracker": "calibrations candidates config device features name network noise restore save stream track "
-    "weights_hash",
+    "Tracker": "calibrations config device features find name network noise restore save stream track weights_hash",
     "Tracks": "alarm confidence describe frame_flags joints labels lost_p names point_world save select stamp_s state "
     "to_pandas uv_px visible",
 }
@@ -46,7 +45,7 @@ MEMBERS = {
 
 COMMANDS = [
     *("calibrate", "data", "doctor", "eval", "eval-monitor"),
-    *("generate", "monitor", "objects", "track", "train", "weights"),
+    *("find", "generate", "monitor", "objects", "track", "train", "weights"),
 ]
 
 ERRORS = [

@@ -151,7 +151,10 @@ def test_only_sim_imports_sapien():
 
 
 def test_no_pickles():
-    """Weights and checkpoints are safetensors: reading them must not run code."""
+    """Weights and checkpoints are safetensors: reading them must not run code.
+
+    One published pickle is turned into safetensors; it is known by its hash, and of it torch builds tensors alone.
+    """
     wrong = [
         f"{name(path)}:{line} imports {module}"
         for path in FILES
@@ -161,10 +164,11 @@ def test_no_pickles():
     for path in FILES:
         for node in nodes(path):
             if isinstance(node, ast.Attribute) and ast.unparse(node) in ("torch.load", "torch.save"):
-                wrong.append(f"{name(path)}:{node.lineno} uses {ast.unparse(node)}")
+                wrong.append(f"{name(path)} uses {ast.unparse(node)}")
             if isinstance(node, ast.keyword) and node.arg == "allow_pickle" and ast.unparse(node.value) != "False":
                 wrong.append(f"{name(path)}:{node.value.lineno} allows pickles")
-    assert not wrong
+    assert wrong == ["model/import_detail.py uses torch.load"]
+    assert "weights_only=True" in (SOURCE / "model" / "import_detail.py").read_text(encoding="utf-8")
 
 
 def test_no_rooms_without_a_name():

@@ -56,7 +56,7 @@ def test_help_begins_with_what_one_needs_first(capsys):
     with pytest.raises(SystemExit):
         program.main(["--help"])
     out = capsys.readouterr().out
-    assert [line.split()[0] for line in out.splitlines() if line[:2] == "  " != line[1:3]][:2] == ["track", "monitor"]
+    assert [line.split()[0] for line in out.splitlines() if line[:2] == "  " != line[1:3]][:2] == ["track", "find"]
     assert "quest --version" in out
 
 
@@ -78,7 +78,7 @@ def test_every_command_has_help(words, capsys):
     [
         (["trak", "sample"], "no command 'trak'; did you mean track"),
         (["weights", "lst"], "quest weights: no command 'lst'; did you mean list?"),
-        (["xyzzy"], "expected one of track, monitor,"),
+        (["xyzzy"], "expected one of track, find,"),
     ],
 )
 def test_misspelt_commands(words, advice, capsys):

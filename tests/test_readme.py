@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 from tests.track.clips import make_calibration
 
 ROOT = Path(__file__).parents[1]
@@ -110,7 +110,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         TakeStore(folder / store).write(take)
     for run in ("runs/found", "runs/mine"):
         (folder / run).mkdir(parents=True)
-        save_network(folder / run / "weights.safetensors", make_network(), settings="{}", about="tiny")
+        save_network(folder / run / "weights.safetensors", make_finder(), settings="{}", about="tiny")
     shutil.copy(folder / "sample" / "rgb.mp4", folder / "my.mp4")
     quest.load().track(clip, [quest.Query.semantic("handle")]).save(folder / "outputs" / "demo")
     return folder

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,18 +10,15 @@ import torch
 
 import quest
 from quest.baselines import TRACKERS, Shared, line_up
-from quest.baselines.flow_chain import FlowChain, units_of
-from quest.baselines.of_weights import detector_of
 from quest.baselines.pixels_only import PixelsOnly
 from quest.baselines.point_queries import lift_pixels
 from quest.baselines.redetect import Redetect
-from quest.errors import ConfigError, WeightsError
+from quest.errors import ConfigError
 from quest.evaluation.runner import has_protocol
 from quest.track import Tracker, TrackerConfig
-from quest.types import Clip, Query, Take
+from quest.types import Query, Take
 from tests.synthetic import make_take
-from tests.tiny import make_network
-from tests.train.prepared import make_store
+from tests.tiny import make_finder
 
 CPU = torch.device("cpu")
 
@@ -32,19 +28,15 @@ def take() -> Take:
     return make_take(frames=10, views=1, entities=2, size=(64, 48))
 
 
-def make_tracker(**changes) -> Tracker:
-    return Tracker(make_network(**changes), TrackerConfig(slot_bias=100.0), device=CPU)
-
-
-def unit_m(clip: Clip) -> float:
-    return 1.0
+def make_tracker() -> Tracker:
+    return Tracker(make_finder(), TrackerConfig(bias=100.0, size_px=64), device=CPU)
 
 
 @pytest.mark.slow
 def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, take: Take) -> None:
-    monkeypatch.setattr(quest, "load", lambda weights: make_tracker(flow=True), raising=False)
+    monkeypatch.setattr(quest, "load", lambda weights: make_tracker(), raising=False)
     names = (*TRACKERS, "quest")
-    trackers = line_up(names, weights="any", unit_m=unit_m)
+    trackers = line_up(names, weights="any")
     assert [tracker.name for tracker in trackers] == list(dict.fromkeys(names))
     queries = [Query.point(0, 30.0, 20.0)]
     for tracker in trackers:
@@ -52,49 +44,28 @@ def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, t
         if has_protocol(tracker, "semantic"):
             assert tracker.track(take.views[0].clip).uv_px.shape[1] > 0
     with pytest.raises(ConfigError, match="expected one of"):
-        line_up(["raft"], weights="any", unit_m=unit_m)
+        line_up(["raft"], weights="any")
 
 
 def test_trackers_of_weights_know_which(monkeypatch: pytest.MonkeyPatch) -> None:
-    tracker = make_tracker(flow=True)
+    tracker = make_tracker()
     tracker.weights_hash = "0123"
     monkeypatch.setattr(quest, "load", lambda weights: tracker, raising=False)
     for name in [name for name, entry in TRACKERS.items() if entry.of_weights]:
-        (alone,) = line_up([name], weights="runs/mine", unit_m=unit_m)
+        (alone,) = line_up([name], weights="runs/mine")
         assert getattr(alone, "weights_hash", None) == "0123"  # answers of other weights do not count
 
 
 def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quest, "load", None, raising=False)
     names = [name for name, entry in TRACKERS.items() if not entry.of_weights]
-    assert [t.name for t in line_up(names, weights="none", unit_m=unit_m)] == names
+    assert [t.name for t in line_up(names, weights="none")] == names
 
 
-def test_variants_take_threshold_and_noise_from_their_name() -> None:
-    tracker = make_tracker(flow=True)
-    config = tracker.config = replace(tracker.config, slot_bias=0.5, slot_gain=2.0, slot_threshold=0.8)
-    detector = detector_of(tracker)
-    score = 1 / (1 + np.exp(-config.slot_gain * (detector.min_logit + config.slot_bias)))
-    np.testing.assert_allclose(score, 0.8)
-    shared = Shared(tracker, unit_m, seed=3)
-    for name, noise in {"flow-chain": 0.0, "flow-chain-0.01": 0.01, "flow-chain-0.05": 0.05}.items():
-        chain = TRACKERS[name].build(name, shared)
-        assert isinstance(chain, FlowChain)
-        assert (chain.noise, chain.seed) == (noise, 3)
+def test_variants_take_their_pace_from_their_name() -> None:
+    shared = Shared(make_tracker())
     every = [TRACKERS[name].build(name, shared) for name in ("redetect", "redetect-1")]
     assert [t.every for t in every if isinstance(t, Redetect)] == [4, 1]
-    with pytest.raises(WeightsError, match="flow head"):
-        TRACKERS["flow-chain"].build("flow-chain", Shared(make_tracker(), unit_m))
-
-
-def test_units_of_stores(tmp_path: Path, take: Take) -> None:
-    store = make_store(tmp_path, (0,))
-    unit = units_of([store])
-    name = store.names()[0]
-    clip = store.read(name).views[0].clip
-    assert unit(clip) == store.infos()[name].half_diagonal_m
-    with pytest.raises(ConfigError, match="stores at hand"):
-        unit(replace(clip, name="another"))
 
 
 def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
@@ -111,7 +82,6 @@ def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
     np.testing.assert_array_equal(tracks.point_world[known], lifted[known])
     assert np.isnan(tracks.point_world[:3, 1]).all()
     assert tracks.joints is None or set(tracks.joints.kind) <= {"unknown", "static"}
-    peaks, blind = (tracker.candidates(c.camera, c.frame(0)) for c in (clip, replace(clip, depth_m=None)))
-    torch.testing.assert_close(peaks.logit, blind.logit)
-    assert torch.isfinite(peaks.point_m).all(dim=1).any()
-    assert torch.isnan(blind.point_m).all()
+    found, blind = (tracker.find(c.camera, c.frame(0)) for c in (clip, replace(clip, depth_m=None)))
+    np.testing.assert_array_equal(found.uv_px, blind.uv_px)
+    np.testing.assert_array_equal(found.logit, blind.logit)

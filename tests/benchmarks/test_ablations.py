@@ -11,13 +11,12 @@ import torch
 from benchmarks import ablation_variants as variants
 from benchmarks.ablation_rows import AblationRow, Answers, ablation_rows
 from benchmarks.cached_encoder import CachedEncoder
-from quest.errors import InputError
+from quest.baselines import TRACKERS
+from quest.errors import ConfigError, InputError
 from quest.evaluation.records import Discovery, EntityRecord
-from quest.model.config import NetworkConfig
-from quest.train.feature_cache import FeatureCache
+from quest.paper.objective import LOSSES
 from tests.evaluation.answers import make_answer
-from tests.tiny import make_network
-from tests.train.prepared import CPU, make_store
+from tests.paper.tiny import make_paper
 
 SETTINGS = {"resamples": 200, "seed": 0}
 OBJECTS = ("desk-102015", "chest-102016", "safe-102017")
@@ -125,10 +124,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
 
 
 def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
-    from quest.baselines import TRACKERS
-
-    both = ("default", "paper")
-    tables = {table: variants.lines_of(table, both) for table in variants.TABLES}
+    tables = {table: variants.lines_of(table) for table in variants.TABLES}
     for lines in tables.values():
         labels = [line.label for line in lines]
         assert len(set(labels)) == len(labels)
@@ -139,32 +135,31 @@ def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
         for line in lines:
             assert by_name.setdefault(line.variant.name, line.variant) == line.variant
     assert [line.variant.network.window for line in tables["window"]] == [2, 4, 8]
-    assert [getattr(line.variant.network, "slots", None) for line in tables["slots"]] == [4, 8, 16]
-    some = variants.chosen_lines(variants.TABLES, both, ("paper-no-aff",))
-    assert {t: [line.label for line in lines] for t, lines in some.items()} == {
-        "losses": ["paper: all losses", "paper: no aff"]
-    }
-    assert list(variants.chosen_lines(variants.TABLES, ("default",), ())) == ["parts"]
-    off = [name for line in tables["losses"] for name in line.variant.losses]
-    assert off == list(variants.LOSSES_OF["paper"])
-    flat = next(line.variant for line in tables["parts"] if line.label == "default: no 3D")
-    assert isinstance(flat.network, NetworkConfig)
-    assert not flat.network.points3d
+    assert [line.variant.network.slots for line in tables["slots"]] == [4, 8, 16]
+    assert [line.reference for line in tables["window"]] == ["T = 4", None, "T = 4"]
+    some = variants.chosen_lines(variants.TABLES, ("no-aff",))
+    assert {t: [line.label for line in lines] for t, lines in some.items()} == {"losses": ["all losses", "no aff"]}
+    with pytest.raises(ConfigError, match="no-such"):
+        variants.chosen_lines(variants.TABLES, ("no-such",))
+    assert [name for line in tables["losses"] for name in line.variant.losses] == list(LOSSES)
+    flat = next(line.variant for line in tables["parts"] if line.label == "no 3D")
     assert flat.windows.depth_drop_share == 1.0
-    assert flat.losses == dict.fromkeys(("point", "vel", "acc", "geo", "joint"), 0.0)
+    assert flat.losses == dict.fromkeys(("vel", "acc", "geo"), 0.0)
 
 
 def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:
-    network = make_network()
-    store = make_store(tmp_path / "takes", (0, 1))
-    cache = FeatureCache(tmp_path / "cache", network.config, network.encoder)
-    list(cache.build(store, store.names(), device=CPU))
-    views = cache.views(store.names())
-    other = make_network(seed=5)
-    computed = other.encode(torch.from_numpy(np.array(views[0].rgb[:1])))
-    CachedEncoder(views).serve(other)
-    rgb = torch.from_numpy(np.array(views[1].rgb[2:4]))
-    torch.testing.assert_close(other.encode(rgb), torch.from_numpy(np.array(views[1].features[2:4])).float())
-    assert not torch.allclose(other.encode(torch.from_numpy(np.array(views[0].rgb[:1]))), computed, atol=1e-3)
-    unknown = torch.zeros_like(rgb)
-    torch.testing.assert_close(other.encode(unknown), make_network(seed=5).encode(unknown))
+    rgb = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (3, 64, 64, 3), dtype=np.uint8))
+    network, plain = make_paper(), make_paper()
+    CachedEncoder(tmp_path).serve(network)
+    encoded = network.encode(rgb[:2])
+    torch.testing.assert_close(encoded, plain.encode(rgb[:2]).half().float())
+    again, computed = make_paper(), []
+    again.encoder.register_forward_hook(lambda *_: computed.append(1))
+    CachedEncoder(tmp_path).serve(again)
+    assert torch.equal(again.encode(rgb[:2]), encoded)
+    assert not computed
+    again.encode(rgb)
+    assert len(computed) == 1
+    other = make_paper(seed=5)
+    CachedEncoder(tmp_path).serve(other)
+    assert not torch.allclose(other.encode(rgb[:2]), encoded, atol=1e-3)

@@ -14,7 +14,7 @@ REPORT = {"command": "quest eval", "commit": "0123456789abcdef"}
 
 def test_pages_are_up_to_date():
     pages = update.pages(RESULTS)
-    assert {page.name for page in pages} >= {"README.md", "results.md", "quest-s16-research.md"}
+    assert {page.name for page in pages} >= {"README.md", "results.md", "quest-s16-apache.md"}
     assert [page for page, text in pages.items() if page.read_text(encoding="utf-8") != text] == []
 
 

@@ -18,7 +18,7 @@ from quest.monitor import calibration_file, write_calibrations
 from quest.track import Stream, TrackerConfig
 from quest.types import Camera
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 from tests.track.clips import make_calibration
 
 FRAMES = 7
@@ -36,9 +36,9 @@ def take(tmp_path_factory: pytest.TempPathFactory) -> str:
 def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     """Untrained weights whose tracker takes every peak, or none; with a calibration that alarms or never does."""
     folder = tmp_path_factory.mktemp("weights")
-    network, alarming = make_network(), make_calibration(alarming=True)
+    network, alarming = make_finder(), make_calibration(alarming=True)
     for name, threshold in (("eager", 0.0), ("blind", 1.0)):
-        settings = TrackerConfig(slot_threshold=threshold, prompt_threshold=threshold).to_json()
+        settings = TrackerConfig(threshold=threshold, prompt_threshold=threshold, size_px=64).to_json()
         save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test")
     found = {name: ["--weights", str(folder / f"{name}.safetensors")] for name in ("eager", "blind")}
     for name, calibration in (

@@ -31,7 +31,7 @@ from quest.track import Stream, TrackerConfig
 from quest.tracks import read_tracks
 from quest.types import Clip
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 
 FRAMES = 6
 
@@ -55,8 +55,8 @@ def sources(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> dict[str, s
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("weights") / "plain.safetensors"
-    eager = TrackerConfig(slot_threshold=0.0, prompt_threshold=0.0).to_json()
-    save_network(path, make_network(), settings=eager, about="a test")
+    eager = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64).to_json()
+    save_network(path, make_finder(), settings=eager, about="a test")
     return str(path)
 
 

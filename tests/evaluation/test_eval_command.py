@@ -23,7 +23,7 @@ from quest.evaluation.selection import Shard, SplitPart, part_of, select_takes
 from quest.types import Clip, Query, Take, TakeInfo, Tracks
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 
 
 def _take(seed: int, *, level: int = 1) -> Take:
@@ -114,7 +114,7 @@ def test_command_writes_what_it_prints(
     store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     oracle = Oracle(store.read("panels-100001-1"), name="quest", slots=(0, 1))
-    oracle.network = make_network()
+    oracle.network = make_finder()
     monkeypatch.setattr(quest, "load", lambda weights: oracle, raising=False)
     monkeypatch.setenv("COLUMNS", "200")
     out = tmp_path / "results.json"

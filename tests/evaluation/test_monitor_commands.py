@@ -22,7 +22,7 @@ from quest.track import Tracker
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
-from tests.tiny import make_network
+from tests.tiny import make_finder
 
 
 def made_up(tracker: Tracker, take: Take, view: int, *, part: str, inputs: Inputs) -> StreamRecord:
@@ -48,7 +48,7 @@ def stores(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def folder(tmp_path: Path, stores: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with weights and the takes."""
     monkeypatch.setattr(stream_record, "record_stream", made_up)
-    save_network(tmp_path / "w.safetensors", make_network(), settings="{}", about="a test")
+    save_network(tmp_path / "w.safetensors", make_finder(), settings="{}", about="a test")
     for name in ("validation", "test"):
         shutil.copytree(stores / name, tmp_path / name)
     return tmp_path

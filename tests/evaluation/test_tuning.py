@@ -1,25 +1,23 @@
-"""Discovery's threshold is chosen on validation objects only, and remembering frames changes no answer."""
+"""Scores of the finder and its threshold are fitted on validation data only."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from quest.baselines.memory import remember_frames
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.tuning import Tuned, discovery_bias
-from quest.model.discovery import Peaks
+from quest.evaluation.tuning import tune
+from quest.model.found import LABELS_FOUND, Found, Panels
 from quest.track import Tracker
-from quest.types import LABELS, Query
+from quest.types import Camera, Frame
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker
 
 NAME = "panels-100001"
+NO_PANELS = Panels(np.zeros((0, 4)), np.zeros(0, int), np.zeros(0), np.zeros((0, 5)))
 
 
 @pytest.fixture(scope="module")
@@ -29,82 +27,39 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> TakeStore:
     return store
 
 
+def made_up(uv_px: np.ndarray, logit: np.ndarray) -> Found:
+    """Handles at some pixels."""
+    n = len(logit)
+    label_p = np.zeros((n, len(LABELS_FOUND)))
+    label_p[:, 0] = 1
+    return Found(uv_px, logit, label_p, np.zeros(n), np.full((n, 4), np.nan), np.full(n, -1), NO_PANELS)
+
+
 def test_other_objects_than_validation_are_refused(store: TakeStore):
     with pytest.raises(ConfigError, match="validation"):
-        discovery_bias(make_tracker(), [(store, {NAME: "test"})])
-    with pytest.raises(ConfigError, match="none"):
-        discovery_bias(make_tracker(), [(store, {})])
+        tune(make_tracker(), [], [(store, {NAME: "test"})])
+    with pytest.raises(ConfigError, match="nothing was found"):
+        tune(make_tracker(), [], [])
 
 
-def test_discovery_threshold_is_the_best_one(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
-    """Three candidates, of which the first and the last are entities: keeping all gives the best F2."""
+def test_the_threshold_lies_below_what_is_right(store: TakeStore, monkeypatch: pytest.MonkeyPatch):
+    """Two entities found and four places without any: likelier and less likely ones are right in part."""
     take = store.read(NAME)
     entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
-    first, second = (LABELS.index(take.info.entities[e].label) for e in entities)
-    pose = take.views[0].clip.cam_from_world[0]
-    point_m = torch.from_numpy(take.point_world[0, entities] @ pose[:3, :3].T + pose[:3, 3]).float()
-    peaks = Peaks(
-        uv=torch.zeros(3, 2),
-        point_m=torch.stack([point_m[0], point_m[0] + 9, point_m[1]]),
-        label=torch.tensor([first, first, second]),
-        logit=torch.tensor([2.0, 1.0, -1.0]),
-        intent=torch.zeros(3, dtype=torch.long),
-    )
-    monkeypatch.setattr(Tracker, "candidates", lambda *_: peaks)
-    tuned = discovery_bias(make_tracker(), [(store, {NAME: "validation"})])
-    assert (tuned.precision, tuned.recall) == pytest.approx((2 / 3, 1.0))
-    assert tuned.slot_bias == pytest.approx(1.0)
-    wrong = replace(peaks, point_m=point_m[[0, 0, 0]] + 9)
-    monkeypatch.setattr(Tracker, "candidates", lambda *_: wrong)
-    tracker = make_tracker()
-    assert discovery_bias(tracker, [(store, {NAME: "validation"})]) == Tuned(tracker.config.slot_bias, 0.0, 0.0)
+    true = take.views[0].uv_px[0, entities].astype(float)
+    away = np.array([[1.0, 1], [63, 1], [1, 63], [63, 63]])
+    found = made_up(np.concatenate((true[:1], away[:1], true[1:], away[1:])), np.array([4.0, 3, 2, -1, -2, -3]))
 
+    def find(tracker: Tracker, camera: Camera, frame: Frame) -> Found:
+        return replace(found, logit=tracker.config.gain * found.logit + tracker.config.bias)
 
-def test_every_source_counts_the_same_for_the_threshold_of_discovery(
-    store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    """Of two procedural views each finds both entities at 2.0 and nothing else; of the one real view the entities are
-    at 1.0 and 0.0, behind two wrong ones."""
-    take = store.read(NAME)
-    real = TakeStore(tmp_path / "real")
-    real.write(replace(take, info=replace(take.info, name="44817-L1", source="partnet-mobility")))
-    more = TakeStore(tmp_path / "more")
-    more.write(replace(take, info=replace(take.info, name="panels-100002")))
-    entities = [int(e) for e in take.tracked if take.views[0].visible[0, e]]
-    pose = take.views[0].clip.cam_from_world[0]
-    point_m = torch.from_numpy(take.point_world[0, entities] @ pose[:3, :3].T + pose[:3, 3]).float()
-    label = torch.tensor([LABELS.index(take.info.entities[e].label) for e in entities])
-
-    def peaks(logits: list[float], wrong: int) -> Peaks:
-        places = torch.cat((point_m[:1].expand(wrong, 3) + 9, point_m))
-        return Peaks(
-            torch.zeros(len(logits), 2), places, torch.cat((label[:1].expand(wrong), label)), torch.tensor(logits),
-            torch.zeros(len(logits), dtype=torch.long),
-        )  # fmt: skip
-
-    seen = {"procedural": peaks([2.0, 2.0], 0), "partnet-mobility": peaks([1.5, 1.5, 1.0, 0.0], 2)}
-
-    def discovered(*takes: tuple[TakeStore, str]) -> Tuned:
-        answers = iter([seen[store.infos()[name].source] for store, name in takes])
-        monkeypatch.setattr(Tracker, "candidates", lambda *_: next(answers))
-        return discovery_bias(make_tracker(), [(store, {name: "validation"}) for store, name in takes])
-
-    procedural = (store, NAME), (more, "panels-100002")
-    both = discovered(*procedural)
-    assert (both.precision, both.recall) == (1.0, 1.0)
-    one = discovered(procedural[0], (real, "44817-L1"))
-    assert (one.slot_bias, one.precision, one.recall) == (pytest.approx(0.0), pytest.approx(0.75), 1.0)
-    assert discovered(*procedural, (real, "44817-L1")) == one, "however many there are of either"
-
-
-@pytest.mark.parametrize("capacity", [3, 100])
-def test_remembering_changes_nothing(store: TakeStore, tmp_path: Path, capacity: int):
-    clip = store.read_clip(NAME, 0)
-    queries = [Query.point(0, 20.0, 30.0)]
-    plain = make_tracker().track(clip, queries)
-    tracker = make_tracker()
-    remember_frames(tracker.network, capacity=capacity)
-    for _ in range(2):
-        again = tracker.track(clip, queries)
-        np.testing.assert_allclose(again.uv_px, plain.uv_px, atol=1e-4)
-        np.testing.assert_allclose(again.point_world, plain.point_world, atol=1e-5)
+    monkeypatch.setattr(Tracker, "find", find)
+    tuned = tune(make_tracker(), [], [(store, {NAME: "validation"})])
+    assert tuned.of == ("takes",)
+    assert (*tuned.precision, *tuned.recall) == pytest.approx((2 / 3, 1.0))
+    p = 1 / (1 + np.exp(-(tuned.config.gain * found.logit + tuned.config.bias)))
+    assert p[2] > tuned.config.threshold > p[3]
+    assert p.sum() == pytest.approx(2, abs=0.05)  # as many as are right
+    monkeypatch.setattr(Tracker, "find", lambda *_: made_up(away, np.arange(4.0)))
+    with pytest.raises(ConfigError, match="nothing was found"):
+        tune(make_tracker(), [], [(store, {NAME: "validation"})])

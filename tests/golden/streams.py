@@ -17,7 +17,7 @@ from quest import Clip, Query, Tracker, Tracks
 from quest.data.sample import sample_folder
 
 HERE = Path(__file__).parent
-WEIGHTS = "quest-s16-research"
+WEIGHTS = "quest-s16"
 """Others only find other entities; all are followed alike."""
 
 

@@ -49,30 +49,18 @@ def test_colours_are_normalised():
     torch.testing.assert_close(seen[0][0, :, 5, 7], expected)
 
 
-def test_an_enlarged_image_has_tokens_of_its_smaller_parts():
+def test_tokens_after_several_blocks_of_pictures_of_any_size():
+    """Each normalised by itself; the last of a picture of the configured size is what the encoder says of it."""
     torch.manual_seed(0)
-    encoder = Encoder(CONFIG).eval()
-    rgb = torch.randint(0, 256, (1, 64, 64, 3), dtype=torch.uint8)
-    larger = Encoder(EncoderConfig(image_size=128, patch_size=16, width=32, depth=1, heads=2)).eval()
-    larger.load_initial(encoder.state_dict())
-    seen = []
-    encoder.patch.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
-    tokens = encoder(rgb, enlarge=2)
-    assert tokens.shape == (1, 64, 32)
-    assert seen[0].shape == (1, 3, 128, 128)
-    # Larger by resampling: the mean colour of the image stays.
-    torch.testing.assert_close(seen[0].mean((2, 3)), encoder_input(encoder, rgb).mean((2, 3)), rtol=0, atol=0.02)
-    smooth = torch.full((1, 64, 64, 3), 100, dtype=torch.uint8)
-    expected = larger(torch.full((1, 128, 128, 3), 100, dtype=torch.uint8))
-    torch.testing.assert_close(encoder(smooth, enlarge=2), expected, **NETWORK)
-
-
-def encoder_input(encoder: Encoder, rgb: Tensor) -> Tensor:
-    seen = []
-    handle = encoder.patch.register_forward_pre_hook(lambda module, inputs: seen.append(inputs[0]))
-    encoder(rgb)
-    handle.remove()
-    return seen[0]
+    encoder = Encoder(EncoderConfig(image_size=64, patch_size=16, width=32, depth=3, heads=2)).eval()
+    rgb = torch.randint(0, 256, (2, 64, 64, 3), dtype=torch.uint8)
+    with torch.no_grad():
+        read = encoder.depths(rgb.permute(0, 3, 1, 2) / 255, (0, 2))
+        assert read.shape == (2, 64, 4, 4)
+        torch.testing.assert_close(read[:, 32:].flatten(2).transpose(1, 2), encoder(rgb), **NETWORK)
+        assert not torch.allclose(read[:, :32], read[:, 32:], atol=0.1)
+        torch.testing.assert_close(read[:, :32].mean(1), torch.zeros(2, 4, 4), **NETWORK)
+        assert encoder.depths(torch.rand(1, 3, 32, 96), (1,)).shape == (1, 32, 2, 6)
 
 
 def test_images_of_a_batch_do_not_meet():
@@ -85,7 +73,7 @@ def test_images_of_a_batch_do_not_meet():
 def test_same_sizes_stay_as_they_are():
     kernel, position = torch.randn(8, 3, 16, 16), torch.randn(1, 17, 8)
     assert resize_patch_kernel(kernel, 16) is kernel
-    assert resize_position(position, 4) is position
+    assert resize_position(position, (4, 4)) is position
 
 
 @pytest.mark.parametrize(("old", "new", "tolerance"), [(14, 16, 1e-3), (16, 14, 0.05), (8, 16, 1e-3)])
@@ -104,13 +92,14 @@ def test_resized_positions_keep_the_class_token_and_the_layout():
     y, x = torch.meshgrid(torch.linspace(0, 1, 9), torch.linspace(0, 1, 9), indexing="ij")
     square = torch.stack((x, y), dim=-1).reshape(1, 81, 2)
     position = torch.cat((torch.tensor([[[7.0, 8.0]]]), square), dim=1)
-    resized = resize_position(position, 5)
+    resized = resize_position(position, (5, 5))
     assert resized.shape == (1, 26, 2)
     assert resized[0, 0].tolist() == [7.0, 8.0]
     grid = resized[0, 1:].reshape(5, 5, 2)
     assert (grid[:, 1:, 0] > grid[:, :-1, 0]).all()
     assert (grid[1:, :, 1] > grid[:-1, :, 1]).all()
     torch.testing.assert_close(grid[2, 2], torch.tensor([0.5, 0.5]))
+    assert resize_position(position, (3, 7)).shape == (1, 22, 2)
 
 
 def test_weights_of_another_patch_size_load():
@@ -145,9 +134,9 @@ def test_foreign_weights_are_refused(changes: dict[str, Tensor | None], named: s
 def test_encoder_files_that_cannot_be_used(tmp_path: Path):
     from safetensors.torch import save_file
 
-    from tests.tiny import make_network
+    from tests.paper.tiny import make_paper
 
-    network = make_network()
+    network = make_paper()
     with pytest.raises(WeightsError, match="import-encoder"):
         load_initial_encoder(network, tmp_path / "none.safetensors")
     torn = tmp_path / "torn.safetensors"

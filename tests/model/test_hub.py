@@ -18,7 +18,7 @@ from quest.model.hub import FILE, HubId, download, model_card
 from quest.model.tensor_file import read_tensors, save_tensors
 from quest.model.weights import LoadedNetwork, load_network, save_network
 from tests.model.hub_server import COMMIT, FakeHub
-from tests.tiny import DEFAULT, make_network
+from tests.tiny import FINDER, make_finder
 
 ABOUT = "a test | of weights"
 
@@ -29,8 +29,8 @@ def file(tmp_path: Path) -> Path:
     path = tmp_path / "run" / "weights.safetensors"
     save_network(
         path,
-        make_network(),
-        settings='{"slot_bias": 0.1}',
+        make_finder(),
+        settings='{"bias": 0.1}',
         about=ABOUT,
         licence="Apache-2.0",
         version="1.2",
@@ -74,7 +74,7 @@ def test_a_folder_loses_nothing(file: Path, tmp_path: Path):
     for again in (LoadedNetwork.from_pretrained(tmp_path / "saved"), load_network(tmp_path / "saved")):
         assert same(loaded, again)
         assert not again.network.training
-    assert json.loads((tmp_path / "saved" / "config.json").read_text())["network"]["width"] == DEFAULT.width
+    assert json.loads((tmp_path / "saved" / "config.json").read_text())["network"]["width"] == FINDER.width
 
 
 def test_a_run_is_a_folder_of_weights(file: Path):
@@ -104,7 +104,7 @@ def test_the_card_beside_the_file_is_taken(file: Path, tmp_path: Path):
 
 
 def test_a_card_of_a_file_that_says_little():
-    loaded_as = {"config": DEFAULT, "about": "", "settings": "{}", "licence": "", "version": ""}
+    loaded_as = {"config": FINDER, "about": "", "settings": "{}", "licence": "", "version": ""}
     text = str(model_card({}, text=None, load_as="owner/name", **loaded_as))  # type: ignore[arg-type]
     assert "license" not in text.partition("# Weights")[0]
     assert "| licence | not said |" in text
@@ -125,7 +125,7 @@ def test_loaded_from_the_hub_and_then_from_the_cache(hub: FakeHub, file: Path, m
 
 def test_a_folder_of_this_machine_comes_first(hub: FakeHub, file: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(file.parents[1])
-    save_network(Path("owner/name") / FILE, make_network(seed=1), settings="{}", about="here")
+    save_network(Path("owner/name") / FILE, make_finder(seed=1), settings="{}", about="here")
     hub.files["owner/name"] = {"main": {FILE: file.read_bytes()}}
     assert load_network("owner/name").about == "here"
     assert not hub.requests
@@ -202,7 +202,7 @@ def test_ids():
 def test_show_and_save(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture):
     assert main(["weights", "show", str(file)]) == 0
     printed = capsys.readouterr().out
-    for expected in ("Apache-2.0", "1.2", load_network(file).sha256[:16], "slot_bias 0.1", "preset default"):
+    for expected in ("Apache-2.0", "1.2", load_network(file).sha256[:16], "bias 0.1", "finder: width 16"):
         assert expected in printed
     assert main(["weights", "save", str(file), str(tmp_path / "saved"), "--licence", "MIT"]) == 0
     assert load_network(tmp_path / "saved").licence == "MIT"

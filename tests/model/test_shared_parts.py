@@ -12,16 +12,16 @@ from safetensors.torch import load_file, save_file
 
 from quest.errors import WeightsError
 from quest.model import weights
-from quest.model.network import QuestNetwork
+from quest.model.finder import FinderNetwork
 from quest.model.tensor_file import SHARED
 from quest.model.weights import load_network, save_network
-from tests.tiny import make_network
+from tests.tiny import make_finder
 
 
-def another(seed: int = 1) -> QuestNetwork:
+def another(seed: int = 1) -> FinderNetwork:
     """A network of another training, with the encoder of the first."""
-    network = make_network(seed=seed)
-    network.encoder.load_state_dict(make_network().encoder.state_dict())
+    network = make_finder(seed=seed)
+    network.encoder.load_state_dict(make_finder().encoder.state_dict())
     return network
 
 
@@ -29,7 +29,7 @@ def another(seed: int = 1) -> QuestNetwork:
 def pair(tmp_path: Path) -> tuple[Path, Path]:
     """A whole file, and one beside it that shares its encoder."""
     whole, shares = tmp_path / "whole.safetensors", tmp_path / "shares.safetensors"
-    save_network(whole, make_network(), settings="{}", about="whole")
+    save_network(whole, make_finder(), settings="{}", about="whole")
     save_network(shares, another(), settings="{}", about="shares", beside=whole)
     return whole, shares
 
@@ -64,7 +64,7 @@ def test_the_other_file_is_looked_for_beside_it_then_among_what_ships(
 
 def test_another_encoder_is_not_taken_for_it(pair: tuple[Path, Path]):
     whole, shares = pair
-    save_network(whole, make_network(seed=2), settings="{}", about="another")
+    save_network(whole, make_finder(seed=2), settings="{}", about="another")
     with pytest.raises(WeightsError, match="another encoder"):
         load_network(shares)
     whole.write_bytes(whole.read_bytes()[:100])
@@ -89,7 +89,7 @@ def test_nothing_to_share(pair: tuple[Path, Path], tmp_path: Path):
     whole, shares = pair
     out = tmp_path / "out.safetensors"
     with pytest.raises(WeightsError, match="no part"):
-        save_network(out, make_network(seed=3), settings="{}", about="", beside=whole)
+        save_network(out, make_finder(seed=3), settings="{}", about="", beside=whole)
     with pytest.raises(WeightsError, match="shares parts itself"):
         save_network(out, another(), settings="{}", about="", beside=shares)
     with pytest.raises(WeightsError, match="not a whole"):
@@ -101,6 +101,7 @@ def test_what_was_written_before_stays_when_nothing_can_be_shared(pair: tuple[Pa
     whole, shares = pair
     before = shares.read_bytes()
     with pytest.raises(WeightsError):
-        save_network(shares, make_network(seed=3), settings="{}", about="", beside=whole)
+        save_network(shares, make_finder(seed=3), settings="{}", about="", beside=whole)
     assert shares.read_bytes() == before
-    assert torch.equal(load_network(whole).network.norm.bias, make_network().norm.bias.half().float())
+    read, made = (network.state_dict() for network in (load_network(whole).network, make_finder()))
+    assert torch.equal(read["lateral.0.weight"], made["lateral.0.weight"].half().float())

@@ -10,7 +10,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from quest.model.observation import FrameBatch
+from quest.model.frames import FrameBatch
+from quest.paper.flow import FlowScores, StageTwo, with_flow_head
 from quest.paper.network import PaperNetwork
 from quest.paper.objective import (
     LOSSES,
@@ -20,10 +21,9 @@ from quest.paper.objective import (
     slot_confidence_loss,
     slot_label_loss,
 )
-from quest.train.flow import FlowScores, StageTwo, with_flow_head
+from quest.train.answers import RIGHT_PX
 from quest.train.loop import StepReport, fit
 from quest.train.losses import weighted_sum, weights_of
-from quest.train.objective import RIGHT_PX
 from quest.train.settings import TrainingConfig
 from quest.train.windows import WindowSampler, WindowTruth
 from tests.paper.tiny import PAPER, make_paper
@@ -86,11 +86,6 @@ def test_slots_are_taken_once_and_answer_at_the_anchor_frame_by_themselves(batch
         assert len(set(taken)) == len(taken)
 
 
-def test_entities_that_are_left_out_of_queries_keep_their_slots(batch: Batch):
-    whole, dropped = answer(batch, whole=True), answer(batch, whole=True, bound=torch.zeros_like(batch[-1].bound))
-    assert (whole.asked == dropped.asked).all()
-
-
 @pytest.mark.parametrize("near", [False, True])
 def test_confidence_of_all_slots_against_a_plain_loop(batch: Batch, near: bool):
     roll = answer(batch, whole=True)
@@ -151,7 +146,7 @@ def test_every_loss_is_finite_and_the_gradient_reaches_every_part(batch: Batch):
 
 def test_nothing_to_learn_from_is_no_nan(batch: Batch):
     network, frames, truth = batch
-    dark = replace(frames, depth_m=0 * frames.depth_m, cell_depth_m=0 * frames.cell_depth_m)
+    dark = replace(frames, depth_m=0 * frames.depth_m)
     nothing = replace(truth, visible=torch.zeros_like(truth.visible), uv=torch.full_like(truth.uv, torch.nan))
     for seen, known in ((dark, truth), (frames, nothing)):
         weighted_sum(PaperStageOne(network).losses(seen, known), WEIGHTS).backward()

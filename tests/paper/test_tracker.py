@@ -13,7 +13,7 @@ from torch import Tensor
 import quest
 from quest.data.cut import cut_clip
 from quest.errors import InputError, WeightsError
-from quest.model.observation import FrameBatch
+from quest.model.frames import FrameBatch
 from quest.paper.network import SlotAnswers
 from quest.paper.tracker import PaperTracker
 from quest.track import load as load_ours

@@ -8,9 +8,9 @@ from typing import Any
 import torch
 
 from quest.paper.network import PaperConfig, PaperNetwork
-from tests.tiny import DEFAULT, shaken
+from tests.tiny import ENCODER, shaken
 
-PAPER = PaperConfig(encoder=DEFAULT.encoder, width=32, heads=2, decoder_layers=1, slots=5)
+PAPER = PaperConfig(encoder=ENCODER, width=32, heads=2, decoder_layers=1, slots=5)
 
 
 def make_paper(config: PaperConfig = PAPER, *, seed: int = 0, **changes: Any) -> PaperNetwork:

@@ -7,22 +7,22 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from quest.model.config import NetworkConfig
+from quest.model.finder import FinderConfig
 from quest.monitor import Calibration
 from quest.monitor.statistic import Cusum
 from quest.track import Tracker, TrackerConfig
 from quest.track.settings import REVISION
 from quest.types import Clip
 from tests.synthetic import make_take
-from tests.tiny import DEFAULT, make_network
+from tests.tiny import FINDER, make_finder
 
-EAGER = TrackerConfig(slot_threshold=0.0, prompt_threshold=0.0)
-"""Discovery takes every peak, which random weights need."""
+EAGER = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64)
+"""Discovery takes whatever is found, which random weights need."""
 
 
-def make_tracker(network: NetworkConfig = DEFAULT, config: TrackerConfig = EAGER, *, seed: int = 0) -> Tracker:
+def make_tracker(network: FinderConfig = FINDER, config: TrackerConfig = EAGER, *, seed: int = 0) -> Tracker:
     """A tracker without a monitor, whose network finds anything."""
-    return Tracker(make_network(network, seed=seed), config, device=torch.device("cpu"))
+    return Tracker(make_finder(network, seed=seed), config, device=torch.device("cpu"))
 
 
 def make_clip(*, frames: int = 6, size: tuple[int, int] = (64, 64)) -> Clip:

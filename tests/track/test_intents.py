@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import torch
 
 from quest.errors import InputError
-from quest.model.discovery import Candidates, Peaks
+from quest.model.finder import OPENINGS
+from quest.model.found import LABELS_FOUND, Found, Panels
 from quest.types import Clip, Query
-from tests.tiny import DEFAULT
 from tests.track.clips import make_clip, make_tracker
 
 
@@ -20,37 +17,31 @@ def clip() -> Clip:
     return make_clip()
 
 
-def peaks(*_: object, **__: object) -> Candidates:
-    found = Peaks(
-        uv=torch.tensor([[0.25, 0.25], [0.75, 0.75], [0.25, 0.75]]),
-        point_m=torch.ones(3, 3),
-        label=torch.tensor([2, 2, 0]),
-        logit=torch.tensor([9.0, 8.0, 7.0]),
-        intent=torch.tensor([0, 1, 1]),
+def seen(*places: tuple[str, str, tuple[float, float]]) -> Found:
+    """What a finder is sure of, the surest first: label, intent and pixel of each."""
+    n = len(places)
+    return Found(
+        uv_px=np.array([at for *_, at in places], np.float64),
+        logit=9.0 - np.arange(n),
+        label_p=np.eye(len(LABELS_FOUND))[[LABELS_FOUND.index(label) for label, *_ in places]],
+        lift_p=np.array([float(intent == "lift") for _, intent, _ in places]),
+        box_px=np.full((n, 4), np.nan),
+        panel=np.full(n, -1),
+        panels=Panels(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, len(OPENINGS)))),
     )
-    return Candidates(found, torch.eye(3, dtype=torch.bool))
 
 
 def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.finder.find_candidates", peaks)
+    found = seen(("rim", "open", (16, 16)), ("rim", "lift", (48, 48)), ("handle", "lift", (16, 48)))
+    monkeypatch.setattr("quest.track.stream.find", lambda *_, **__: found)
     tracker = make_tracker()
     tracks = tracker.track(clip, [Query.semantic("rim", intent=intent) for intent in ("lift", "open")])
     np.testing.assert_allclose(tracks.uv_px[0], [[48, 48], [16, 16]])
     assert tracker.track(clip).names == ("rim 0", "rim 1 (lift)", "handle 2 (lift)")
 
 
-def all_at_one_place(*_: object, **__: object) -> Candidates:
-    """A handle, a rim to open and the same rim to lift, which are no two rims but may be a rim and a handle."""
-    found = Peaks(
-        uv=torch.full((4, 2), 0.5),
-        point_m=torch.ones(4, 3),
-        label=torch.tensor([0, 2, 2, 2]),
-        logit=torch.tensor([9.0, 8.0, 7.0, 6.0]),
-        intent=torch.tensor([0, 0, 1, 1]),
-    )
-    clash = torch.ones(4, 4, dtype=torch.bool)
-    clash[1, 2:] = clash[2:, 1] = False
-    return Candidates(found, clash)
+ALL_AT_ONE_PLACE = seen(("handle", "open", (32, 32)), ("rim", "open", (32, 32)), ("rim", "lift", (32, 32)))
+"""A handle, a rim to open and the same rim to lift."""
 
 
 def names_after(clip: Clip, *asked: list[Query]) -> list[str]:
@@ -72,17 +63,16 @@ HANDLE, OPEN, LIFT = (
 
 
 def test_a_prompt_is_not_kept_from_its_entity_by_another_label(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("quest.track.finder.find_candidates", all_at_one_place)
+    monkeypatch.setattr("quest.track.stream.find", lambda *_, **__: ALL_AT_ONE_PLACE)
     assert names_after(clip, [HANDLE, OPEN, LIFT]) == ["handle 0", "rim 1", "rim 2"]
     assert names_after(clip, [HANDLE, HANDLE, LIFT, LIFT]) == ["handle 0", "rim 2"]
-    assert make_tracker().track(clip).names == ("handle 0", "rim 1 (or handle 0)", "rim 2 (lift) (or handle 0)")
+    assert make_tracker().track(clip).names == ("handle 0", "rim 1", "rim 2 (lift)")
 
 
 def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_purpose(
     clip: Clip, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("quest.track.finder.find_candidates", all_at_one_place)
-    monkeypatch.setattr("quest.track.queries.StreamQueries._near", lambda _, __, at_px: [[True] * len(at_px)] * 4)
+    monkeypatch.setattr("quest.track.stream.find", lambda *_, **__: ALL_AT_ONE_PLACE)
     assert names_after(clip, [OPEN], [LIFT]) == ["rim 0", "rim 1"]
     assert names_after(clip, [OPEN], [OPEN]) == ["rim 0"]
     assert names_after(clip, [HANDLE], [OPEN]) == ["handle 0", "rim 1"]
@@ -94,9 +84,6 @@ def test_a_prompt_that_comes_later_is_kept_from_what_is_followed_for_the_same_pu
     ]  # fmt: skip
 
 
-def test_weights_that_know_no_intents_say_so(clip: Clip):
-    tracker = make_tracker(replace(DEFAULT, intents=False))
-    with pytest.raises(InputError, match="cannot tell what to lift"):
-        tracker.track(clip, [Query.semantic("rim", intent="lift")])
+def test_intents_are_to_open_and_to_lift():
     with pytest.raises(InputError, match="expected one of open, lift"):
         Query.semantic("rim", intent="push")

@@ -309,7 +309,7 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.Monk
         with pytest.raises(InputError, match="saved stream"):
             tracker.restore(torn)
     with pytest.raises(InputError, match="other weights, settings"):
-        make_tracker(config=replace(EAGER, slot_bias=0.2)).restore(data)
+        make_tracker(config=replace(EAGER, bias=0.2)).restore(data)
     monkeypatch.setattr("quest.track.tracker.REVISION", -1)
     with pytest.raises(InputError, match="another revision"):
         tracker.restore(data)

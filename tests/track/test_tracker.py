@@ -26,7 +26,6 @@ from quest.track.tracker import (
     pick_device,
 )
 from quest.types import GUESSED_CAMERA, LABELS, Clip, Query, State, Tracks
-from tests.tiny import DEFAULT
 from tests.tolerances import PIXEL, PIXEL_MOVED, POINT, POINT_MOVED
 from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
@@ -77,7 +76,7 @@ def test_the_future_is_not_used(clip: Clip):
 def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
     """Whenever they bind: evaluation takes answer k for query k."""
     tracker = make_tracker()
-    label = LABELS[int(tracker.candidates(clip.camera, clip.frame(0)).label[0])]
+    label = next(label for label in tracker.find(clip.camera, clip.frame(0)).labels if label in LABELS)
     asked = (Query.point(3, 20, 30), POINTS[0], Query.semantic(label), Query.point(1, 30, 30), POINTS[1])
     tracks = tracker.track(clip, asked)
     bound = np.all(np.isfinite(tracks.uv_px), axis=-1)
@@ -210,14 +209,14 @@ def test_permuting_queries_permutes_tracks(clip: Clip):
 
 def test_discovery(clip: Clip):
     tracks = make_tracker().track(clip)
-    assert 1 <= len(tracks.names) <= DEFAULT.slots
+    assert 1 <= len(tracks.names) <= EAGER.most
     assert len(set(tracks.names)) == len(tracks.names)
     assert set(tracks.labels) <= set(LABELS)
     assert np.isfinite(tracks.uv_px).all()
 
 
 def test_discovery_that_finds_nothing(clip: Clip):
-    tracks = make_tracker(config=replace(EAGER, slot_threshold=1.0)).track(clip)
+    tracks = make_tracker(config=replace(EAGER, threshold=1.0)).track(clip)
     assert tracks.uv_px.shape == (6, 0, 2)
     assert tracks.frame_flags == (NOTHING_FOUND_FLAG,)
 
@@ -355,7 +354,7 @@ def test_from_a_file(tmp_path: Path, clip: Clip):
     assert loaded.config == EAGER
     assert isinstance(loaded, Tracker)
     assert loaded.track(clip, POINTS).uv_px.shape == (6, 2, 2)
-    save_network(path, tracker.network, settings='{"slot_bias": "red"}', about="")
+    save_network(path, tracker.network, settings='{"bias": "red"}', about="")
     with pytest.raises(WeightsError, match="settings"):
         load(path, device="cpu")
 

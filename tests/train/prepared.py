@@ -8,8 +8,7 @@ from pathlib import Path
 import torch
 
 from quest.data.store import TakeStore
-from quest.model.config import DecoderConfig
-from quest.model.network import WindowNetwork
+from quest.paper.network import PaperNetwork
 from quest.train.feature_cache import CachedView, FeatureCache
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler
@@ -26,18 +25,14 @@ def make_store(root: Path, seeds: Sequence[int], *, frames: int = 12, entities: 
     return store
 
 
-def prepare(
-    root: Path, network: WindowNetwork[DecoderConfig], seeds: Sequence[int], *, frames: int = 12
-) -> list[CachedView]:
+def prepare(root: Path, network: PaperNetwork, seeds: Sequence[int], *, frames: int = 12) -> list[CachedView]:
     """Takes in a store, and their features in a cache."""
     store = make_store(root / "takes", seeds, frames=frames)
-    cache = FeatureCache(root / "cache", network.config, network.encoder)
+    cache = FeatureCache(root / "cache", network.encoder)
     list(cache.build(store, store.names(), device=CPU))
     return cache.views(store.names())
 
 
-def make_sampler(
-    root: Path, network: WindowNetwork[DecoderConfig], seeds: Sequence[int] = (0, 1), *, batch: int = 4
-) -> WindowSampler:
+def make_sampler(root: Path, network: PaperNetwork, seeds: Sequence[int] = (0, 1), *, batch: int = 4) -> WindowSampler:
     """Windows of synthetic takes."""
     return WindowSampler(prepare(root, network, seeds), network.config, WindowConfig(batch=batch))

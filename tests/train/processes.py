@@ -13,13 +13,13 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from quest.paper.objective import PaperStageOne
 from quest.train.devices import launch
 from quest.train.feature_cache import FeatureCache
 from quest.train.loop import StepReport, fit
 from quest.train.settings import TrainingConfig, WindowConfig
-from quest.train.stage import StageOne
 from quest.train.windows import WindowSampler
-from tests.tiny import make_network
+from tests.paper.tiny import make_paper
 
 
 def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[float]:
@@ -36,12 +36,12 @@ def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[floa
         accumulate=accumulate,
     )
     fabric = launch(config)
-    network = make_network()
+    network = make_paper()
     names = sorted({path.name.rsplit("-v", 1)[0] for path in cache.glob("*/*-v*")})
-    views = FeatureCache(cache, network.config, network.encoder).views(names)
+    views = FeatureCache(cache, network.encoder).views(names)
     sampler = WindowSampler(views, network.config, WindowConfig(batch=8))
     reports: list[StepReport] = []
-    objective = StageOne(network)
+    objective = PaperStageOne(network)
     fit(objective, sampler, sampler, config, out=out, report=reports.append, fabric=fabric)
     losses = [report.loss for report in reports]
     if fabric.is_global_zero:

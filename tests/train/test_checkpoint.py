@@ -13,15 +13,15 @@ from safetensors.torch import load_file, save_file
 
 from quest.errors import WeightsError
 from quest.model import tensor_file
-from quest.model.network import QuestNetwork
+from quest.paper.network import PaperNetwork
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, save_checkpoint
-from tests.tiny import DEFAULT, make_network
+from tests.paper.tiny import PAPER, make_paper
 
-PROGRESS = Progress(7, 0.25, 5, 2, "{}", DEFAULT.to_json())
+PROGRESS = Progress(7, 0.25, 5, 2, "{}", PAPER.to_json())
 
 
-def trained(seed: int = 0, *, steps: int = 2) -> tuple[QuestNetwork, torch.optim.Optimizer]:
-    network = make_network(seed=seed)
+def trained(seed: int = 0, *, steps: int = 2) -> tuple[PaperNetwork, torch.optim.Optimizer]:
+    network = make_paper(seed=seed)
     optimizer = torch.optim.AdamW(network.trainable(), lr=1e-2, betas=(0.8, 0.9))
     for _ in range(steps):
         optimizer.zero_grad()
@@ -56,7 +56,7 @@ def test_the_encoder_is_left_out(tmp_path: Path):
     weights = load_file(saved(tmp_path / "last") / "weights.safetensors")
     assert weights
     assert not any(name.startswith("encoder.") for name in weights)
-    other = make_network(seed=1)
+    other = make_paper(seed=1)
     encoder = {name: t.clone() for name, t in other.encoder.state_dict().items()}
     load_checkpoint(tmp_path / "last", other, None)
     assert all((t == encoder[name]).all() for name, t in other.encoder.state_dict().items())
@@ -66,14 +66,14 @@ def test_replacing_leaves_one_checkpoint(tmp_path: Path):
     saved(tmp_path / "last")
     save_checkpoint(tmp_path / "last", *trained(seed=1), replace(PROGRESS, step=8))
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
-    assert load_checkpoint(tmp_path / "last", make_network(), None).step == 8
+    assert load_checkpoint(tmp_path / "last", make_paper(), None).step == 8
 
 
 def test_killed_between_the_renames(tmp_path: Path):
     saved(tmp_path / "last").rename(tmp_path / ".old-last")
-    assert load_checkpoint(tmp_path / "last", make_network(), None).step == 7
+    assert load_checkpoint(tmp_path / "last", make_paper(), None).step == 7
     save_checkpoint(tmp_path / "last", *trained(), replace(PROGRESS, step=9))
-    assert load_checkpoint(tmp_path / "last", make_network(), None).step == 9
+    assert load_checkpoint(tmp_path / "last", make_paper(), None).step == 9
     assert [path.name for path in tmp_path.iterdir()] == ["last"]
 
 
@@ -82,7 +82,7 @@ def test_killed_while_writing_keeps_the_old_one(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(Path, "rename", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     with pytest.raises(KeyboardInterrupt):
         save_checkpoint(tmp_path / "last", *trained(), replace(PROGRESS, step=9))
-    assert load_checkpoint(tmp_path / "last", make_network(), None).step == 7
+    assert load_checkpoint(tmp_path / "last", make_paper(), None).step == 7
 
 
 @pytest.mark.parametrize("name", ["weights.safetensors", "optimizer.safetensors", "progress.json"])
@@ -109,7 +109,7 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
 
 def test_a_missing_checkpoint(tmp_path: Path):
     with pytest.raises(WeightsError, match="missing"):
-        load_checkpoint(tmp_path / "last", make_network(), None)
+        load_checkpoint(tmp_path / "last", make_paper(), None)
 
 
 @pytest.mark.parametrize("text", ["[]", "{}", '{"progress": {}}', json.dumps({"progress": {"step": 1}, "groups": []})])
@@ -129,15 +129,15 @@ def test_a_foreign_optimiser_state(tmp_path: Path):
 def test_another_network_is_refused(tmp_path: Path):
     folder = saved(tmp_path / "last")
     with pytest.raises(WeightsError, match="do not fit"):
-        load_checkpoint(folder, make_network(width=64), None)
-    check_same_run(PROGRESS, DEFAULT, "stage-1", "abc", folder)
+        load_checkpoint(folder, make_paper(width=64), None)
+    check_same_run(PROGRESS, PAPER, "stage-1", "abc", folder)
     with pytest.raises(WeightsError, match="another network"):
-        check_same_run(PROGRESS, replace(DEFAULT, slots=7), "stage-1", "abc", folder)
+        check_same_run(PROGRESS, replace(PAPER, slots=7), "stage-1", "abc", folder)
 
 
 def test_other_starting_weights_are_refused(tmp_path: Path):
     """What a stage does not train is in its checkpoints too, and would replace that of the new weights."""
     begun = replace(PROGRESS, begun="abc")
-    check_same_run(begun, DEFAULT, "stage-1", "abc", tmp_path)
+    check_same_run(begun, PAPER, "stage-1", "abc", tmp_path)
     with pytest.raises(WeightsError, match="began with other weights"):
-        check_same_run(begun, DEFAULT, "stage-1", "def", tmp_path)
+        check_same_run(begun, PAPER, "stage-1", "def", tmp_path)

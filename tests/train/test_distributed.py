@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from quest.model.weights import load_network, save_network
-from tests.tiny import make_network
+from quest.paper.network import read_paper
+from tests.paper.tiny import make_paper
 from tests.tolerances import TRAINED, approx
 from tests.train.prepared import make_store, prepare
 from tests.train.processes import train
@@ -30,7 +30,7 @@ TORCHRUN = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "
 def one_process(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, list[float]]:
     """Features, the folder of a run of one process, and its losses."""
     root = tmp_path_factory.mktemp("processes")
-    prepare(root, make_network(), (0, 1))
+    prepare(root, make_paper(), (0, 1))
     return root / "cache", root / "one", train(root / "cache", root / "one", devices=1, accumulate=1)
 
 
@@ -59,17 +59,17 @@ def test_two_processes_learn_what_one_does(
 
 
 def test_the_command_prepares_features_once_and_writes_one_file(tmp_path: Path):
-    network = make_network()
-    save_network(tmp_path / "tiny.safetensors", network, settings="{}", about="tiny")
+    network = make_paper()
+    network.save(tmp_path / "tiny.safetensors", about="tiny")
     make_store(tmp_path / "takes", (0, 1))
     make_store(tmp_path / "choose", (100_002,))
     run(
-        *("-m", "quest.cli.main", "train", "--data", str(tmp_path / "takes")),
+        *("-m", "quest.cli.main", "train", "--stage", "1", "--data", str(tmp_path / "takes")),
         *("--validation", str(tmp_path / "choose"), "--weights", str(tmp_path / "tiny.safetensors")),
         *("--out", str(tmp_path / "run"), "--windows.batch", "4", "--training.steps", "2", "--training.devices", "2"),
         *("--training.accelerator", "cpu", "--training.validation-batches", "1"),
     )
-    assert load_network(tmp_path / "run" / "weights.safetensors").network.config == network.config
+    assert read_paper(tmp_path / "run" / "weights.safetensors").network.config == network.config
     assert len(list((tmp_path / "run" / "curves").iterdir())) == 1, "one process writes"
 
 

@@ -1,4 +1,4 @@
-"""Entities that are fixed in the base: no joint is taught, and the last joint is not taken for theirs."""
+"""Entities that are fixed in the base: the last joint is not taken for theirs."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ import pytest
 import torch
 
 from quest.data.store import TakeStore
-from quest.model.joint_head import JointBelief
 from quest.train import losses
 from quest.train.feature_cache import FeatureCache
 from quest.types import Entity, Take
 from quest.viz.contact_sheet import contact_sheet
+from tests.paper.tiny import make_paper
 from tests.synthetic import make_take
-from tests.tiny import DEFAULT, make_network
 from tests.train.prepared import CPU
 
 
@@ -32,7 +31,7 @@ def test_feature_cache_keeps_no_joint_for_what_is_fixed(tmp_path: Path) -> None:
     take, store = take_with_fixed_entity(), TakeStore(tmp_path / "takes")
     store.write(take)
     assert store.read(take.info.name).info.entities[1].fixed
-    cache = FeatureCache(tmp_path / "cache", DEFAULT, make_network().encoder)
+    cache = FeatureCache(tmp_path / "cache", make_paper().encoder)
     tuple(cache.build(store, store.names(), device=CPU))
     (view,) = cache.views([take.info.name])
     assert view.revolute.tolist() == [False, False]
@@ -49,27 +48,6 @@ def test_intent_follows_from_the_joint() -> None:
     rim, handle = Entity("base/rim", "rim", 0, -1), Entity("lid/handle", "handle", 1, 0)
     assert (rim.fixed, rim.intent) == (True, "lift")
     assert (handle.fixed, handle.intent) == (False, "open")
-
-
-def test_joint_loss_leaves_out_what_has_no_joint() -> None:
-    torch.manual_seed(0)
-    shape = (1, 2, 2)
-    raw = torch.randn(*shape, 13, requires_grad=True)
-    belief = JointBelief(raw[..., 0], raw[..., 1:4], raw[..., 4:7], raw[..., 7:10], raw[..., 10:13])
-    point, mask = torch.randn(*shape, 3), torch.ones(shape, dtype=torch.bool)
-    axis = torch.randn(1, 2, 6)
-    axis[:, 1, 3:] = 0
-    revolute = torch.tensor([[True, False]])
-    loss = losses.joint_loss(belief, point, axis, revolute, mask)
-    alone = losses.joint_loss(
-        JointBelief(*(getattr(belief, n)[:, :, :1] for n in JointBelief.__dataclass_fields__)),
-        point[:, :, :1], axis[:, :1], revolute[:, :1], mask[:, :, :1],
-    )  # fmt: skip
-    assert float(loss.detach()) == pytest.approx(float(alone.detach()), rel=1e-6)
-    loss.backward()
-    assert raw.grad is not None
-    assert torch.isfinite(raw.grad).all()
-    assert not raw.grad[:, :, 1].any()
 
 
 def test_manifold_of_what_is_fixed_is_its_place() -> None:

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
 from quest.errors import ConfigError
-from quest.model.affordance import AffordanceMap
-from quest.model.joint_head import JointBelief
 from quest.train import losses
 from tests.tolerances import LOSS, approx
 
-B, T, K, C = 2, 4, 3, 8
+B, T, K = 2, 4, 3
 
 
 @pytest.fixture(autouse=True)
@@ -80,51 +76,6 @@ def test_coordinate_loss():
     assert uv.grad is not None
     assert (uv.grad[~mask] == 0).all()
     assert losses.coordinate_loss(target, target, mask) == 0
-
-
-def test_heatmap_loss():
-    logits, uv = torch.randn(B, T, K, C * C, requires_grad=True), torch.rand(B, T, K, 2)
-    weight = some_mask() * torch.where(torch.rand(B, T, K) < 0.5, 1.0, 0.3)
-    uv[weight == 0] = math.nan
-    total, norm = 0.0, 0.0
-    for b in range(B):
-        for t in range(T):
-            for k in range(K):
-                w = float(weight[b, t, k])
-                if w == 0:
-                    continue
-                x, y = (uv[b, t, k] * C).tolist()
-                blob = [
-                    math.exp(-0.5 * (((i % C) + 0.5 - x) ** 2 + ((i // C) + 0.5 - y) ** 2) / 0.6**2)
-                    for i in range(C * C)
-                ]
-                log_p = logits[b, t, k].detach().log_softmax(-1).tolist()
-                total -= w * sum(p / sum(blob) * q for p, q in zip(blob, log_p, strict=True))
-                norm += w
-    loss = losses.heatmap_loss(logits, uv, weight, cells=C)
-    assert float(loss.detach()) == approx(total / norm, LOSS)
-    lives(loss, logits)
-
-
-def test_heatmap_loss_is_least_at_the_truth():
-    uv = torch.tensor([[0.3, 0.7]])
-    at = [torch.zeros(1, C * C) for _ in range(2)]
-    at[0][0, 5 * C + 2], at[1][0, 2 * C + 5] = 9.0, 9.0
-    right, swapped = (losses.heatmap_loss(x, uv, torch.ones(1), cells=C) for x in at)
-    assert right < swapped
-
-
-def test_point_loss():
-    point, target, unit, mask = track()
-    expected = []
-    for b, t, k in mask.nonzero().tolist():
-        error = (point[b, t, k] - target[b, t, k]).detach() / unit[b]
-        if error.isfinite().all():
-            expected.append(sum(huber(e, 0.05) for e in error.tolist()) / 0.05)
-    loss = losses.point_loss(point, target, unit, mask)
-    assert float(loss.detach()) == approx(mean(expected), LOSS)
-    lives(loss, point)
-    assert losses.point_loss(target, target, unit, mask) == 0
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -253,136 +204,6 @@ def test_manifold_loss():
     loss = losses.manifold_loss(point, rest, axis, revolute, unit, mask)
     assert float(loss.detach()) == approx(mean(expected), LOSS)
     lives(loss, point)
-
-
-@pytest.mark.parametrize("purposes", [1, 2])
-def test_affordance_loss(purposes: int):
-    logits = torch.randn(B, C * C, 4, purposes, requires_grad=True)
-    offset = torch.randn(B, C * C, purposes, 2, requires_grad=True)
-    uv, label = torch.rand(B, K, 2), torch.tensor([[0, 0, 3], [1, 2, 2]])
-    visible = torch.tensor([[True, True, False], [True, False, True]])
-    intent = torch.tensor([[0, 1, 0], [0, 0, 1]])
-    uv[~visible] = math.nan
-    total, positives, residuals = 0.0, 0, [[] for _ in range(purposes)]
-    p = logits.detach().sigmoid()
-    for b in range(B):
-        told = intent[b] if purposes == 2 else torch.zeros_like(intent[b])
-        for i, n, m in itertools.product(range(C * C), range(4), range(purposes)):
-            y = 0.0
-            for k in range(K):
-                if not visible[b, k] or label[b, k] != n or told[k] != m:
-                    continue
-                px, py = (uv[b, k] * C).tolist()
-                gap = (i % C + 0.5 - px) ** 2 + (i // C + 0.5 - py) ** 2
-                y = max(y, 1.0 if i == int(py) * C + int(px) else math.exp(-0.5 * gap / 0.8**2))
-            q = float(p[b, i, n, m])
-            positives += y == 1.0
-            total -= (1 - q) ** 2 * math.log(q) if y == 1.0 else (1 - y) ** 4 * q**2 * math.log(1 - q)
-        for i, m in itertools.product(range(C * C), range(purposes)):
-            gaps = [
-                (uv[b, k] * C - torch.tensor([i % C + 0.5, i // C + 0.5])).tolist()
-                for k in range(K)
-                if visible[b, k] and told[k] == m
-            ]
-            gap = min(gaps, key=lambda g: max(map(abs, g)), default=[math.inf, math.inf])
-            if max(map(abs, gap)) < 1.5:
-                residuals[m].append(sum(abs(o - g) for o, g in zip(offset[b, i, m].tolist(), gap, strict=True)))
-    found = AffordanceMap(logits[:, None], offset[:, None])
-    loss = losses.affordance_loss(found, uv[:, None], label, intent, visible[:, None])
-    assert float(loss.detach()) == approx(total / positives + 0.5 * mean([mean(r) for r in residuals]), LOSS)
-    lives(loss, logits, offset)
-
-
-def test_affordance_loss_of_an_empty_and_of_a_perfect_map():
-    uv, label, intent = torch.tensor([[[[0.3, 0.7]]]]), torch.tensor([[2]]), torch.tensor([[1]])
-    quiet = AffordanceMap(torch.full((1, 1, C * C, 4, 2), -20.0), torch.zeros(1, 1, C * C, 2, 2))
-    perfect = AffordanceMap(quiet.logits.clone(), quiet.offset.clone())
-    perfect.logits[0, 0, 5 * C + 2, 2, 1] = 20.0
-    for x, y in itertools.product((1, 2, 3), (4, 5, 6)):
-        perfect.offset[0, 0, y * C + x, 1] = torch.tensor([2.4 - 0.5 - x, 5.6 - 0.5 - y])
-    none, seen = torch.tensor([[[False]]]), torch.tensor([[[True]]])
-    assert losses.affordance_loss(quiet, uv, label, intent, none) == approx(0, LOSS)
-    assert losses.affordance_loss(perfect, uv, label, intent, seen) == pytest.approx(0, abs=1e-4)
-    assert losses.affordance_loss(quiet, uv, label, intent, seen) > 1
-
-
-def test_every_cell_of_a_rim_or_front_points_to_it():
-    uv = torch.tensor([[[[0.3, 0.7], [0.9, 0.1], [0.9, 0.5]]]])
-    label, intent, visible = torch.tensor([[2, 3, 0]]), torch.tensor([[0, 1, 0]]), torch.ones(1, 1, 3, dtype=torch.bool)
-    found = AffordanceMap(torch.randn(1, 1, C * C, 4, 2), torch.randn(1, 1, C * C, 2, 2))
-    owner = torch.full((1, 1, C * C), -1)
-    cells = {0: [(2, 2), (3, 4), (7, 7)], 1: [(0, 0), (6, 5)]}
-    for k, places in cells.items():
-        for x, y in places:
-            owner[0, 0, y * C + x] = k
-    far = []
-    for k, places in cells.items():
-        gaps = {(x, y): uv[0, 0, k] * C - torch.tensor([x + 0.5, y + 0.5]) for x, y in places}
-        beside = [uv[0, 0, n] * C for n in range(3) if intent[0, n] == intent[0, k]]
-        own = [
-            float((found.offset[0, 0, y * C + x, k] - gap).abs().sum())
-            for (x, y), gap in gaps.items()
-            if all((b - torch.tensor([x + 0.5, y + 0.5])).abs().max() >= 1.5 for b in beside)
-        ]
-        assert len(own) == 2  # one cell of each lies beside an entity, which counts more
-        far.append(mean(own))
-    plain = losses.affordance_loss(found, uv, label, intent, visible)
-    more = losses.affordance_loss(found, uv, label, intent, visible, owner)
-    assert float(more - plain) == approx(0.5 * losses.FAR_WEIGHT * mean(far), LOSS)
-    # Any cell of a handle may score like its middle; those of rims and fronts may not.
-    owner[0, 0, 3 * C + 1] = 2
-    found.logits[0, 0, 3 * C + 1, 0, 0] += 9
-    assert losses.affordance_loss(found, uv, label, intent, visible) > plain + 1
-    assert losses.affordance_loss(found, uv, label, intent, visible, owner) == pytest.approx(float(more), abs=1)
-    found.logits[0, 0, 3 * C + 1, 0, 0] -= 9
-    owner[0, 0, 3 * C + 1] = -1
-    # The middle of what is not seen cannot be told.
-    visible[0, 0, 1] = False
-    less = losses.affordance_loss(found, uv, label, intent, visible, owner)
-    alone = losses.affordance_loss(found, uv, label, intent, visible)
-    assert float(less - alone) == approx(0.5 * losses.FAR_WEIGHT * far[0] / 2, LOSS)
-
-
-def joints() -> tuple[JointBelief, Tensor, Tensor, Tensor, Tensor]:
-    """A belief, true points and axes, kinds and a mask."""
-    unit = torch.nn.functional.normalize
-    belief = JointBelief(
-        torch.randn(B, T, K),
-        unit(torch.randn(B, T, K, 3), dim=-1),
-        unit(torch.randn(B, T, K, 3), dim=-1),
-        torch.randn(B, T, K, 3),
-        torch.randn(B, T, K, 3),
-    )
-    axis = torch.cat((torch.randn(B, K, 3), unit(torch.randn(B, K, 3), dim=-1)), dim=-1)
-    return belief, torch.randn(B, T, K, 3), axis, torch.rand(B, K) < 0.5, some_mask()
-
-
-def test_joint_loss_against_a_plain_loop():
-    belief, point, axis, revolute, mask = joints()
-    expected = []
-    for b, t, k in mask.nonzero().tolist():
-        origin, direction = axis[b, k, :3], axis[b, k, 3:]
-        logit, spread = belief.revolute_logit[b, t, k], belief.log_spread[b, t, k]
-        value = math.log1p(math.exp(-logit if revolute[b, k] else logit))
-        used = belief.turn_axis if revolute[b, k] else belief.slide_axis
-        sine = math.sqrt(max(0.0, 1 - float(used[b, t, k] @ direction) ** 2))
-        log = float(spread[1] if revolute[b, k] else spread[0])
-        value += sine * math.exp(-log) + 2 * log
-        if revolute[b, k]:
-            foot = origin + ((point[b, t, k] - origin) @ direction) * direction
-            gap = float((belief.foot[b, t, k] - (foot - point[b, t, k])).norm())
-            value += gap * math.exp(-float(spread[2])) + 3 * float(spread[2])
-        expected.append(value)
-    assert float(losses.joint_loss(belief, point, axis, revolute, mask)) == approx(mean(expected), LOSS)
-
-
-def test_joint_loss_does_not_know_the_sign_of_an_axis():
-    belief, point, axis, revolute, mask = joints()
-    flipped = replace(belief, slide_axis=-belief.slide_axis, turn_axis=-belief.turn_axis)
-    point[~mask] = math.nan
-    torch.testing.assert_close(
-        losses.joint_loss(belief, point, axis, revolute, mask), losses.joint_loss(flipped, point, axis, revolute, mask)
-    )
 
 
 def test_weights_come_from_the_table():

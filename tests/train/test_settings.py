@@ -23,8 +23,7 @@ from quest.train.settings import TrainingConfig, WindowConfig
         (TrainingConfig(), "seed", 2**64),
         (WindowConfig(), "batch", 0),
         (WindowConfig(), "max_stride", -1),
-        (WindowConfig(), "point_jitter_px", -1.0),
-        (WindowConfig(), "label_share", 1.5),
+        (WindowConfig(), "depth_drop_share", 1.5),
     ],
 )
 def test_settings_out_of_range_are_refused_before_anything_is_prepared(
@@ -40,8 +39,10 @@ def test_an_unknown_accelerator_is_refused() -> None:
 
 
 def test_options_that_would_do_nothing_are_refused() -> None:
-    command = Train(data=("takes",), out=Path("run"), weights="quest-s16")
+    command = Train(out=Path("run"), data=("takes",), stage=1, weights="runs/paper")
     with pytest.raises(ConfigError, match=r"omit --losses"):
-        replace(command, stage=2, losses={"vel": 0.0})._start()
+        replace(command, stage=2, losses={"vel": 0.0})._start_paper()
     with pytest.raises(ConfigError, match="omit --encoder"):
-        replace(command, encoder=Path("encoder.safetensors"))._start()
+        replace(command, encoder=Path("encoder.safetensors"))._start_paper()
+    with pytest.raises(ConfigError, match="omit --encoder"):
+        replace(command, stage="find", detail=Path("detail.safetensors"))._start_finder()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,40 +10,37 @@ import torch
 
 from quest.errors import ConfigError
 from quest.geometry import invert, project, transform
-from quest.model.network import UNKNOWN_LABEL
 from quest.train.feature_cache import CachedView
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler
 from quest.types import Camera
-from tests.tiny import DEFAULT, make_network
+from tests.paper.tiny import PAPER, make_paper
 from tests.tolerances import EXACT
 from tests.train.prepared import prepare
 
-WINDOW = DEFAULT.window
+WINDOW = PAPER.window
 
 
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> list[CachedView]:
     """One view with two entities, one with three, one of an object with NaN pixels."""
-    return prepare(tmp_path_factory.mktemp("prepared"), make_network(), seeds=(0, 1, 2))
+    return prepare(tmp_path_factory.mktemp("prepared"), make_paper(), seeds=(0, 1, 2))
 
 
 def sampler(views: list[CachedView], **changes) -> WindowSampler:
-    return WindowSampler(views, DEFAULT, replace(WindowConfig(batch=6), **changes))
+    return WindowSampler(views, PAPER, replace(WindowConfig(batch=6), **changes))
 
 
 @pytest.mark.parametrize("disturb", [True, False])
 def test_shapes_and_masks(views: list[CachedView], disturb: bool):
     frames, truth = sampler(views).draw(np.random.default_rng(0), disturb=disturb)
     assert frames.features.shape == (6, 1 + WINDOW, 16, 32)
-    assert frames.rgb.shape == (6, 1 + WINDOW, 64, 64, 3)
+    assert frames.depth_m.shape == (6, 1 + WINDOW, 64, 64)
     assert truth.uv.shape == (6, 1 + WINDOW, 3, 2)
-    assert (truth.bound <= (truth.visible[:, 0] & truth.exists)).all(), "an anchor must be seen where it is bound"
-    assert truth.bound.any(dim=1).all()
+    assert truth.visible[:, 0].any(dim=1).all(), "something must be seen in the anchor frame"
     assert (truth.exists.sum(dim=1) >= 2).all()
     assert not truth.exists.all(), "one object has fewer entities than the other"
     assert not truth.visible.transpose(1, 2)[~truth.exists].any()
-    assert ((truth.anchor_uv >= 0) & (truth.anchor_uv <= 1)).all()
 
 
 def test_truth_is_what_the_frames_show(views: list[CachedView]):
@@ -106,26 +102,18 @@ def test_windows_are_in_order_with_one_stride(views: list[CachedView]):
     assert strides >= {-3, -1, 0, 1, 3}
 
 
-def test_nothing_is_disturbed_when_it_must_not_be(views: list[CachedView]):
-    frames, truth = sampler(views, depth_drop_share=1.0, query_drop_share=1.0).draw(
-        np.random.default_rng(0), disturb=False
-    )
+def test_windows_lose_their_depth_only_where_they_are_disturbed(views: list[CachedView]):
+    always, rng = sampler(views, depth_drop_share=1.0), np.random.default_rng(0)
+    frames, _ = always.draw(rng, disturb=False)
     assert (frames.depth_m > 0).any()
-    assert (truth.told == UNKNOWN_LABEL).all()
-    assert (truth.bound == (truth.visible[:, 0] & truth.exists)).all()
-    torch.testing.assert_close(truth.anchor_uv[truth.bound], truth.uv[:, 0][truth.bound])
-
-
-def test_disturbances(views: list[CachedView]):
-    rng = np.random.default_rng(0)
-    frames, truth = sampler(views, depth_drop_share=1.0, label_share=1.0).draw(rng)
+    frames, truth = always.draw(rng)
     assert (frames.depth_m == 0).all()
-    assert (frames.cell_depth_m == 0).all()
     assert (frames.scale == 1).all()
-    assert (truth.told == truth.label).all()
-    frames, truth = sampler(views, query_drop_share=1.0, label_share=0.0).draw(rng)
-    assert (truth.told == UNKNOWN_LABEL).all()
-    assert truth.bound.any(dim=1).all(), "one query at least is left"
+    assert truth.point.isfinite().all()
+    some, _ = sampler(views, depth_drop_share=0.5, batch=40).draw(rng)
+    with_depth = (some.depth_m > 0).flatten(1).any(dim=1)
+    assert with_depth.any()
+    assert not with_depth.all()
 
 
 def test_views_in_which_nothing_is_seen(views: list[CachedView]):
@@ -135,10 +123,10 @@ def test_views_in_which_nothing_is_seen(views: list[CachedView]):
         sampler([blind])
 
 
-def test_behind_the_camera_is_outside(views: list[CachedView], tmp_path: Path):
+def test_what_is_behind_the_camera_has_no_pixel(views: list[CachedView]):
     uv = np.array(views[0].uv_px)
     visible = np.array(views[0].visible)
     uv[3:, 0], visible[3:, 0] = np.nan, False
     _, truth = sampler([replace(views[0], uv_px=uv, visible=visible)]).draw(np.random.default_rng(0))
     assert truth.uv.isnan().any()
-    assert truth.anchor_uv.isfinite().all()
+    assert not truth.visible[truth.uv.isnan().any(-1)].any()

@@ -6,7 +6,7 @@ heavy is imported before a tracker is built.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
@@ -21,8 +21,6 @@ Inputs = Literal["depth and poses", "depth", "colours"]
 """What of a real recording a tracker is shown."""
 
 EVERYTHING: tuple[Inputs, ...] = ("depth and poses", "depth", "colours")
-
-_REMEMBERED_FRAMES = 1000
 
 
 @runtime_checkable
@@ -41,14 +39,10 @@ class ClipTracker(Protocol):
 
 @dataclass(frozen=True)
 class Shared:
-    """What trackers that are made of one network share."""
+    """What trackers that are made of the same weights share."""
 
     tracker: Tracker
-    """The tracker whose network and settings they use."""
-    unit_m: Callable[[Clip], float]
-    """Metres per normalised unit of a clip, for the noise of chained flow."""
-    seed: int = 0
-    """Of that noise."""
+    """The tracker whose networks and settings they use."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +79,8 @@ def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHI
 TRACKERS: dict[str, Entry] = {
     "quest": _of_weights("this tracker", "whole"),
     "quest-pixels": _of_weights("quest without depth", "pixels_only", inputs=("colours",)),
-    "redetect": _of_weights("its network without queries, every 4th frame", "redetect", every=4),
+    "redetect": _of_weights("its finder without queries, every 4th frame", "redetect", every=4),
     "redetect-1": _of_weights("the same in every frame", "redetect", every=1),
-    "flow-chain": _of_weights("its flow head, chained", "flow_chain", noise=0.0),
-    "flow-chain-0.01": _of_weights("the same with noise", "flow_chain", noise=0.01),
-    "flow-chain-0.02": _of_weights("the same with noise", "flow_chain", noise=0.02),
-    "flow-chain-0.05": _of_weights("the same with noise", "flow_chain", noise=0.05),
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
     "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),
@@ -104,16 +94,12 @@ TRACKERS: dict[str, Entry] = {
 """Every tracker by the name that commands and tables call it."""
 
 
-def line_up(
-    names: Sequence[str], *, weights: str, unit_m: Callable[[Clip], float], seed: int = 0
-) -> tuple[ClipTracker, ...]:
-    """The trackers of some names; all that need weights share one network and what it sees in a frame.
+def line_up(names: Sequence[str], *, weights: str) -> tuple[ClipTracker, ...]:
+    """The trackers of some names; all that need weights share one network.
 
     Args:
         names: of :data:`TRACKERS`; each counts once.
         weights: name or file of the weights.
-        unit_m: metres per normalised unit of a clip, for the noise of chained flow.
-        seed: of that noise.
 
     Raises:
         ConfigError: no tracker of that name.
@@ -125,14 +111,10 @@ def line_up(
     shared = None
     if any(TRACKERS[name].of_weights for name in names):
         import quest
-        from quest.baselines.memory import remember_frames
         from quest.track import Tracker
 
-        shared = Shared(quest.load(weights), unit_m, seed)
-        if isinstance(shared.tracker, Tracker):
-            remember_frames(shared.tracker.network, capacity=_REMEMBERED_FRAMES)  # all of them see the same frames
-        elif other := [name for name in names if TRACKERS[name].of_weights and name != "quest"]:
-            raise WeightsError(
-                f"tracker {other[0]!r}: these weights are of the published network; use preset default's"
-            )
+        shared = Shared(quest.load(weights))
+        other = [name for name in names if TRACKERS[name].of_weights and name != "quest"]
+        if other and not isinstance(shared.tracker, Tracker):
+            raise WeightsError(f"tracker {other[0]!r}: these weights are of the published network; use a finder's")
     return tuple(TRACKERS[name].build(name, shared) for name in dict.fromkeys(names))

@@ -6,11 +6,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import torch
 
 from quest.baselines.point_queries import hold_last, lift_pixels
-from quest.geometry.letterbox import Letterbox
-from quest.model.discovery import Peaks
+from quest.model.found import Found
 from quest.track.tracker import DEFAULT_ALPHA, Tracker
 from quest.types import Camera, Clip, Frame, Query, Tracks
 
@@ -34,16 +32,9 @@ class PixelsOnly(Tracker):
         other.name = name
         return other
 
-    def candidates(self, camera: Camera, frame: Frame) -> Peaks:
-        """As :meth:`quest.track.Tracker.candidates`, by colours alone; their points are lifted as those of tracks."""
-        peaks = super().candidates(camera, replace(frame, depth_m=None))
-        if frame.depth_m is None:
-            return peaks
-        size = self.network.config.encoder.image_size
-        uv_px = Letterbox(camera, size).to_source(peaks.uv.float().cpu().numpy() * size)
-        alone = Clip("", camera, frame.rgb[None], frame.depth_m[None], np.zeros(1), np.eye(4, dtype=np.float32)[None])
-        point = lift_pixels(alone, uv_px.astype(np.float32)[None])[0]
-        return replace(peaks, point_m=torch.from_numpy(point).to(peaks.point_m))
+    def find(self, camera: Camera, frame: Frame) -> Found:
+        """As :meth:`quest.track.Tracker.find`, by colours alone."""
+        return super().find(camera, replace(frame, depth_m=None))
 
     def track(
         self, clip: Clip, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA

@@ -1,7 +1,7 @@
 """No queries: entities are detected anew in every window and linked to the nearest previous one.
 
-The ablation of persistent queries. Detections are the peaks of the network's dense affordance map, the same that QueST
-binds its slots to; nothing of an entity is remembered but where it was.
+The ablation of persistent queries. Detections are what the tracker's finder finds, by the threshold of discovery;
+nothing of an entity is remembered but where it was.
 
 Reference: Bewley et al., Simple Online and Realtime Tracking, ICIP 2016, for linking detections by place alone.
 """
@@ -12,15 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32
 from scipy.optimize import linear_sum_assignment
 
-from quest.baselines.clip_frames import ClipFrames
 from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
 from quest.data.cut import cut_clip
-from quest.model.discovery import find_peaks
-from quest.model.network import QuestNetwork
+from quest.track import Tracker
 from quest.types import LABELS, Clip, Query, State, Tracks
 
 NOTHING_FOUND = "nothing was detected in the first frame"
@@ -28,7 +25,7 @@ NOTHING_FOUND = "nothing was detected in the first frame"
 
 @dataclass(frozen=True)
 class Detections:
-    """What the affordance map shows in one frame, best first."""
+    """What is found in one frame, best first."""
 
     uv_px: Float32[np.ndarray, "N 2"]
     """Pixels of the source image."""
@@ -37,59 +34,7 @@ class Detections:
     label: tuple[str, ...]
     """One of :data:`quest.types.LABELS` each."""
     confidence: Float32[np.ndarray, " N"]
-    """Probability by the map's own score."""
-
-
-class Detector:
-    """Finds entities in single frames by a network's dense affordance map.
-
-    Args:
-        network: a network with a heatmap, in evaluation mode.
-        device: where it runs.
-        min_logit: least score of a detection.
-        radius_cells: of peaks closer than this the best stays.
-        depth_window_px: odd side of the window whose median depth lifts a pixel.
-        autocast: whether the network computes in bfloat16.
-        weights_hash: SHA-256 of the file that the network came from, for result files.
-    """
-
-    def __init__(
-        self,
-        network: QuestNetwork,
-        *,
-        device: torch.device,
-        min_logit: float = 0.0,
-        radius_cells: float = 1.5,
-        depth_window_px: int = 3,
-        autocast: bool = False,
-        weights_hash: str | None = None,
-    ) -> None:
-        self.network = network.to(device).eval()
-        self.device = device
-        self.min_logit = min_logit
-        self.radius_cells = radius_cells
-        self.depth_window_px = depth_window_px
-        self.autocast = autocast
-        self.weights_hash = weights_hash
-
-    def frames(self, clip: Clip) -> ClipFrames:
-        """The clip's frames as the network takes them."""
-        return ClipFrames(self.network, clip, device=self.device)
-
-    def detect(self, clip: Clip, frames: ClipFrames, t: int) -> Detections:
-        """What is seen in frame ``t``."""
-        with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, enabled=self.autocast):
-            batch, observed = frames.see(t)
-            peaks = find_peaks(self.network, batch, observed, radius_cells=self.radius_cells)
-        kept = torch.nonzero(peaks.logit > self.min_logit)[:, 0]
-        uv_px = frames.to_source(peaks.uv[kept])
-        score = (peaks.logit[kept] - self.min_logit).sigmoid().float().cpu().numpy()
-        return Detections(
-            uv_px,
-            lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None], window_px=self.depth_window_px)[0],
-            tuple(LABELS[int(n)] for n in peaks.label[kept]),
-            score.astype(np.float32),
-        )
+    """Probability of being right."""
 
 
 class Redetect:
@@ -101,18 +46,18 @@ class Redetect:
     linked to stays where it was, and so do all of them between detections. Nothing is random.
 
     Args:
-        detector: what finds entities.
+        tracker: whose finder and settings of discovery are used.
         every: frames from one detection to the next: T, the window of the network.
-        reach: farthest that a detection is linked, in half widths of the view at the scene's median depth, and at
+        reach: farthest that a detection is linked, in half widths of the view at the depth of what is linked, and at
             which a point query binds, in half widths of the image.
         name: what tables call it.
     """
 
     protocols = ("point", "semantic")
 
-    def __init__(self, detector: Detector, *, every: int = 4, reach: float = 0.25, name: str = "redetect") -> None:
-        self.detector = detector
-        self.weights_hash = detector.weights_hash
+    def __init__(self, tracker: Tracker, *, every: int = 4, reach: float = 0.25, name: str = "redetect") -> None:
+        self.tracker = tracker
+        self.weights_hash = tracker.weights_hash
         self.every = every
         self.reach = reach
         self.name = name
@@ -134,31 +79,38 @@ class Redetect:
         if queries is None:
             return self._discover(clip)
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
-        frames = self.detector.frames(clip)
         rows = _Rows(len(clip), len(queries))
         for t in range(len(clip)):
             rows.hold(t)
             born = np.flatnonzero(first == t)
             if len(born) or t % self.every == 0:
-                seen = self.detector.detect(clip, frames, t)
+                seen = self.detect(clip, t)
                 alive = np.flatnonzero(first < t)
                 if len(alive) and t % self.every == 0:
-                    self._link(rows, alive, seen, t, frames)
+                    self._link(rows, alive, seen, clip, t)
                 if len(born):
                     self._bind(rows, born, uv_first[born], seen, clip, t)
         flags = (NO_DEPTH,) if clip.depth_m is None else ()
         return rows.tracks(clip, query_names(queries), tuple(q.label for q in queries), flags)
 
+    def detect(self, clip: Clip, t: int) -> Detections:
+        """What is found in frame ``t``."""
+        found = self.tracker.find(clip.camera, clip.frame(t))
+        exists = 1 / (1 + np.exp(-found.logit))
+        kept = np.flatnonzero((exists > self.tracker.config.threshold) & np.isin(found.labels, LABELS))
+        found, uv_px = found.select(kept), found.uv_px[kept].astype(np.float32)
+        point = lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None])[0]
+        return Detections(uv_px, point, found.labels, exists[kept].astype(np.float32))
+
     def _discover(self, clip: Clip) -> Tracks:
-        frames = self.detector.frames(clip)
-        start = self.detector.detect(clip, frames, 0)
+        start = self.detect(clip, 0)
         rows = _Rows(len(clip), len(start.label))
         every_row = np.arange(len(start.label))
         rows.set(0, every_row, start, every_row)
         for t in range(1, len(clip)):
             rows.hold(t)
             if t % self.every == 0 and len(every_row):
-                self._link(rows, every_row, self.detector.detect(clip, frames, t), t, frames)
+                self._link(rows, every_row, self.detect(clip, t), clip, t)
         names = tuple(f"{label} {k}" for k, label in enumerate(start.label))
         flags = ((NO_DEPTH,) if clip.depth_m is None else ()) + (() if names else (NOTHING_FOUND,))
         return rows.tracks(clip, names, start.label, flags)
@@ -175,18 +127,20 @@ class Redetect:
         """Point queries begin at the nearest detection; one that has none in reach begins, and stays, at its pixel."""
         own = cut_clip(clip, slice(t, t + 1))
         rows.uv_px[t, born] = uv_px
-        rows.point_world[t, born] = lift_pixels(own, uv_px[None], window_px=self.detector.depth_window_px)[0]
+        rows.point_world[t, born] = lift_pixels(own, uv_px[None])[0]
         half_px = max(clip.camera.width, clip.camera.height) / 2
         gap = np.linalg.norm(uv_px[:, None] - seen.uv_px[None], axis=-1) / half_px
         which, detection = link(gap, self.reach)
         rows.set(t, born[which], seen, detection)
 
-    def _link(self, rows: _Rows, alive: np.ndarray, seen: Detections, t: int, frames: ClipFrames) -> None:
+    def _link(self, rows: _Rows, alive: np.ndarray, seen: Detections, clip: Clip, t: int) -> None:
         rows.visible[t, alive] = False
-        half_px = frames.letterbox.size / frames.letterbox.scale / 2
+        half_px = max(clip.camera.width, clip.camera.height) / 2
         in_image = np.linalg.norm(rows.uv_px[t, alive][:, None] - seen.uv_px[None], axis=-1) / half_px
         in_space = np.linalg.norm(rows.point_world[t, alive][:, None] - seen.point_world[None], axis=-1)
-        gap = np.where(np.isfinite(in_space), in_space / frames.scale_m, in_image)
+        pose = clip.cam_from_world[t]
+        half_m = (rows.point_world[t, alive] @ pose[2, :3] + pose[2, 3]) * half_px / clip.camera.fx
+        gap = np.where(np.isfinite(in_space), in_space / np.maximum(half_m, 1e-6)[:, None], in_image)
         which, detection = link(gap, self.reach)
         rows.set(t, alive[which], seen, detection)
 

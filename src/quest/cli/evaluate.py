@@ -14,7 +14,7 @@ from quest.baselines import TRACKERS
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from rich.console import Console
     from rich.progress import Progress
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
     from quest.evaluation.selection import Shard, SplitPart
-    from quest.types import Clip
 
 if TYPE_CHECKING:
     TrackerName = str
@@ -74,7 +73,7 @@ class Eval:
     resamples: int = 1000
     """Of the bootstrap over objects, clips or pictures."""
     seed: int = 0
-    """Of the bootstrap and of the noise of chained flow."""
+    """Of the bootstrap."""
     shard: str = "0/1"
     """Part of the takes, such as 0/2 and 1/2 for two processes side by side; the last one reports. Needs --out."""
     out: Path | None = None
@@ -119,7 +118,7 @@ class Eval:
         names = [real.name for real in sets]
         if len(set(names)) < len(names):
             raise ConfigError(f"eval: expected sets of different names, got {', '.join(names)}; rename a folder")
-        trackers = self._load_trackers(self.trackers or _OF_REAL, unit_m=_no_unit)
+        trackers = self._load_trackers(self.trackers or _OF_REAL)
         console, found = _stderr(), dict[str, list[RealRow]]()
         with _bar(console) as progress:
             task = progress.add_task("", total=sum(len(real.clips) + len(real.pictures) for real in sets))
@@ -149,7 +148,6 @@ class Eval:
         return 0
 
     def _run_takes(self, takes: str) -> int:
-        from quest.baselines.flow_chain import units_of
         from quest.cli.takes import open_store
         from quest.data.provenance import combined_hash
         from quest.errors import ConfigError
@@ -170,7 +168,7 @@ class Eval:
         )
         names = list(self.trackers or ("quest", "lk", "hold-still"))
         names += ["hold-still"] * ("point" in self.protocol)
-        trackers = self._load_trackers(names, unit_m=units_of([store]))
+        trackers = self._load_trackers(names)
         console = _stderr()
         finished = self._finished(trackers)
         found = self._evaluate(store, chosen, trackers, finished, shard, console)
@@ -206,10 +204,10 @@ class Eval:
 
         return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(self.weights)
 
-    def _load_trackers(self, names: Sequence[str], *, unit_m: Callable[[Clip], float]) -> list[ClipTracker]:
+    def _load_trackers(self, names: Sequence[str]) -> list[ClipTracker]:
         from quest.baselines import line_up
 
-        return list(line_up(names, weights=self.weights, unit_m=unit_m, seed=self.seed))
+        return list(line_up(names, weights=self.weights))
 
     def _evaluate(
         self,
@@ -270,15 +268,6 @@ class Eval:
         if any(len({frozenset(o) for o in by_level.values()}) > 1 for by_level in levels.values()):
             notes.append("levels rest on different objects; compare levels with --same-objects")
         return Results(run, rows, found.discoveries, found.unscored, tuple(notes))
-
-
-def _no_unit(clip: Clip) -> float:
-    from quest.errors import ConfigError
-
-    raise ConfigError(
-        f"clip {clip.name!r}: the noise of flow-chain is in units of the object's size, which real recordings do not "
-        "tell; use other trackers with --real"
-    )
 
 
 def _stderr() -> Console:

@@ -69,6 +69,7 @@ class Group:
 
 COMMANDS: dict[str, Entry | Group] = {
     "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
+    "find": Entry("find", "Find", "Find what can be taken hold of in a picture."),
     "monitor": Entry("monitor", "Monitor", "Watch a recording or a take live: states, joints and alarms."),
     "doctor": Entry("doctor", "Doctor", "Check this machine: devices, renderer, weights, extras."),
     "weights": Group(
@@ -78,9 +79,8 @@ COMMANDS: dict[str, Entry | Group] = {
             "show": Entry("weights", "ShowWeights", "Print the content of a file of weights."),
             "save": Entry("weights", "SaveWeights", "Write weights into a folder in the form of the hub."),
             "push": Entry("weights", "PushWeights", "Push weights and a card to the Hugging Face hub."),
-            "merge": Entry("weights", "MergeWeights", "Merge parts that were trained apart."),
-            "import-encoder": Entry("weights", "ImportEncoder", "Make the encoder's initial weights."),
-            "pieces": Entry("weights", "PiecesWeights", "Teach discovery which pieces are handles and knobs."),
+            "import-encoder": Entry("weights", "ImportEncoder", "Make the vision transformer's initial weights."),
+            "import-detail": Entry("weights", "ImportDetail", "Make EfficientNet's initial weights."),
             "tune": Entry("weights", "TuneWeights", "Choose the threshold of discovery."),
         },
     ),

@@ -1,11 +1,11 @@
-"""``quest train``: teach a network with takes, into a file that ``quest track`` loads."""
+"""``quest train``: teach a network with pictures and takes, into a file that ``quest track`` loads."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 from rich.console import Console
 from rich.markup import escape
@@ -19,84 +19,80 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.settings import TrainingConfig, WindowConfig
 
 if TYPE_CHECKING:
     import torch
 
-    from quest.model.config import DecoderConfig
-    from quest.model.network import WindowNetwork
-    from quest.train.dataset import Dataset
+    from quest.paper.network import PaperConfig
+    from quest.train.batches import Sampler
     from quest.train.loop import StepReport
     from quest.train.stage import Objective
-
-C = TypeVar("C", bound="DecoderConfig")
 
 
 @dataclass(frozen=True)
 class NetworkChanges:
-    """What is to be different from the preset, as in an ablation; what is left out stays as it is."""
+    """What of the published network is to be different, as in an ablation; what is omitted stays as it is."""
 
     window: int | None = None
     """T, frames that the decoder sees together."""
     slots: int | None = None
-    """K, most entities that discovery returns, and number of learned queries."""
+    """K, number of learned queries."""
     decoder_layers: int | None = None
     """Layers of the decoder."""
-    points3d: bool | None = None
-    """Whether depth is seen: position codes of lifted 3D points, and details of depth."""
-    intents: bool | None = None
-    """Whether entities to open are told from entities to lift."""
 
-    def apply(self, preset: C) -> C:
-        """The preset with the changes.
-
-        Raises:
-            ConfigError: the preset has no such setting.
-        """
-        from quest.errors import ConfigError
-
-        changes = {name: value for name, value in asdict(self).items() if value is not None}
-        for name in changes:
-            if not hasattr(preset, name):
-                raise ConfigError(f"--network.{name}: the network of this preset has no such setting; omit it")
-        return replace(preset, **changes)
+    def apply(self, preset: PaperConfig) -> PaperConfig:
+        """The preset with the changes."""
+        return replace(preset, **{name: value for name, value in asdict(self).items() if value is not None})
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a network on takes; run again with the same --out to go on.
+    """Train a network; run again with the same --out to go on.
+
+    Stage find teaches the finder of the tracker with labelled pictures, takes, or both. Stages 1 and 2 teach the
+    published network (preset paper) with takes: its queries, then its flow head.
 
     On several GPUs of a machine: --training.devices N (or auto). On several machines: torchrun --no-python quest train.
     """
 
-    data: tuple[str, ...]
-    """Folders of take stores; the committed object split says which takes teach and which choose."""
     out: Path
     """Folder of the run: checkpoints, curves, and the file weights.safetensors."""
+    data: tuple[str, ...] = ()
+    """Folders of take stores; the committed object split says which takes teach and which choose."""
+    pictures: tuple[Path, ...] = ()
+    """Stage find: labelled pictures: COCO files, YOLO data sets, folders with pictures/ and labels.csv. A fifth of
+    them, by their names, chooses and does not teach."""
+    free: bool = False
+    """Stage find: only pictures that name a licence teach and choose."""
+    stage: Literal["find", 1, 2] = "find"
+    """Find: what can be taken hold of. 1: everything of the published network that follows entities. 2: the flow head
+    of --weights and nothing else."""
     encoder: Path | None = None
-    """Initial encoder weights (quest weights import-encoder); needed unless --weights is given."""
+    """Initial weights of the vision transformer (quest weights import-encoder); needed unless --weights is given."""
+    detail: Path | None = None
+    """Stage find: initial weights of EfficientNet (quest weights import-detail); needed unless --weights is given."""
     weights: str | None = None
     """Start from these trained weights (a name or a file) instead, to fit your own objects."""
     validation: tuple[str, ...] = ()
     """Stores to choose by, for objects that are in no split."""
-    stage: Literal[1, "map", 2] = 1
-    """1 trains everything that follows entities; map trains the affordance map of --weights, from which entities are
-    discovered, and nothing else; 2 trains the flow head of --weights and nothing else."""
-    mirrored: tuple[str, ...] = ()
-    """Stores whose training takes teach by their mirror images; name a store in --data too to use both."""
-    preset: Literal["default", "paper"] = "default"
-    """Network to train, unless --weights is given."""
     network: NetworkChanges = field(default_factory=NetworkChanges)
-    """What is different from the preset."""
+    """What of the published network is different."""
     cache: Path | None = None
     """Folder of the feature cache; default: OUT/cache."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
     """How to train."""
     windows: WindowConfig = field(default_factory=WindowConfig)
-    """How windows are drawn."""
+    """How windows of stages 1 and 2 are drawn."""
+    finding: FinderSamplerConfig = field(default_factory=FinderSamplerConfig)
+    """How cuts of stage find are drawn."""
+    views: int = 2
+    """Stage find: views that are made of every picture and simulated frame."""
+    frames: int = 2
+    """Stage find: frames that are taken of every view of a take."""
     losses: dict[str, float] = field(default_factory=dict)
-    """Losses of stage 1 that are to count more or less than in the preset, such as vel 0 acc 1; 0 turns one off."""
+    """Losses that are to count more or less than in the preset, such as vel 0 acc 1; 0 turns one off."""
 
     def run(self) -> int:
         """Prepare, train, write the file."""
@@ -109,143 +105,169 @@ class Train:
         first = fabric.is_global_zero
         console = Console(stderr=True, highlight=False, quiet=not first)
         torch.manual_seed(self.training.seed)
-        start = self._start()
+        start = self._start_finder() if self.stage == "find" else self._start_paper()
         self.out.mkdir(parents=True, exist_ok=True)
         with Progress(*_columns(), console=console, disable=not first) as progress:
             # The first process prepares features; then the others find them.
             with fabric.rank_zero_first():
-                dataset = self._dataset(start.network, fabric.device, progress)
+                taught = self._taught(start, fabric.device, progress)
             best = fit(
-                self._objective(start.network),
-                dataset.training,
-                dataset.validation,
+                taught.objective,
+                taught.training,
+                taught.validation,
                 self.training,
                 out=self.out,
                 report=_training_bar(progress, self.training.steps),
                 fabric=fabric,
             )
         if first:
-            file = self._write(best, start, dataset)
+            file = self._write(best, start, taught)
             console.print(f"weights: {escape(str(file))}")
         return 0
 
-    def _start(self) -> _Start:
-        """What to train, and what to store with it."""
+    def _start_finder(self) -> _Start:
+        """The finder to train, and what to store with it."""
         from quest.errors import ConfigError
-        from quest.model.config import DEFAULT
-        from quest.model.network import QuestNetwork
-        from quest.paper.network import PaperConfig, PaperNetwork
+        from quest.model.encoder import load_exactly
+        from quest.model.finder import FinderConfig, FinderNetwork
+        from quest.model.tensor_file import read_tensors
+        from quest.model.weights import load_network
         from quest.track.settings import TrackerConfig
         from quest.train.dataset import load_initial_encoder
 
-        if self.stage != 1 and self.losses:
-            raise ConfigError(f"train: stage {self.stage} has a loss of its own; omit --losses")
+        if not self.data and not self.pictures:
+            raise ConfigError("train: pass --pictures FILE_OR_FOLDER or --data STORE to learn from")
         if self.weights is not None:
-            if self.encoder is not None:
-                raise ConfigError("train: trained weights have an encoder of their own; omit --encoder")
-            if self.network != NetworkChanges():
-                raise ConfigError("train: trained weights have a network of their own; omit --network.*")
-            return self._start_from(self.weights)
-        if self.stage != 1:
-            raise ConfigError(f"train: stage {self.stage} needs --weights, a network that stage 1 has trained")
+            if self.encoder is not None or self.detail is not None:
+                raise ConfigError("train: trained weights have an encoder of their own; omit --encoder and --detail")
+            loaded = load_network(self.weights)
+            return _Start(loaded.network.train(), loaded.settings, f"{loaded.about}; ", loaded.licence)
+        if self.encoder is None or self.detail is None:
+            raise ConfigError(
+                "train: pass --encoder FILE and --detail FILE to start anew, or --weights NAME to start from trained "
+                "weights"
+            )
+        network = FinderNetwork(FinderConfig())
+        load_initial_encoder(network, self.encoder)
+        load_exactly(network.detail, read_tensors(self.detail)[1], what=f"--detail {self.detail}")
+        return _Start(network.train(), TrackerConfig().to_json())
+
+    def _start_paper(self) -> _Start:
+        """The published network, with the head that the stage trains."""
+        from quest.errors import ConfigError
+        from quest.model.weights import find_weights
+        from quest.paper.flow import with_flow_head, without_flow_head
+        from quest.paper.network import PaperConfig, PaperNetwork, read_paper
+        from quest.train.dataset import load_initial_encoder
+
+        if not self.data:
+            raise ConfigError(f"train: stage {self.stage} learns from takes; pass --data STORE")
+        if self.stage == 2 and self.losses:
+            raise ConfigError("train: stage 2 has a loss of its own; omit --losses")
+        if self.weights is not None:
+            if self.encoder is not None or self.network != NetworkChanges():
+                raise ConfigError(
+                    "train: trained weights have their own encoder and network; omit --encoder, --network"
+                )
+            paper = read_paper(find_weights(self.weights))
+            network = (with_flow_head if self.stage == 2 else without_flow_head)(paper.network.train())
+            return _Start(network, about=f"{paper.about}; ", licence=paper.licence)
+        if self.stage == 2:
+            raise ConfigError("train: stage 2 needs --weights, a network that stage 1 has trained")
         if self.encoder is None:
             raise ConfigError(
                 "train: pass --encoder FILE to start anew, or --weights NAME to start from trained weights"
             )
-        if self.preset == "paper":
-            network = PaperNetwork(self.network.apply(PaperConfig()))
-        else:
-            network = QuestNetwork(self.network.apply(DEFAULT))
+        network = PaperNetwork(self.network.apply(PaperConfig()))
         load_initial_encoder(network, self.encoder)
-        return _Start(network, TrackerConfig().to_json())
+        return _Start(network)
 
-    def _start_from(self, weights: str) -> _Start:
-        """Trained weights, with the head that the stage trains."""
-        from quest.errors import ConfigError
-        from quest.model.weights import find_weights, load_network
-        from quest.paper.network import is_paper, read_paper
-        from quest.train.flow import with_flow_head, without_flow_head
-        from quest.train.mapping import with_own_map
-
-        path = find_weights(weights)
-        if is_paper(path):
-            if self.stage == "map":
-                raise ConfigError(f"train: {weights} is the published network, which has no affordance map to train")
-            paper = read_paper(path)
-            network = (with_flow_head if self.stage == 2 else without_flow_head)(paper.network.train())
-            return _Start(network, about=f"{paper.about}; ", licence=paper.licence)
-        loaded = load_network(weights)
-        network, before = loaded.network.train(), f"{loaded.about}; "
-        if self.stage == 1:
-            return _Start(without_flow_head(network), loaded.settings, about=before, licence=loaded.licence)
-        grown = with_flow_head(network) if self.stage == 2 else with_own_map(network)
-        return _Start(grown, loaded.settings, before, loaded.licence)
-
-    def _dataset(self, network: WindowNetwork[DecoderConfig], device: torch.device, progress: Progress) -> Dataset:
+    def _taught(self, start: _Start, device: torch.device, progress: Progress) -> _Taught:
+        """What is learned, and from what."""
         from quest.cli.takes import open_store, say_corrupt
+
+        say_corrupt(open_store(store) for store in dict.fromkeys((*self.data, *self.validation)))
+        bar = progress.add_task("features", total=None)
+        cache = self.cache or self.out / "cache"
+        if self.stage == "find":
+            from quest.train.finding.dataset import open_finder_data
+            from quest.train.finding.objective import StageFind
+
+            def viewed(done: int, total: int) -> None:
+                progress.update(bar, completed=done, total=total, description="views")
+
+            found = open_finder_data(
+                start.network.to(device),
+                pictures=self.pictures,
+                free=self.free,
+                stores=self.data,
+                validation_stores=self.validation,
+                cache=cache,
+                views=self.views,
+                frames=self.frames,
+                config=self.finding,
+                report=viewed,
+            )
+            objective = StageFind(start.network, self.losses)
+            return _Taught(objective, found.training, found.validation, found.about, found.sources)
+        from quest.paper.flow import StageTwo
+        from quest.paper.objective import PaperStageOne
         from quest.train.dataset import open_dataset
 
-        say_corrupt(open_store(store) for store in dict.fromkeys((*self.data, *self.validation, *self.mirrored)))
-        return open_dataset(
-            network,
+        def prepared(done: int, total: int, frames: int) -> None:
+            progress.update(bar, completed=done, total=total, description=f"features of {frames} frames")
+
+        dataset = open_dataset(
+            start.network,
             stores=self.data,
             validation_stores=self.validation,
-            mirrored_stores=self.mirrored,
-            cache=self.cache or self.out / "cache",
+            cache=cache,
             windows=self.windows,
             device=device,
-            report=_feature_bar(progress),
-            anchors_only=self.stage == "map",
+            report=prepared,
         )
+        first = PaperStageOne(start.network, self.losses)
+        objective = first if self.stage == 1 else StageTwo(start.network, first.answered)
+        about = f"{dataset.training_takes} training takes"
+        return _Taught(objective, dataset.training, dataset.validation, about, dataset.training_sources)
 
-    def _objective(self, network: WindowNetwork[DecoderConfig]) -> Objective:
-        from quest.model.network import QuestNetwork
-        from quest.paper.network import PaperNetwork
-        from quest.paper.objective import PaperStageOne
-        from quest.train.flow import StageTwo
-        from quest.train.mapping import StageMap
-        from quest.train.stage import StageOne
-
-        if self.stage == "map":
-            assert isinstance(network, QuestNetwork)
-            return StageMap(network)
-        if isinstance(network, PaperNetwork):
-            first = PaperStageOne(network, self.losses)
-        else:
-            assert isinstance(network, QuestNetwork)
-            first = StageOne(network, self.losses)
-        return first if self.stage == 1 else StageTwo(network, first.answered)
-
-    def _write(self, best: Path, start: _Start, dataset: Dataset) -> Path:
+    def _write(self, best: Path, start: _Start, taught: _Taught) -> Path:
         """The best checkpoint as a file that the tracker loads."""
-        from quest.model.network import QuestNetwork
         from quest.model.weights import save_network
-        from quest.paper.network import PaperNetwork
         from quest.train.checkpoint import load_checkpoint
         from quest.train.dataset import licence_after
 
         network = start.network.cpu()
         load_checkpoint(best, network, None)
         file = self.out / "weights.safetensors"
-        how = f"--preset {self.preset}" if self.weights is None else f"--stage {self.stage}"
-        about = f"{start.about}quest train {how}, {dataset.training_takes} training takes"
-        licence = licence_after(start.licence, dataset.training_sources)
-        if isinstance(network, PaperNetwork):
-            network.save(file, about=about, licence=licence)
-        else:
-            assert isinstance(network, QuestNetwork)
+        about = f"{start.about}quest train --stage {self.stage}, {taught.about}"
+        licence = licence_after(start.licence, taught.sources)
+        if self.stage == "find":
             save_network(file, network, settings=start.settings, about=about, licence=licence)
+        else:
+            network.save(file, about=about, licence=licence)
         return file
 
 
 @dataclass(frozen=True)
 class _Start:
-    """What to train; settings of the tracker to store with it, as JSON text; licence."""
+    """The network to train; settings of the tracker to store with it, as JSON text; licence."""
 
-    network: WindowNetwork[DecoderConfig]
+    network: Any
     settings: str = ""
     about: str = ""
     licence: str = ""
+
+
+@dataclass(frozen=True)
+class _Taught:
+    """What is learned and from what, in words too."""
+
+    objective: Objective
+    training: Sampler
+    validation: Sampler
+    about: str
+    sources: frozenset[str]
 
 
 def _columns() -> tuple[ProgressColumn, ...]:
@@ -256,15 +278,6 @@ def _columns() -> tuple[ProgressColumn, ...]:
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
-
-
-def _feature_bar(progress: Progress) -> Callable[[int, int, int], None]:
-    bar = progress.add_task("features", total=None)
-
-    def prepared(done: int, total: int, frames: int) -> None:
-        progress.update(bar, completed=done, total=total, description=f"features of {frames} frames")
-
-    return prepared
 
 
 def _training_bar(progress: Progress, steps: int) -> Callable[[StepReport], None]:

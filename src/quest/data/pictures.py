@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
-from quest.errors import RecordingError
+from quest.errors import InputError, RecordingError
+
+PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+"""Endings of files that are pictures."""
 
 TURNED = (
     "EXIF or the video's header says that the colours are to be turned, and their depth is not turned with them; "
@@ -22,6 +27,19 @@ def is_turned(image: Image.Image) -> bool:
 def upright(image: Image.Image) -> Image.Image:
     """The image as EXIF says that it is to be seen."""
     return ImageOps.exif_transpose(image)
+
+
+def read_picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours of a picture, upright.
+
+    Raises:
+        InputError: it cannot be read.
+    """
+    try:
+        with Image.open(path) as image:
+            return colours_of(upright(image), f"picture {path}")
+    except OSError as error:  # what is no picture, too
+        raise InputError(f"picture {path}: cannot be read ({error}); copy it again") from error
 
 
 def colours_of(image: Image.Image, where: str) -> UInt8[np.ndarray, "H W 3"]:

@@ -1,116 +1,164 @@
-"""Choose the threshold of discovery on validation objects.
+"""Fit the finder's scores, so that 0.7 is right in 70 of 100, and choose the threshold of discovery.
 
-It is the one with the best F2 in the first frame, in which recall counts twice as much as precision (a false entity
-costs one more track, a missed one is not followed at all), in the mean over the sources of the objects.
+Both on labelled pictures and on simulated takes of validation objects, each of which counts the same however many
+answers it has. Scores become probabilities by a slope and a shift of their log odds (Platt, *Probabilistic outputs for
+support vector machines*, 1999), the threshold is the one with the best F1 in their mean.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from scipy.optimize import minimize
 
 from quest.errors import ConfigError
+from quest.evaluation.real.measures import score_picture
+from quest.evaluation.real.run import discover
+from quest.evaluation.real.sets import Picture
 from quest.evaluation.selection import Chosen
-from quest.geometry import transform
-from quest.model.discovery import Peaks, match_peaks
 from quest.track import Tracker
+from quest.track.settings import TrackerConfig
 from quest.types import LABELS, Take
 
-_BETA = 2.0
+_NEAR = 16 / 640
+"""An answer in a take is right at its entity's outline, or this close to it, in widths of the picture."""
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What was found somewhere."""
+
+    logit: Float[np.ndarray, " A"]
+    """Of each answer, as the network says it."""
+    right: Bool[np.ndarray, " A"]
+    """Which of them are right, and the best of their entity."""
+    present: int
+    """How many entities there are."""
 
 
 @dataclass(frozen=True)
 class Tuned:
     """What came of it."""
 
-    slot_bias: float
-    """Bias of the affordance logit."""
-    precision: float
-    """Of discovery with it."""
-    recall: float
-    """Of discovery with it."""
+    config: TrackerConfig
+    """With the slope, shift and threshold."""
+    of: tuple[str, ...]
+    """``pictures`` and ``takes``, those that there are."""
+    precision: tuple[float, ...]
+    """Of discovery in each."""
+    recall: tuple[float, ...]
+    """The same."""
 
 
-def discovery_bias(tracker: Tracker, takes: Chosen) -> Tuned:
-    """Bias of the affordance logit at which discovery in the first frame has its best F2; its precision and recall.
-
-    A slot counts as right if an unclaimed visible entity of its label lies within 0.1 of it in 3D. Where none is, no
-    threshold is best, and the bias stays what it is. F2, precision and recall are means over the sources of the objects
-    (PartNet-Mobility, procedural, your own), each of which counts the same however many takes it has.
+def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
+    """Fit scores and threshold.
 
     Args:
-        tracker: with the network, and the bias to start from.
-        takes: stores with takes of validation objects.
+        tracker: with the network, and the size at which it looks.
+        pictures: labelled ones that did not teach.
+        takes: stores with takes of validation objects, of which the first frames are used.
 
     Raises:
-        ConfigError: a take is not of a validation object, or there are none.
+        ConfigError: there is nothing to choose by, nothing was found, or a take is not of a validation object.
     """
     parts = [item for _, chosen in takes for item in chosen.items()]
     wrong = [name for name, part in parts if part != "validation"]
-    if wrong or not parts:
-        raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3] or 'none'}")
-    seen: dict[str, _Found] = {}
+    if wrong:
+        raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3]}")
+    plain = Tracker(tracker.network, replace(tracker.config, gain=1.0, bias=0.0), device=tracker.device)
+    found = {"pictures": _in_pictures(plain, pictures)} if pictures else {}
+    found |= {"takes": _in_takes(plain, takes)} if parts else {}
+    sets = list(found.values())
+    if not any(answers.right.any() for answers in sets):
+        raise ConfigError(
+            "tuning: nothing was found rightly in the pictures and takes given; train first, or give more"
+        )
+    gain, bias = _fit(sets)
+    threshold = _best_threshold([replace(a, logit=gain * a.logit + bias) for a in sets])
+    rates = [_rates(replace(a, logit=gain * a.logit + bias), np.array([threshold])) for a in sets]
+    config = replace(tracker.config, gain=gain, bias=bias, threshold=float(1 / (1 + np.exp(-threshold))))
+    precision, recall = zip(*((float(p[0]), float(r[0])) for p, r in rates), strict=True)
+    return Tuned(config, tuple(found), precision, recall)
+
+
+def _in_pictures(tracker: Tracker, pictures: Sequence[Picture]) -> Answers:
+    scored = []
+    for picture in pictures:
+        clip = picture.read()
+        scored.append(score_picture(picture, discover(tracker, clip)))
+    return Answers(
+        np.concatenate([s.score for s in scored]),
+        np.concatenate([s.first for s in scored]),
+        sum(len(s.found) for s in scored),
+    )
+
+
+def _in_takes(tracker: Tracker, takes: Chosen) -> Answers:
+    logits: list[float] = []
+    right: list[bool] = []
+    present = 0
     for store, name in ((store, name) for store, chosen in takes for name in chosen):
         take = store.read(name, frames=slice(0, 1))
-        found = seen.setdefault(take.info.source, _Found())
         for view in range(len(take.views)):
             clip = take.views[view].clip
-            found.add(tracker.candidates(clip.camera, clip.frame(0)), take, view)
-    sources = [found for found in seen.values() if found.present]
-    if not any(any(found.hits) for found in sources):
-        return Tuned(tracker.config.slot_bias, 0.0, 0.0)
-    logits = np.unique([logit for found in sources for logit in found.logits])[::-1]
-    rates = np.array([found.at(logits) for found in sources])
-    precision, recall = rates.mean(axis=0)
-    best = int(np.mean([_f_beta(*each) for each in rates], axis=0).argmax())
-    threshold = logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2
-    return Tuned(-float(threshold), float(precision[best]), float(recall[best]))
+            found = tracker.find(clip.camera, clip.frame(0))
+            found = found.select(np.isin(found.labels, LABELS))
+            hits, seen = _match(take, view, found.uv_px)
+            logits, right, present = logits + found.logit.tolist(), right + hits, present + seen
+    return Answers(np.array(logits), np.array(right, bool), present)
 
 
-@dataclass
-class _Found:
-    """What was found in the first frames of takes of one source."""
-
-    logits: list[float] = field(default_factory=list)
-    """Of all candidates."""
-    hits: list[bool] = field(default_factory=list)
-    """Which of them are right."""
-    present: int = 0
-    """How many entities are seen."""
-
-    def add(self, peaks: Peaks, take: Take, view: int) -> None:
-        """Candidates of one view."""
-        hits, present = _match(take, view, peaks)
-        self.logits += peaks.logit.tolist()
-        self.hits += hits
-        self.present += present
-
-    def at(self, thresholds: Float[np.ndarray, " N"]) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-        """Precision and recall if what is not below a threshold counts; thresholds fall."""
-        order = np.argsort(-np.array(self.logits))
-        right = np.concatenate([[0], np.cumsum(np.array(self.hits, int)[order])])
-        taken = np.searchsorted(-np.array(self.logits)[order], -thresholds, side="right")
-        return right[taken] / np.maximum(taken, 1), right[taken] / self.present
-
-
-def _f_beta(precision: Float[np.ndarray, " N"], recall: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
-    total = _BETA**2 * precision + recall
-    return np.divide((1 + _BETA**2) * precision * recall, total, out=np.zeros_like(total), where=total > 0)
-
-
-def _match(take: Take, view: int, peaks: Peaks) -> tuple[list[bool], int]:
-    """Which candidates of a view's first frame are right, and how many entities are seen in it."""
+def _match(take: Take, view: int, uv_px: Float[np.ndarray, "A 2"]) -> tuple[list[bool], int]:
+    """Which answers, best first, are right in a take's first frame, and how many entities are seen in it."""
     truth = take.views[view]
     entities = [int(e) for e in take.tracked if truth.visible[0, e]]
-    point_m = transform(torch.from_numpy(truth.clip.cam_from_world[0]).float(), torch.from_numpy(take.point_world[0]))
-    found = match_peaks(
-        peaks.point_m.cpu(),
-        peaks.label.cpu(),
-        point_m[entities],
-        torch.tensor([LABELS.index(take.info.entities[e].label) for e in entities], dtype=torch.long),
-        half_diagonal_m=take.info.half_diagonal_m,
-    )
-    return (found >= 0).tolist(), len(entities)
+    height, width = truth.entity_id.shape[1:]
+    gap = np.linalg.norm(uv_px[:, None] - truth.uv_px[0, entities], axis=-1)
+    column, row = np.clip(uv_px.astype(int), 0, (width - 1, height - 1)).T
+    on = truth.entity_id[0, row, column][:, None] == 1 + np.array(entities, int)
+    gap = np.where(on | (gap < _NEAR * width), gap, np.inf)
+    hits = []
+    for k in range(len(gap)):
+        e = int(gap[k].argmin()) if entities else -1
+        hits.append(e >= 0 and bool(np.isfinite(gap[k, e])))
+        if hits[-1]:
+            gap[:, e] = np.inf
+    return hits, len(entities)
+
+
+def _fit(sets: Sequence[Answers]) -> tuple[float, float]:
+    """Slope and shift of least cross-entropy in the mean over sets."""
+
+    def loss(parameters: Float[np.ndarray, "2"]) -> float:
+        total = 0.0
+        for answers in sets:
+            logit = parameters[0] * answers.logit + parameters[1]
+            total += float(np.logaddexp(0, np.where(answers.right, -logit, logit)).mean()) if len(logit) else 0.0
+        return total
+
+    gain, bias = minimize(loss, np.array([1.0, 0.0]), method="BFGS").x
+    return float(gain), float(bias)
+
+
+def _best_threshold(sets: Sequence[Answers]) -> float:
+    """Log odds with the best F1 in the mean over sets."""
+    logits = np.unique(np.concatenate([answers.logit for answers in sets]))[::-1]
+    f1 = np.zeros(len(logits))
+    for answers in sets:
+        precision, recall = _rates(answers, logits)
+        f1 += 2 * precision * recall / np.maximum(precision + recall, 1e-9) / len(sets)
+    best = int(f1.argmax())
+    return float(logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2)
+
+
+def _rates(
+    answers: Answers, thresholds: Float[np.ndarray, " N"]
+) -> tuple[Float[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Precision and recall if what is not below a threshold counts; thresholds fall."""
+    order = np.argsort(-answers.logit, kind="stable")
+    right = np.concatenate([[0], np.cumsum(answers.right[order])])
+    taken = np.searchsorted(-answers.logit[order], -thresholds, side="right")
+    return right[taken] / np.maximum(taken, 1), right[taken] / max(answers.present, 1)

@@ -46,12 +46,6 @@ class Letterbox:
         return (self.size - width) // 2, (self.size - height) // 2
 
     @property
-    def picture_px(self) -> tuple[float, float, float, float]:
-        """Left, top, right and bottom edge of the image on the canvas; beyond them is padding."""
-        (left, top), (width, height) = self.pad_px, self._resized
-        return left, top, left + width, top + height
-
-    @property
     def camera(self) -> Camera:
         """Intrinsics of the canvas."""
         left, top = self.pad_px
@@ -67,10 +61,6 @@ class Letterbox:
         """Depth on the canvas, never mixed between pixels; NaN, infinite and negative depth becomes 0 (missing)."""
         clean = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
         return self._place(clean, cv2.INTER_NEAREST_EXACT)  # the plain one is off by up to half a pixel
-
-    def index(self, ids: UInt8[np.ndarray, "H W"]) -> UInt8[np.ndarray, "S S"]:
-        """Indices of links or entities on the canvas, never mixed between pixels; the padding is 0, nothing."""
-        return self._place(ids, cv2.INTER_NEAREST_EXACT)
 
     def to_canvas(self, uv_px: Float[np.ndarray, "*B 2"]) -> Float[np.ndarray, "*B 2"]:
         """Canvas pixels of source pixels."""

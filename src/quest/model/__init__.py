@@ -1,5 +1,5 @@
-"""The network: image encoder, what a frame shows, queries and their decoder, heads, presets, and files of weights.
+"""The networks: the finder and its parts, dense features, frames of the published network, and files of weights.
 
-:class:`quest.model.network.QuestNetwork` assembles them, :mod:`quest.model.config` holds the presets,
+:class:`quest.model.finder.FinderNetwork` finds what can be taken hold of, :mod:`quest.model.found` reads its maps off,
 :mod:`quest.model.weights` reads and writes trained networks.
 """

@@ -7,7 +7,7 @@ follow Oquab et al., DINOv2, TMLR 2024.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -83,22 +83,34 @@ class Encoder(nn.Module):
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
         self.register_buffer("std", torch.tensor(_STD).view(1, 3, 1, 1), persistent=False)
 
-    def forward(self, rgb: UInt8[Tensor, "B H W 3"], *, enlarge: int = 1) -> Float[Tensor, "B N D"]:
-        """Tokens of images of the configured size, row by row, without the class token.
-
-        Args:
-            rgb: the images.
-            enlarge: how many times larger to make them first, for tokens of smaller parts of them.
-        """
-        image = rgb.permute(0, 3, 1, 2).to(self.mean.dtype)
-        if enlarge > 1:
-            image = F.interpolate(image, scale_factor=enlarge, mode="bicubic", align_corners=False).clamp(0, 255)
-        x = self.patch((image / 255 - self.mean) / self.std).flatten(2).transpose(1, 2)
-        position = resize_position(self.position, enlarge * self.config.grid)
-        x = torch.cat((self.class_token.expand(len(x), -1, -1), x), dim=1) + position
+    def forward(self, rgb: UInt8[Tensor, "B H W 3"]) -> Float[Tensor, "B N D"]:
+        """Tokens of images of the configured size, row by row, without the class token."""
+        x, _ = self._embed(rgb.permute(0, 3, 1, 2).to(self.mean.dtype) / 255)
         for block in self.blocks:
             x = block(x)
         return self.norm(x)[:, 1:]
+
+    def depths(self, rgb: Float[Tensor, "B 3 H W"], blocks: Sequence[int]) -> Float[Tensor, "B E r c"]:
+        """Tokens after several blocks, each normalised, one after the other in the channels.
+
+        Args:
+            rgb: pictures of any size in whole patches, colours from 0 to 1.
+            blocks: indices of the blocks, which rise.
+        """
+        x, grid = self._embed(rgb)
+        read = []
+        for block in self.blocks[: blocks[-1] + 1]:
+            x = block(x)
+            read.append(x)
+        normed = [F.layer_norm(read[i][:, 1:], x.shape[-1:]) for i in blocks]
+        return torch.cat(normed, dim=-1).transpose(1, 2).unflatten(2, grid)
+
+    def _embed(self, rgb: Float[Tensor, "B 3 H W"]) -> tuple[Float[Tensor, "B N D"], tuple[int, int]]:
+        """Class token and patches with their places, and how many patches there are down and across."""
+        x = self.patch((rgb - self.mean) / self.std)
+        grid = (x.shape[-2], x.shape[-1])
+        x = torch.cat((self.class_token.expand(len(x), -1, -1), x.flatten(2).transpose(1, 2)), dim=1)
+        return x + resize_position(self.position, grid), grid
 
     def load_initial(self, state: Mapping[str, Tensor]) -> None:
         """Load weights that may have another patch size or position grid; both are resized.
@@ -123,7 +135,7 @@ class Encoder(nn.Module):
                 f"{tuple(patch.shape)} and {tuple(position.shape)}; make the file with `quest weights import-encoder`"
             )
         state["patch.weight"] = resize_patch_kernel(state["patch.weight"], self.config.patch_size)
-        state["position"] = resize_position(state["position"], self.config.grid)
+        state["position"] = resize_position(state["position"], (self.config.grid, self.config.grid))
         load_exactly(self, state, what="encoder weights")
 
 
@@ -148,14 +160,14 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], *, what: str) -
     module.load_state_dict(dict(state))
 
 
-def resize_position(position: Float[Tensor, "1 M D"], grid: int) -> Float[Tensor, "1 N D"]:
-    """Position code (class token first) on another square grid, bicubic."""
+def resize_position(position: Float[Tensor, "1 M D"], grid: tuple[int, int]) -> Float[Tensor, "1 N D"]:
+    """Position code (class token first) of a square grid on one of other rows and columns, bicubic."""
     head, rest = position[:, :1], position[:, 1:]
     side = round(rest.shape[1] ** 0.5)
-    if side == grid:
+    if (side, side) == grid:
         return position
     square = rest.reshape(1, side, side, -1).permute(0, 3, 1, 2)
-    square = F.interpolate(square, size=(grid, grid), mode="bicubic", align_corners=False)
+    square = F.interpolate(square, size=grid, mode="bicubic", align_corners=False)
     return torch.cat((head, square.permute(0, 2, 3, 1).flatten(1, 2)), dim=1)
 
 

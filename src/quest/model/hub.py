@@ -31,7 +31,7 @@ from huggingface_hub.errors import HTTPError as TransportError  # pyright: ignor
 
 from quest.errors import WeightsError
 from quest.extras import DISTRIBUTION
-from quest.model.config import NetworkConfig
+from quest.model.finder import FinderConfig
 
 FILE = "model.safetensors"
 """The file of a repository that holds the network."""
@@ -172,7 +172,7 @@ def model_card(
     data: Mapping[str, Any],
     *,
     text: str | None,
-    config: NetworkConfig,
+    config: FinderConfig,
     about: str,
     settings: str,
     licence: str,
@@ -194,9 +194,8 @@ def model_card(
     header = ModelCardData(**{**data, **_licence(licence)}, ignore_metadata_errors=True)
     if text is None:
         rows = [
-            ("network", f"preset `{config.preset}`, {config.decoder_layers} layers of width {config.width}"),
-            ("encoder", f"ViT of depth {config.encoder.depth}, {config.encoder.image_size} px input"),
-            ("window", f"{config.window} frames"),
+            ("network", f"finder, pyramid of width {config.width}"),
+            ("encoder", f"ViT of depth {config.encoder.depth} and width {config.encoder.width}, EfficientNet-Lite0"),
             ("training", about or "not said"),
             ("licence", licence or "not said"),
             ("version", version or "not said"),

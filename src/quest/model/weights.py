@@ -14,15 +14,14 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin
 from torch import nn
 
 from quest.errors import ConfigError, WeightsError
-from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
+from quest.model.finder import FinderConfig, FinderNetwork
 from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
-from quest.model.network import QuestNetwork
 from quest.model.tensor_file import fetch_shared, leave_out, read_tensors, save_tensors
 
-FORMAT = "quest-network-2"
+FORMAT = "quest-finder-1"
 
-DEFAULTS = {"quest-s16": "quest-s16-research"}
+DEFAULTS = {"quest-s16": "quest-s16-apache"}
 """Names that leave the licence open, and which of the weights that ship they stand for."""
 
 FOLDER_FILES = (FILE, "weights.safetensors")
@@ -42,7 +41,7 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
     """Name, path or hub id that it was asked for by."""
     path: Path
     """File that it came from."""
-    network: QuestNetwork
+    network: FinderNetwork
     """In evaluation mode, on the CPU."""
     settings: str
     """Settings of the tracker that were chosen with these weights, as JSON text."""
@@ -158,7 +157,7 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
 
 def save_network(
     path: Path,
-    network: QuestNetwork,
+    network: FinderNetwork,
     *,
     settings: str,
     about: str,
@@ -264,11 +263,11 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
     if metadata.get("format") != FORMAT:
         raise WeightsError(
             f"{path}: expected a network of format {FORMAT!r}, got {metadata.get('format')!r}; "
-            "make it with `quest train` (networks of format 1 saw no relief; encoder weights alone are no network; "
-            "the published network, preset paper, is read by `quest.load` and `quest eval`)"
+            "make it with `quest train --stage find` (encoder weights alone are no network; the published network, "
+            "preset paper, is read by `quest eval`)"
         )
     try:
-        network = QuestNetwork(NetworkConfig.from_json(metadata["config"]))
+        network = FinderNetwork(FinderConfig.from_json(metadata["config"]))
     except (ConfigError, KeyError) as error:
         raise WeightsError(f"{path}: {error}; the file is of another version of quest") from error
     state |= fetch_shared(path, metadata, shipped_weights())

@@ -36,34 +36,74 @@ protocol that gives no point asks for them, so a linear layer tells them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+import json
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
-from quest.errors import WeightsError
-from quest.model.config import DecoderConfig
-from quest.model.decoder import DecoderLayer
-from quest.model.encoder import load_exactly
-from quest.model.flow_head import FlowHead
-from quest.model.network import WindowNetwork
-from quest.model.observation import FrameBatch
+from quest.errors import ConfigError, WeightsError
+from quest.model.encoder import Encoder, EncoderConfig, load_exactly
+from quest.model.frames import FrameBatch
 from quest.model.tensor_file import read_tensors, save_tensors
+from quest.paper.decoder import DecoderLayer
+from quest.paper.flow_head import FlowHead
 from quest.types import LABELS
 
 FORMAT = "quest-paper-1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperConfig(DecoderConfig):
+class PaperConfig:
     """Shapes of the published network; the defaults are the published ones."""
 
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """The image encoder."""
+    window: int = 4
+    """T, frames that the decoder sees together."""
+    cell_px: int = 8
+    """Side of the cells over whose depths the reference frame takes its median, pixels of the network's input."""
     width: int = 384
+    """Channels inside the decoder."""
     heads: int = 4
+    """Attention heads of the decoder."""
     decoder_layers: int = 2
+    """Layers of the decoder."""
     slots: int = 8
+    """K, learned queries."""
+    flow: bool = False
+    """Whether there is a flow head, which stage 2 trains."""
+
+    def __post_init__(self) -> None:
+        if self.width % self.heads:
+            raise ConfigError(f"network: width {self.width} must be a multiple of heads {self.heads}")
+        if self.encoder.image_size % self.encoder.patch_size or self.encoder.width % self.encoder.heads:
+            raise ConfigError(
+                f"network: expected whole patches and a width that is a multiple of heads, got {self.encoder}"
+            )
+        if min(self.cell_px, self.window, self.slots, self.decoder_layers) < 1:
+            raise ConfigError("network: cell_px, window, slots and decoder_layers must be at least 1")
+        if self.encoder.image_size % self.cell_px:
+            raise ConfigError(f"network: expected whole cells of {self.cell_px} px in {self.encoder.image_size} px")
+
+    def to_json(self) -> str:
+        """The configuration as one line, stored beside the weights."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> PaperConfig:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            ConfigError: the text is not a network configuration of this version.
+        """
+        try:
+            values = json.loads(text)
+            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ConfigError(f"network configuration cannot be read: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -90,11 +130,19 @@ class SlotAnswers:
         return SlotAnswers(*(_gather(getattr(self, f.name), slot) for f in fields(self)))
 
 
-class PaperNetwork(WindowNetwork[PaperConfig]):
-    """Maps a window of T frames to the answers of K slots in each of them."""
+class PaperNetwork(nn.Module):
+    """Maps a window of T frames to the answers of K slots in each of them.
+
+    Attributes:
+        config: its shapes.
+        encoder: of images, frozen.
+        flow: head that stage 2 trains; None without.
+    """
 
     def __init__(self, config: PaperConfig) -> None:
-        super().__init__(config)
+        super().__init__()
+        self.config = config
+        self.encoder = Encoder(config.encoder)
         d = config.width
         self.project = nn.Linear(config.encoder.width, d)
         self.place = nn.Parameter(0.02 * torch.randn(config.encoder.grid**2, d))
@@ -106,7 +154,11 @@ class PaperNetwork(WindowNetwork[PaperConfig]):
         self.norm = nn.LayerNorm(d)
         self.head = nn.Sequential(nn.LayerNorm(d), nn.Linear(d, d), nn.GELU(), nn.Linear(d, 3))
         self.label = nn.Linear(d, len(LABELS))
-        self.flow = FlowHead(d, window=config.window, points3d=False) if config.flow else None
+        self.flow = FlowHead(d, window=config.window) if config.flow else None
+
+    def encode(self, rgb: UInt8[Tensor, "B H W 3"]) -> Float[Tensor, "B N E"]:
+        """Tokens of letterboxed images; frozen while the rest trains, so they can be cached."""
+        return self.encoder(rgb)
 
     def forward(self, frames: FrameBatch) -> SlotAnswers:
         """Answers for every frame of a window; those for a frame do not depend on later ones."""
@@ -121,9 +173,8 @@ class PaperNetwork(WindowNetwork[PaperConfig]):
         b, t = features.shape[:2]
         tokens = self.token_norm(self.project(features) + self.place) + self.time[:t, None]
         x = self.queries.expand(b, t, -1, -1)
-        all_valid = torch.ones(b, x.shape[2], dtype=torch.bool, device=x.device)
         for layer in self.layers:
-            x = layer(x, tokens, all_valid)
+            x = layer(x, tokens)
         return self.norm(x)
 
     def answer(self, x: Float[Tensor, "B T K D"], frames: FrameBatch) -> SlotAnswers:
@@ -138,6 +189,19 @@ class PaperNetwork(WindowNetwork[PaperConfig]):
         uv_px = uv * self.config.encoder.image_size
         point = frames.to_reference(uv_px, frames.depth_at(uv_px))
         return SlotAnswers(x, uv, out[..., 2], self.label(x).float(), point)
+
+    def displace(self, embedding: Float[Tensor, "B T K D"]) -> Float[Tensor, "B K 3"]:
+        """Displacement of every query from the window's newest frame to the next, in units of the reference frame.
+
+        Args:
+            embedding: the queries after the decoder, oldest frame first.
+
+        Raises:
+            ConfigError: the network has no flow head.
+        """
+        if self.flow is None:
+            raise ConfigError("network: these weights have no flow head; `quest train --stage 2` adds one")
+        return self.flow(embedding)
 
     def trainable(self) -> list[nn.Parameter]:
         """Parameters of stage 1: all but the encoder and the flow head."""

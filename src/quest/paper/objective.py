@@ -13,12 +13,12 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from quest.model.observation import FrameBatch
+from quest.model.frames import FrameBatch
 from quest.paper.matching import assign_slots, slot_cost
 from quest.paper.network import PaperNetwork, SlotAnswers
 from quest.train import losses
+from quest.train.answers import RIGHT_PX, Answered
 from quest.train.losses import Loss
-from quest.train.objective import RIGHT_PX, Answered
 from quest.train.validation import WindowScores, score_windows
 from quest.train.windows import WindowSampler, WindowTruth
 

@@ -1,8 +1,7 @@
 """Tracking as published: every frame's window is decoded anew, and a query keeps the slot that it took.
 
-There are no anchors, no joints and no alarms. A slot's answer is the lifted pixel of its coordinates; what it is called
-is decided in the frame in which it is taken: whether there is an entity by its confidence, which label it has by its
-embedding.
+There are no joints and no alarms. A slot's answer is the lifted pixel of its coordinates; what it is called is decided
+in the frame in which it is taken: whether there is an entity by its confidence, which label it has by its embedding.
 """
 
 from __future__ import annotations
@@ -21,9 +20,9 @@ from torch import Tensor
 from quest.errors import InputError
 from quest.geometry import invert, transform
 from quest.geometry.letterbox import Letterbox
-from quest.model.framing import Framer
 from quest.model.precision import fast_bfloat16
 from quest.model.weights import find_weights
+from quest.paper.framing import Framer
 from quest.paper.matching import assign_slots, slot_cost
 from quest.paper.network import PaperNetwork, is_paper, read_paper
 from quest.track import Tracker
@@ -198,7 +197,7 @@ def _check(clip: Clip, queries: Sequence[Query] | None) -> None:
         if query.intent is not None:
             raise InputError(
                 f"query {query.name or query.kind!r}: the published network cannot tell what to {query.intent}; omit "
-                "the intent or use weights of the default preset"
+                "the intent or use weights of the finder"
             )
         if query.frame >= len(clip):
             raise InputError(f"clip {clip.name!r}: query at frame {query.frame}, but the clip has {len(clip)} frames")

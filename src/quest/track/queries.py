@@ -6,15 +6,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from quest.errors import InputError
-from quest.geometry.letterbox import Letterbox
-from quest.model.config import NetworkConfig
-from quest.model.discovery import Candidates, Peaks
-from quest.model.network import UNKNOWN_INTENT
+from quest.model.found import APART_PX, Found
 from quest.track.settings import TrackerConfig
-from quest.types import INTENTS, LABELS, Query
+from quest.types import LABELS, Camera, Query
 
 PATIENCE_S = 0.25
 """For how long a label or slot looks for its entity, seconds."""
@@ -71,25 +68,21 @@ class StreamQueries:
     """Asks, renames and retires the queries of one stream, and binds them to entities.
 
     Args:
-        network: configuration of the network that finds entities.
-        config: settings of tracking.
-        letterbox: between the source image and the network's input.
+        config: settings of discovery.
+        camera: intrinsics of the frames.
         queries: what to follow; None discovers entities in the first frame.
 
     Attributes:
         state: the queries.
 
     Raises:
-        InputError: a point query lies outside the image, or asks for an intent of a network that knows none.
+        InputError: a point query lies outside the image.
     """
 
-    def __init__(
-        self, network: NetworkConfig, config: TrackerConfig, letterbox: Letterbox, queries: Sequence[Query] | None
-    ) -> None:
+    def __init__(self, config: TrackerConfig, camera: Camera, queries: Sequence[Query] | None) -> None:
         self.state = QueriesState(discover=queries is None)
-        self._network = network
         self._config = config
-        self._letterbox = letterbox
+        self._camera = camera
         if isinstance(queries, Query | str):
             raise InputError(f"queries: expected a list of them, got {queries!r}")
         for query in queries or ():
@@ -99,20 +92,15 @@ class StreamQueries:
         """Ask for one more entity from a frame on; returns the query's number.
 
         Raises:
-            InputError: a point query lies outside the image or in a frame that has passed, a query asks for an intent
-                of a network that knows none, has the name of another one, or is none.
+            InputError: a point query lies outside the image or in a frame that has passed, a query has the name of
+                another one, or is none.
         """
         if not isinstance(query, Query):
             raise InputError(f"queries: expected Query.point(…), Query.semantic(…) or Query.slot(), got {query!r}")
         if query.name and query.name in self.state.names.values():
             raise InputError(f"query {query.name!r}: another query is called so already; choose another name")
-        if query.intent is not None and not self._network.intents:
-            raise InputError(
-                f"query {query.name or query.kind!r}: these weights cannot tell what to {query.intent}; leave the "
-                "intent away or use weights of the default preset"
-            )
         if query.uv_px is not None:
-            (x, y), camera = query.uv_px, self._letterbox.source
+            (x, y), camera = query.uv_px, self._camera
             if not (0 <= x <= camera.width and 0 <= y <= camera.height):
                 raise InputError(
                     f"query {query.name!r}: expected a pixel within {camera.width} x {camera.height}, "
@@ -164,7 +152,7 @@ class StreamQueries:
         return self.state.discover or any(w.until_s is None or w.until_s > now_s for w in self.state.waiting)
 
     def bind(
-        self, frame: int, now_s: float, at_px: Float[np.ndarray, "K 2"], see: Callable[[], Candidates]
+        self, frame: int, now_s: float, at_px: Float[np.ndarray, "K 2"], see: Callable[[], Found]
     ) -> Float[np.ndarray, "M 2"]:
         """Queries that find their entity in this frame join those that are followed.
 
@@ -202,61 +190,51 @@ class StreamQueries:
         return Following(waiting.number, name, label, waiting.query.intent or intent)
 
     def _among(
-        self, looking: Sequence[Waiting], at_px: Float[np.ndarray, "K 2"], candidates: Candidates
+        self, looking: Sequence[Waiting], at_px: Float[np.ndarray, "K 2"], found: Found
     ) -> tuple[list[Following], list[np.ndarray]]:
         """Discovered entities, labels and slots, and their pixels."""
         config, following = self._config, self.state.following
-        peaks, clash = candidates.peaks, candidates.clash.tolist()
-        existence = (config.slot_gain * (peaks.logit + config.slot_bias)).sigmoid().tolist()
-        label, intent = [LABELS[int(n)] for n in peaks.label], _intents(peaks)
-        canvas_px = peaks.uv.float().cpu().numpy().astype(np.float64) * self._network.encoder.image_size
-        near = self._near(canvas_px, at_px)
-        found: list[Following] = []
+        exists = 1 / (1 + np.exp(-(config.gain * found.logit + config.bias)))
+        label_p = found.label_p[:, : len(LABELS)]
+        exists = exists * label_p.sum(axis=1)
+        likeliest = [LABELS[int(i)] for i in label_p.argmax(axis=1)]
+        intent = ["lift" if p > 0.5 else "open" for p in found.lift_p]
+        near = self._near(found, at_px)
+        begun: list[Following] = []
         chosen: list[int] = []
         if self.state.discover:
-            apart = candidates.apart()[: self._network.slots]
-            chosen = [i for i in apart if existence[i] > config.slot_threshold and not any(near[i])]
+            chosen = [i for i in range(len(found)) if exists[i] > config.threshold and not near[i].any()]
+            chosen = chosen[: config.most]
             for i in chosen:
                 number = self._next_number()
-                # What is followed at the same place is the same thing under another label, or a part of it.
-                others = [f"{label[j]} {f.number}" for f, j in zip(found, chosen, strict=False) if clash[i][j]]
-                notes = ["lift"] * (intent[i] == "lift") + [f"or {other}" for other in others[:1]]
-                name = " ".join([f"{label[i]} {number}", *(f"({note})" for note in notes)])
-                found.append(Following(number, name, label[i], intent[i]))
+                name = f"{likeliest[i]} {number}" + " (lift)" * (intent[i] == "lift")
+                begun.append(Following(number, name, likeliest[i], intent[i]))
             self.state.discover = False
         for waiting in looking:
             query = waiting.query
-            fits = [
-                i
-                for i in candidates.apart(_asked_for(query, label, intent))
-                if i not in chosen
-                and not any(clash[i][j] for j in chosen if query.label in (None, label[j]))
-                and not any(close and _same(query, f) for close, f in zip(near[i], following, strict=True))
-            ]
-            if fits and existence[fits[0]] > config.prompt_threshold:
-                chosen.append(fits[0])
-                name = query.name or f"{label[fits[0]]} {waiting.number}"
-                found.append(self._begin(waiting, name, label[fits[0]], intent[fits[0]]))
-        return found, list(self._letterbox.to_source(canvas_px[chosen]))
+            fits = exists.copy() if query.label is None else exists * label_p[:, LABELS.index(query.label)]
+            if query.intent is not None:
+                fits *= found.lift_p if query.intent == "lift" else 1 - found.lift_p
+            taken = near & np.array([_same(query, f) for f in following], bool)
+            fits[taken.any(axis=1)] = 0
+            fits[chosen] = 0
+            best = int(fits.argmax()) if len(fits) else -1
+            if best >= 0 and fits[best] > config.prompt_threshold:
+                chosen.append(best)
+                label = query.label or likeliest[best]
+                begun.append(self._begin(waiting, query.name or f"{label} {waiting.number}", label, intent[best]))
+        return begun, list(found.uv_px[chosen])
 
-    def _near(self, canvas_px: Float[np.ndarray, "N 2"], at_px: Float[np.ndarray, "K 2"]) -> list[list[bool]]:
-        """For every peak, which queries follow what is seen there."""
-        gap_px = np.linalg.norm(canvas_px[:, None] - self._letterbox.to_canvas(at_px), axis=-1)
-        return (gap_px < self._config.slot_radius_cells * self._network.cell_px).tolist()
-
-
-def _asked_for(query: Query, label: Sequence[str], intent: Sequence[str | None]) -> list[int]:
-    """The peaks that a prompt may mean."""
-    return [i for i in range(len(label)) if query.label in (None, label[i]) and query.intent in (None, intent[i])]
+    def _near(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "N K"]:
+        """Which queries follow what was found: they are in its box, or close to it."""
+        apart_px = APART_PX * max(self._camera.width, self._camera.height) / self._config.size_px
+        low, high = found.box_px[:, None, :2], found.box_px[:, None, 2:]
+        inside = ((at_px >= low) & (at_px <= high)).all(axis=-1)
+        return inside | (np.linalg.norm(found.uv_px[:, None] - at_px, axis=-1) < apart_px)
 
 
 def _same(query: Query, following: Following) -> bool:
-    """Whether what another query follows, at the place of a prompt's peak, may be what the prompt means."""
+    """Whether what another query follows, at the same place, may be what a query means."""
     if query.label is not None and following.label not in (None, query.label):
         return False
     return query.intent in (None, following.intent or "open")
-
-
-def _intents(peaks: Peaks) -> list[str | None]:
-    """What each peak is for; None where the network does not tell."""
-    return [None if n == UNKNOWN_INTENT else INTENTS[n] for n in peaks.intent.tolist()]

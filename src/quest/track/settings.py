@@ -1,12 +1,11 @@
-"""What discovery is told besides its weights; chosen on validation objects and stored with the weights."""
+"""What discovery is told besides its weights; chosen on validation data and stored with the weights."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 from quest.errors import WeightsError
-from quest.model.discovery import RADIUS_CELLS
 
 REVISION = 10
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
@@ -16,16 +15,18 @@ REVISION = 10
 class TrackerConfig:
     """Settings of discovery."""
 
-    slot_bias: float = 0.0
-    """Added to the affordance logit, so that slots worth keeping have a confidence above one half."""
-    slot_gain: float = 1.0
-    """Multiplies the affordance logit."""
-    slot_threshold: float = 0.5
-    """Probability above which discovery takes a slot."""
+    gain: float = 1.0
+    """Multiplies the finder's logits ..."""
+    bias: float = 0.0
+    """... and is added to them, so that they are log odds of being right."""
+    threshold: float = 0.5
+    """Probability above which discovery follows what was found."""
     prompt_threshold: float = 0.2
-    """Probability above which a prompt takes a slot; lower, because the user says it is there."""
-    slot_radius_cells: float = RADIUS_CELLS
-    """Peaks of one label closer than this are one slot."""
+    """Probability above which a label or slot is bound; lower, because the user says that it is there."""
+    size_px: int = 640
+    """Longer side of the picture that the finder sees, pixels."""
+    most: int = 32
+    """Most entities that discovery follows."""
 
     def to_json(self) -> str:
         """One line, stored with the weights."""
@@ -33,13 +34,14 @@ class TrackerConfig:
 
     @classmethod
     def from_json(cls, text: str) -> TrackerConfig:
-        """Read what :meth:`to_json` wrote; settings of a tracker before that this one does not have are left out.
+        """Read what :meth:`to_json` wrote.
 
         Raises:
             WeightsError: the text holds no settings.
         """
         try:
-            stored = json.loads(text).items()
-            return cls(**{name: float(value) for name, value in stored if name in cls.__dataclass_fields__})
-        except (json.JSONDecodeError, TypeError, ValueError, AttributeError) as error:
+            stored = {name: float(value) for name, value in json.loads(text).items()}
+            whole = {name: int(stored.pop(name)) for name in ("size_px", "most") if name in stored}
+            return replace(cls(**stored), **whole)  # type: ignore[arg-type]
+        except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise WeightsError(f"settings stored with the weights cannot be read: {error}") from error

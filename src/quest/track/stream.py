@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, UInt8
 
 from quest.filter import step as filtering
@@ -14,10 +13,10 @@ from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
 from quest.filter.step import Answer, FilterState
 from quest.filter.view import View, move
-from quest.model.network import QuestNetwork
+from quest.model.finder import FinderNetwork
+from quest.model.found import find
 from quest.model.xfeat import XFeat
 from quest.monitor import Alarm, Budget, Calibration, Inputs, Monitor, MonitorState, probability
-from quest.track.finder import Finder
 from quest.track.preprocess import Arrival, Prepared, Preprocessor, PreprocessorState, to_picture
 from quest.track.queries import QueriesState, StreamQueries
 from quest.track.reasons import reason
@@ -64,10 +63,9 @@ class Stream:
         network: finds entities, in evaluation mode.
         features: dense features, by which the filter finds again what it follows.
         noise: parameters of the filter.
-        config: settings of tracking.
+        config: settings of discovery.
         camera: intrinsics of the frames.
         queries: what to follow; None discovers entities in the first frame.
-        device: where the networks run.
         calibrations: of the monitor, by what frames bring.
         budget: how often alarms may be false; None for no alarms.
 
@@ -77,14 +75,13 @@ class Stream:
 
     def __init__(
         self,
-        network: QuestNetwork,
+        network: FinderNetwork,
         features: XFeat,
         noise: Noise,
         config: TrackerConfig,
         camera: Camera,
         queries: Sequence[Query] | None,
         *,
-        device: torch.device,
         calibrations: Mapping[Inputs, Calibration],
         budget: Budget | None,
     ) -> None:
@@ -93,8 +90,8 @@ class Stream:
         self._config = config
         self._calibrations = calibrations
         self._preprocessor = Preprocessor(camera)
-        self._finder = Finder(network, camera, device=device)
-        self._queries = StreamQueries(network.config, config, self._finder.letterbox, queries)
+        self._network = network
+        self._queries = StreamQueries(config, camera, queries)
         self._monitor = None
         if budget is not None and calibrations:
             first = next(iter(calibrations.values()))
@@ -216,7 +213,7 @@ class Stream:
         at_px = filtering.read_off(state, self._noise).uv_px
         new_px = self._queries.bind(
             memory.frame - 1, preprocessor.state.now_s, at_px,
-            lambda: self._finder.find(rgb, frame.depth_m, radius_cells=self._config.slot_radius_cells),
+            lambda: find(self._network, rgb, frame.depth_m, size_px=self._config.size_px),
         )  # fmt: skip
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
         if self._monitor is not None:

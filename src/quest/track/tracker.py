@@ -16,12 +16,11 @@ from quest.data.recording import read_recording
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
-from quest.model.discovery import Peaks
-from quest.model.network import QuestNetwork
+from quest.model.finder import FinderNetwork
+from quest.model.found import Found, find
 from quest.model.weights import load_network
 from quest.model.xfeat import XFeat
 from quest.monitor import Budget, Calibration, Inputs, read_calibrations
-from quest.track.finder import Finder
 from quest.track.preprocess import NO_DEPTH_FLAG, Preprocessor
 from quest.track.saving import load as restored
 from quest.track.saving import save
@@ -74,7 +73,7 @@ class Tracker:
 
     def __init__(
         self,
-        network: QuestNetwork,
+        network: FinderNetwork,
         config: TrackerConfig,
         *,
         device: torch.device,
@@ -124,17 +123,19 @@ class Tracker:
             self.config,
             camera,
             queries,
-            device=self.device,
             calibrations=self.calibrations,
             budget=None if alpha is None else Budget(alpha, alpha_frames),
         )
 
-    def candidates(self, camera: Camera, frame: Frame) -> Peaks:
-        """What discovery would choose from in a frame, whatever its score.
+    def find(self, camera: Camera, frame: Frame) -> Found:
+        """What can be taken hold of in a frame, however unlikely; nothing is followed.
 
         Args:
             camera: intrinsics of the frame.
             frame: the frame.
+
+        Returns:
+            Best first; its ``logit`` is calibrated: the log odds of being right.
 
         Raises:
             InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
@@ -142,10 +143,8 @@ class Tracker:
         preprocessor = Preprocessor(camera)
         preprocessor.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
         depth_m = preprocessor.prepare(frame.rgb, frame.depth_m, frame.cam_from_world).depth_m
-        found = Finder(self.network, camera, device=self.device).find(
-            frame.rgb, depth_m, radius_cells=self.config.slot_radius_cells
-        )
-        return found.peaks.select(found.apart()[: self.network.config.slots])
+        found = find(self.network, frame.rgb, depth_m, size_px=self.config.size_px)
+        return replace(found, logit=self.config.gain * found.logit + self.config.bias)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""

@@ -1,4 +1,5 @@
-"""Training: windows from prepared features, losses of stage 1, the loop, checkpoints, and the score that chooses.
+"""Training: the one loop with its checkpoints and losses, and what it learns from.
 
-:func:`quest.train.dataset.open_dataset` prepares windows, :func:`quest.train.loop.fit` is the one loop.
+:func:`quest.train.loop.fit` is the loop. :mod:`quest.train.finding` is how the finder learns;
+:func:`quest.train.dataset.open_dataset` prepares windows of takes for the published network.
 """

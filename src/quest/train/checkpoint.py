@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import UInt8
@@ -18,7 +19,6 @@ from safetensors.torch import load_file
 from torch import nn
 
 from quest.errors import WeightsError
-from quest.model.config import DecoderConfig
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import save_tensors
 
@@ -135,7 +135,17 @@ def _load_optimizer(
         ) from error
 
 
-def check_same_run(progress: Progress, config: DecoderConfig, objective: str, begun: str, folder: Path) -> None:
+@runtime_checkable
+class Config(Protocol):
+    """What determines the shapes of a network."""
+
+    @classmethod
+    def from_json(cls, text: str) -> Config:
+        """Read what it was stored as."""
+        ...
+
+
+def check_same_run(progress: Progress, config: Config, objective: str, begun: str, folder: Path) -> None:
     """Refuse to resume with another network or objective, or from other weights: what is not trained is kept too.
 
     Raises:

@@ -5,21 +5,41 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import torch
 
-from quest.data.mirror import mirrored_name
 from quest.data.split import split_of
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, WeightsError
-from quest.model.config import DecoderConfig
-from quest.model.network import WindowNetwork
+from quest.model.encoder import Encoder
 from quest.train.feature_cache import FeatureCache
-from quest.train.windows import WindowConfig, WindowSampler
+from quest.train.settings import WindowConfig
+from quest.train.windows import WindowSampler, WindowShape
 from quest.types import TakeInfo
 
 PARTNET_TERMS = "research use only for the PartNet-Mobility objects that taught"
 """What the licence of weights says beside, if such objects taught."""
+
+
+@runtime_checkable
+class EncodingNetwork(Protocol):
+    """A network with an image encoder."""
+
+    @property
+    def encoder(self) -> Encoder:
+        """Of images, frozen."""
+        ...
+
+
+@runtime_checkable
+class WindowNetwork(EncodingNetwork, Protocol):
+    """A network that looks at windows of frames."""
+
+    @property
+    def config(self) -> WindowShape:
+        """What the windows are like."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -43,27 +63,18 @@ class _Wanted:
     store: TakeStore
     name: str
     part: str
-    mirrored: bool
     source: str
-
-    @property
-    def entry(self) -> str:
-        """Its name in the feature cache."""
-        return mirrored_name(self.name) if self.mirrored else self.name
 
 
 def open_dataset(
-    network: WindowNetwork[DecoderConfig],
+    network: WindowNetwork,
     *,
     stores: Sequence[str | Path],
     validation_stores: Sequence[str | Path],
-    mirrored_stores: Sequence[str | Path] = (),
     cache: Path,
     windows: WindowConfig,
     device: torch.device,
     report: Callable[[int, int, int], None],
-    anchors_only: bool = False,
-    sources: Collection[str] | None = None,
 ) -> Dataset:
     """Select takes by the object split and prepare their features.
 
@@ -75,55 +86,43 @@ def open_dataset(
         network: network with the encoder that the features come from.
         stores: take stores, folders or URLs.
         validation_stores: take stores to choose by; may be empty.
-        mirrored_stores: take stores whose training takes teach by their mirror images; one that is in ``stores`` too
-            teaches both ways.
         cache: folder of the feature cache.
         windows: how windows are drawn.
         device: where the encoder runs.
         report: told takes done, takes in all, frames so far.
-        anchors_only: whether windows are anchor frames alone, for the affordance map.
-        sources: of the takes that teach (``partnet-mobility``, ``procedural``, ``own``); all by default
 
     Raises:
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
     """
     wanted: list[_Wanted] = []
-    for folders, role, mirrored in (
-        (stores, "train", False),
-        (mirrored_stores, "train", True),
-        (validation_stores, "validation", False),
-    ):
+    for folders, role in ((stores, "train"), (validation_stores, "validation")):
         for folder in folders:
             store = TakeStore(folder)
             for name, info in store.infos().items():
-                part = _part(info)
+                part = part_of(info)
                 if part == "unlisted":
                     part = role if validation_stores else "none"
-                teaches = part == "train" == role and (sources is None or info.source in sources)
-                chooses = part == "validation" and not mirrored and (role == "validation" or not validation_stores)
+                teaches = part == "train" == role
+                chooses = part == "validation" and (role == "validation" or not validation_stores)
                 if teaches or chooses:
-                    wanted.append(_Wanted(store, name, part, mirrored, info.source))
-    takes = {part: [w.entry for w in wanted if w.part == part] for part in ("train", "validation")}
+                    wanted.append(_Wanted(store, name, part, info.source))
+    takes = {part: [w.name for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
         if not found:
             raise ConfigError(
                 f"training: no {part} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
                 "name a store of your own objects with --validation"
             )
-    names = [w.entry for w in wanted]
+    names = [w.name for w in wanted]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ConfigError(f"training: takes {', '.join(twice[:3])} are wanted twice; name each take in one store only")
-    features = FeatureCache(cache, network.config, network.encoder)
+    features = FeatureCache(cache, network.encoder)
     frames = 0
     for done, w in enumerate(wanted, start=1):
-        built = features.build(w.store, [w.name], device=device, mirrored=w.mirrored, enlarged=anchors_only)
-        frames += sum(built)
+        frames += sum(features.build(w.store, [w.name], device=device))
         report(done, len(wanted), frames)
-    samplers = {
-        part: WindowSampler(features.views(found), network.config, windows, anchors_only=anchors_only)
-        for part, found in takes.items()
-    }
+    samplers = {part: WindowSampler(features.views(found), network.config, windows) for part, found in takes.items()}
     return Dataset(
         samplers["train"],
         samplers["validation"],
@@ -139,7 +138,7 @@ def licence_after(licence: str, sources: Collection[str]) -> str:
     return f"{licence}, {PARTNET_TERMS}"
 
 
-def load_initial_encoder(network: WindowNetwork[DecoderConfig], path: Path) -> None:
+def load_initial_encoder(network: EncodingNetwork, path: Path) -> None:
     """Load the encoder's initial weights from a safetensors file.
 
     Raises:
@@ -159,7 +158,8 @@ def load_initial_encoder(network: WindowNetwork[DecoderConfig], path: Path) -> N
     network.encoder.load_initial(state)
 
 
-def _part(info: TakeInfo) -> str:
+def part_of(info: TakeInfo) -> str:
+    """The part of the split that an object is in; ``unlisted`` if it is in none."""
     try:
         return split_of(info)
     except ObjectError:

@@ -21,18 +21,15 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Int8, UInt8, UInt16
 
-from quest.data.mirror import mirror_take, mirrored_name
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.geometry.letterbox import Letterbox
-from quest.model.config import DecoderConfig
 from quest.model.encoder import Encoder
-from quest.model.observation import cell_depth
 from quest.model.precision import fast_bfloat16
 from quest.model.weights import weights_digest
-from quest.types import GRIPS, LABELS, Camera, Take
+from quest.types import LABELS, Camera, Take
 
-_VERSION = 1
+_VERSION = 2
 DEPTH_UNIT_M = 1e-4
 """What depth is stored in, metres."""
 _LEFT_AFTER_S = 3600.0
@@ -87,29 +84,9 @@ class CachedView:
         return self._map("features")
 
     @property
-    def enlarged(self) -> Float16[np.ndarray, "T C E"]:
-        """Tokens of the images at twice their size, if they were asked for when the features were prepared."""
-        return self._map("enlarged")
-
-    @property
-    def owner(self) -> Int8[np.ndarray, "T C"]:
-        """Which entity each cell is a part of (see :func:`owner_of`), if enlarged tokens were asked for."""
-        return self._map("owner")
-
-    @property
-    def rgb(self) -> UInt8[np.ndarray, "T S S 3"]:
-        """Letterboxed colours."""
-        return self._map("rgb")
-
-    @property
     def depth(self) -> UInt16[np.ndarray, "T S S"]:
         """Letterboxed depth in units of 0.1 mm, 0 where missing."""
         return self._map("depth")
-
-    @property
-    def cell_depth_m(self) -> Float32[np.ndarray, "T C C"]:
-        """Near depth of each cell."""
-        return self._map("cell_depth_m")
 
     def _map(self, name: str) -> np.ndarray:
         array = np.load(self.folder / f"{name}.npy", mmap_mode="r", allow_pickle=False)
@@ -121,7 +98,6 @@ class CachedView:
         return array
 
 
-_MAPPED = ("features", "rgb", "depth", "cell_depth_m")
 _READ = ("cam_from_world", "uv_px", "visible", "point_world", "label", "revolute", "axis_world")
 
 
@@ -130,54 +106,34 @@ class FeatureCache:
 
     Args:
         root: folder of the cache; the entries of this encoder are in one of its folders.
-        config: network that will read it.
         encoder: encoder with its initial weights.
     """
 
-    def __init__(self, root: Path, config: DecoderConfig, encoder: Encoder) -> None:
-        self.config = config
+    def __init__(self, root: Path, encoder: Encoder) -> None:
         self.encoder = encoder.eval()
-        layout = json.dumps([_VERSION, asdict(config.encoder), config.cell_px])
+        layout = json.dumps([_VERSION, asdict(encoder.config)])
         self.encoder_hash = weights_digest(encoder, beside=layout)
         self.root = root / self.encoder_hash[:12]
 
-    def build(
-        self,
-        store: TakeStore,
-        names: list[str],
-        *,
-        device: torch.device,
-        mirrored: bool = False,
-        enlarged: bool = False,
-    ) -> Iterator[int]:
+    def build(self, store: TakeStore, names: list[str], *, device: torch.device) -> Iterator[int]:
         """Make what is missing or stale; yields the number of frames of every view that is ready.
 
         Args:
             store: where the takes are.
             names: takes to prepare.
             device: where the encoder runs.
-            mirrored: prepare their mirror images instead (see :func:`quest.data.mirror.mirror_take`).
-            enlarged: prepare what the affordance map is learned from too: tokens of the images at twice their size,
-                four times the space and five times the work, and which entity each cell is a part of.
         """
         self.root.mkdir(parents=True, exist_ok=True)
         self.encoder.to(device)
         for name in names:
             stamp = {"encoder": self.encoder_hash, "take": store.data_hash(name)}
-            entries = self._entries(mirrored_name(name) if mirrored else name)
+            entries = self._entries(name)
             if not self._complete(entries, stamp):
                 for entry in entries:  # also of views that the take no longer has
                     _remove(entry)
-                take = _read(store, name, mirrored)
+                take = store.read(name)
                 entries = [self._write(take, view, stamp, device) for view in range(len(take.views))]
-            if enlarged and not all((entry / "owner.npy").exists() for entry in entries):
-                take = _read(store, name, mirrored)
-                for entry in entries:
-                    view = int(entry.name.rpartition("-v")[2])
-                    _save(entry, "owner", owner_of(take, view, self.config))
             for entry in entries:
-                if enlarged and not (entry / "enlarged.npy").exists():
-                    self._enlarge(entry, device)
                 yield len(np.load(entry / "visible.npy", mmap_mode="r"))
 
     def views(self, names: list[str]) -> list[CachedView]:
@@ -202,11 +158,11 @@ class FeatureCache:
             metas = [json.loads((entry / "meta.json").read_text()) for entry in entries]
         except (OSError, ValueError):  # what a killed removal left
             return False
-        return bool(metas) and all(m["stamp"] == stamp and m.get("views", len(metas)) == len(metas) for m in metas)
+        return bool(metas) and all(m["stamp"] == stamp and m["views"] == len(metas) for m in metas)
 
     def _write(self, take: Take, view: int, stamp: dict[str, str], device: torch.device) -> Path:
         clip, truth, tracked = take.views[view].clip, take.views[view], take.tracked
-        box = Letterbox(clip.camera, self.config.encoder.image_size)
+        box = Letterbox(clip.camera, self.encoder.config.image_size)
         rgb = np.stack([box.rgb(image) for image in clip.rgb])
         depth_m = np.zeros(rgb.shape[:3], np.float32)
         if clip.depth_m is not None:
@@ -217,9 +173,7 @@ class FeatureCache:
         axis[moving] = take.joint_axis[0, [j for j in joints if j >= 0]].reshape(-1, 6)
         arrays = {
             "features": encode_images(self.encoder, rgb, device=device),
-            "rgb": rgb,
             "depth": np.clip(np.rint(depth_m / DEPTH_UNIT_M), 0, 65535).astype(np.uint16),
-            "cell_depth_m": cell_depth(torch.from_numpy(depth_m), self.config.cell_px).numpy(),
             "cam_from_world": clip.cam_from_world.astype(np.float32),
             "uv_px": box.to_canvas(truth.uv_px[:, tracked]).astype(np.float32),
             "visible": truth.visible[:, tracked],
@@ -242,16 +196,12 @@ class FeatureCache:
                     shutil.rmtree(left, ignore_errors=True)
         partial = self.root / f".partial-{entry.name}.{os.getpid()}"
         partial.mkdir()
-        for name in _MAPPED + _READ:
-            np.save(partial / f"{name}.npy", arrays[name], allow_pickle=False)
+        for name, array in arrays.items():
+            np.save(partial / f"{name}.npy", array, allow_pickle=False)
         (partial / "meta.json").write_text(json.dumps(meta))
         _remove(entry)  # another process may have made it meanwhile
         partial.rename(entry)
         return entry
-
-    def _enlarge(self, entry: Path, device: torch.device) -> None:
-        rgb = np.load(entry / "rgb.npy", mmap_mode="r", allow_pickle=False)
-        _save(entry, "enlarged", encode_images(self.encoder, rgb, device=device, batch=4, enlarge=2))
 
     def _open(self, entry: Path) -> CachedView:
         meta = json.loads((entry / "meta.json").read_text())
@@ -265,33 +215,6 @@ class FeatureCache:
         )
 
 
-def owner_of(take: Take, view: int, config: DecoderConfig) -> Int8[np.ndarray, "T C"]:
-    """The entity that each cell is a part of: its rank among the tracked ones, else -1.
-
-    A handle or knob owns the cells that show it in at least a sixteenth of their pixels. Rims and fronts have no
-    outline of their own; what tells where their middle is, is how far their link reaches: they own the cells whose
-    middle shows it.
-    """
-    truth, cell = take.views[view], config.cell_px
-    box = Letterbox(truth.clip.camera, config.encoder.image_size)
-    of_entity = np.full(len(take.info.entities) + 1, -1, np.int8)
-    of_link = np.full(take.link_pose.shape[1] + 1, -1, np.int8)
-    for rank, e in enumerate(take.tracked):
-        entity = take.info.entities[e]
-        if entity.label in GRIPS:
-            of_entity[1 + e] = rank
-        else:
-            of_link[1 + entity.link] = rank
-    owners = []
-    for entity_id, link_id in zip(truth.entity_id, truth.link_id, strict=True):
-        owner = of_link[box.index(link_id)[cell // 2 :: cell, cell // 2 :: cell]]
-        shown = of_entity[box.index(entity_id)].reshape(config.cells, cell, config.cells, cell).swapaxes(1, 2)
-        pixels = (shown.reshape(*owner.shape, -1, 1) == np.arange(len(take.tracked))).sum(axis=2)
-        most = pixels.argmax(axis=-1) if len(take.tracked) else owner
-        owners.append(np.where(pixels.max(axis=-1, initial=0) * 16 >= cell * cell, most, owner).ravel())
-    return np.stack(owners).astype(np.int8)
-
-
 def _remove(entry: Path) -> None:
     """Remove an entry whole or not at all, as far as others can see."""
     gone = entry.with_name(f".gone-{entry.name}.{os.getpid()}")
@@ -300,29 +223,13 @@ def _remove(entry: Path) -> None:
     shutil.rmtree(gone, ignore_errors=True)
 
 
-def _read(store: TakeStore, name: str, mirrored: bool) -> Take:
-    return mirror_take(store.read(name)) if mirrored else store.read(name)
-
-
-def _save(entry: Path, name: str, array: np.ndarray) -> None:
-    """Write an array of an entry whole or not at all."""
-    partial = entry / f".{name}.npy"
-    np.save(partial, array, allow_pickle=False)
-    partial.rename(entry / f"{name}.npy")
-
-
 def encode_images(
-    encoder: Encoder,
-    rgb: UInt8[np.ndarray, "T S S 3"],
-    *,
-    device: torch.device,
-    batch: int = 16,
-    enlarge: int = 1,
+    encoder: Encoder, rgb: UInt8[np.ndarray, "T S S 3"], *, device: torch.device, batch: int = 16
 ) -> Float16[np.ndarray, "T N E"]:
-    """Features of many images, made ``enlarge`` times larger first, in bfloat16 arithmetic where that is fast."""
+    """Features of many images, in bfloat16 arithmetic where that is fast."""
     out = []
     with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, enabled=fast_bfloat16(device)):
         for start in range(0, len(rgb), batch):
-            images = torch.from_numpy(np.array(rgb[start : start + batch])).to(device)
-            out.append(encoder(images, enlarge=enlarge).to(torch.float16).cpu().numpy())
+            images = torch.from_numpy(rgb[start : start + batch]).to(device)
+            out.append(encoder(images).to(torch.float16).cpu().numpy())
     return np.concatenate(out)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from quest.errors import ConfigError
 from quest.extras import require
 from quest.model.weights import weights_digest
-from quest.train.batches import Batch, MicroBatch, stream_batches
+from quest.train.batches import Batch, MicroBatch, Sampler, stream_batches
 from quest.train.checkpoint import Progress, check_same_run, load_checkpoint, load_generators, save_checkpoint
 from quest.train.devices import (
     deterministic_algorithms,
@@ -33,7 +33,6 @@ from quest.train.optimizer import RunningMean, make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
 from quest.train.stage import Objective, Scores
-from quest.train.windows import WindowSampler
 
 if TYPE_CHECKING:
     from lightning_fabric import Fabric
@@ -58,8 +57,8 @@ class StepReport:
 
 def fit(
     objective: Objective,
-    training: WindowSampler,
-    validation: WindowSampler,
+    training: Sampler,
+    validation: Sampler,
     config: TrainingConfig,
     *,
     out: Path,
@@ -72,8 +71,8 @@ def fit(
 
     Args:
         objective: what is learned, of which network.
-        training: windows to learn from.
-        validation: windows of other objects; the same ones are drawn at every validation.
+        training: examples to learn from.
+        validation: other examples; the same ones are drawn at every validation.
         config: how to train.
         out: folder for the checkpoints ``last`` and ``best`` and the curves.
         report: called after every step.
@@ -207,7 +206,7 @@ class _Learner:
         self.mean.update(step)
         return values
 
-    def validate(self, sampler: WindowSampler) -> Scores:
+    def validate(self, sampler: Sampler) -> Scores:
         """Scores of the mean of the weights, which the first process finds out and tells the others."""
         scores = None
         if self.fabric.is_global_zero:

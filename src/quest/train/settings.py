@@ -95,23 +95,14 @@ class WindowConfig:
     """Largest step between the frames of a window, in stored frames (0 repeats one frame)."""
     first_frame_share: float = 0.6
     """How often the anchor is the first frame in which most entities are seen."""
-    point_jitter_px: float = 1.0
-    """Standard deviation of the anchor's pixel, pixels of the input."""
-    label_share: float = 0.4
-    """How often a query is told its label."""
     depth_drop_share: float = 0.08
     """How often a window loses all depth."""
-    query_drop_share: float = 0.2
-    """How often a query is left out of a window."""
-    colour_jitter: float = 0.2
-    """Largest relative change of brightness per channel, seen by the detail stem only."""
 
     def __post_init__(self) -> None:
         if self.batch < 1:
             raise ConfigError(f"windows: expected batch to be at least 1, got {self.batch}")
-        for name in ("max_stride", "point_jitter_px", "colour_jitter"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ConfigError(f"windows: expected {name} to be at least 0, got {getattr(self, name)}")
-        for name in ("first_frame_share", "label_share", "depth_drop_share", "query_drop_share"):
+        if self.max_stride < 0:
+            raise ConfigError(f"windows: expected max_stride to be at least 0, got {self.max_stride}")
+        for name in ("first_frame_share", "depth_drop_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"windows: expected {name} from 0 to 1, got {getattr(self, name)}")

@@ -13,10 +13,14 @@ from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_v
 from quest.evaluation.drift import ranked_auroc
 from quest.evaluation.metrics import Sums
 from quest.evaluation.real.sets import Labels, Picture
+from quest.model.finder import PANELS
+from quest.model.found import shared
 
 NEAR_PX = 16.0
 BEYOND_PX = 50.0
 Measures = Mapping[str, Value | None]
+
+_SAME_BOX = 0.5
 
 SIZES_PX = (0, 16, 32, 64, np.inf)
 """Handles are told apart by their longer side in a picture 640 pixels wide."""
@@ -99,7 +103,7 @@ def track_measures(clips: Sequence[ScoredClip], *, far_px: float, resamples: int
 
 
 @dataclass(frozen=True)
-class Found:
+class ScoredPicture:
     """What a tracker found unasked in one picture."""
 
     right: Bool[np.ndarray, " A"]
@@ -114,33 +118,63 @@ class Found:
     """Of each candidate that answers are chosen from."""
     first: Bool[np.ndarray, " C"]
     """Which candidates are right, and the best one of their handle."""
+    boxes: Mapping[str, Boxes]
+    """Handles and panels by their boxes, of those kinds that are labelled in boxes."""
 
 
-def score_picture(
-    picture: Picture, uv_px: Float[np.ndarray, "A 2"], candidates_px: Float[np.ndarray, "C 2"], score: np.ndarray
-) -> Found:
-    """Compare answers and candidates with the handles of a picture.
+@dataclass(frozen=True)
+class Boxes:
+    """Boxes of one kind in one picture."""
+
+    score: Float[np.ndarray, " C"]
+    """Of each box that was found."""
+    first: Bool[np.ndarray, " C"]
+    """Which of them share at least half of their union with a labelled one that no better one has."""
+    labelled: int
+    """How many are labelled."""
+
+
+def score_picture(picture: Picture, found: Mapping[str, np.ndarray]) -> ScoredPicture:
+    """Compare what was found with the labels of a picture.
 
     Args:
         picture: with its handles.
-        uv_px: answers, best first.
-        candidates_px: what they were chosen from.
-        score: of each candidate.
+        found: see :func:`quest.evaluation.real.run.discover`.
     """
-    order = np.argsort(-score, kind="stable")
-    right, again, found = _assign(picture, uv_px)
-    right_of_all, again_of_all, _ = _assign(picture, candidates_px[order])
-    sizes_px = picture.sizes_px()[picture.wanted]
-    counted = np.isfinite(right_of_all)
-    first = (right_of_all == 1) & ~again_of_all
-    return Found(
-        right[np.isfinite(right)] == 1,
-        again[np.isfinite(right)],
-        found,
-        sizes_px,
-        score[order][counted],
-        first[counted],
+    uv_px, score = found["uv_px"], found["score"]
+    right, again, _ = _assign(picture, uv_px)
+    followed = score > found["least"]
+    got = _assign(picture, uv_px[followed])[2]
+    counted = np.isfinite(right)
+    boxes = {}
+    if not picture.bars:
+        boxes["handle"] = match_boxes(found["box_px"], score, picture.boxes)
+        for k, kind in enumerate(PANELS):
+            own = found["panel_kind"] == k
+            true = picture.panels.get(kind, np.zeros((0, 4)))
+            boxes[kind] = match_boxes(found["panel_px"][own], found["panel_score"][own], true)
+    return ScoredPicture(
+        right[followed & counted] == 1,
+        again[followed & counted],
+        got,
+        picture.sizes_px()[picture.wanted],
+        score[counted],
+        (right[counted] == 1) & ~again[counted],
+        boxes,
     )
+
+
+def match_boxes(
+    box_px: Float[np.ndarray, "C 4"], score: Float[np.ndarray, " C"], true_px: Float[np.ndarray, "H 4"]
+) -> Boxes:
+    """Give each box, best first, the labelled one that it shares most with, if that is at least half of their union."""
+    free, first = np.ones(len(true_px), bool), np.zeros(len(box_px), bool)
+    for i in np.argsort(-score, kind="stable"):
+        share = np.where(free, shared(box_px[i], true_px), 0.0)
+        if share.max(initial=0.0) >= _SAME_BOX:
+            first[i] = True
+            free[share.argmax()] = False
+    return Boxes(score, first, len(true_px))
 
 
 def _assign(picture: Picture, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -160,7 +194,7 @@ def _assign(picture: Picture, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return right, again, taken[picture.wanted]
 
 
-def discovery_measures(pictures: Sequence[Found], *, resamples: int, seed: int) -> Measures:
+def discovery_measures(pictures: Sequence[ScoredPicture], *, resamples: int, seed: int) -> Measures:
     """Measures of what was found in pictures, with intervals over these."""
     draws = draw_objects(len(pictures), resamples=resamples, generator=np.random.default_rng(seed))
 
@@ -191,6 +225,14 @@ def discovery_measures(pictures: Sequence[Found], *, resamples: int, seed: int) 
     for low, high in pairwise(SIZES_PX):
         name = f"recall_{low}_to_{high}_px" if np.isfinite(high) else f"recall_above_{low}_px"
         measures[name] = share(found, home, (size_px >= low) & (size_px < high))
+    for kind in dict.fromkeys(kind for picture in pictures for kind in picture.boxes):
+        boxes = [picture.boxes[kind] for picture in pictures]
+        home = np.repeat(np.arange(len(boxes)), [b.labelled for b in boxes])
+        own = np.repeat(np.arange(len(boxes)), [len(b.score) for b in boxes])
+        area = _average_precision(
+            np.concatenate([b.score for b in boxes]), np.concatenate([b.first for b in boxes]), own, home
+        )
+        measures[f"ap50_{kind}"] = statistic_value(area, draws, count=len(home))
     return measures
 
 

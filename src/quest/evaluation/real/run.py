@@ -18,9 +18,9 @@ from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.real.measures import (
     Answers,
-    Found,
     Measures,
     ScoredClip,
+    ScoredPicture,
     discovery_measures,
     score_clip,
     score_picture,
@@ -28,9 +28,9 @@ from quest.evaluation.real.measures import (
 )
 from quest.evaluation.real.sets import LabelledClip, Labels, Picture, RealSet
 from quest.evaluation.results import Run
-from quest.geometry.letterbox import Letterbox
+from quest.model.found import Found
 from quest.track import Tracker
-from quest.types import LABELS, Clip
+from quest.types import Clip
 from quest.whole_file import whole_file
 
 FORMAT = 1
@@ -38,8 +38,6 @@ FORMAT = 1
 
 WIDE_STEP_PX = 16.0
 """Clips whose points move farther than this from frame to frame (median) have rows of their own."""
-
-HANDLES = ("handle", "knob")
 
 T = TypeVar("T", bound=ClipTracker)
 Progress = Callable[[str, int], None]
@@ -137,12 +135,12 @@ def evaluate_set(
     for (of, tracker, inputs), clips in tracked.items():
         rows.append(track_row(of, tracker, inputs, list(clips.values()), resamples))
         single += [track_row(name, tracker, inputs, [clip], 1) for name, clip in clips.items()]
-    found: dict[tuple[str, Inputs], dict[str, Found]] = {}
+    found: dict[tuple[str, Inputs], dict[str, ScoredPicture]] = {}
     for picture in real.pictures:
         for tracker, inputs, one in _ask_picture(picture, trackers, kept, progress):
             found.setdefault((tracker, inputs), {})[picture.name] = one
 
-    def found_row(of: str, tracker: str, inputs: Inputs, pictures: Sequence[Found], resamples: int) -> RealRow:
+    def found_row(of: str, tracker: str, inputs: Inputs, pictures: Sequence[ScoredPicture], resamples: int) -> RealRow:
         measures = discovery_measures(pictures, resamples=resamples, seed=seed)
         handles, answers = (sum(len(getattr(p, name)) for p in pictures) for name in ("found", "right"))
         return RealRow(of, tracker, inputs, len(pictures), handles, answers, measures)
@@ -180,12 +178,12 @@ def _ask_clip(
 
 def _ask_picture(
     picture: Picture, trackers: Sequence[ClipTracker], kept: KeptAnswers | None, progress: Progress
-) -> Iterator[tuple[str, Inputs, Found]]:
+) -> Iterator[tuple[str, Inputs, ScoredPicture]]:
     ways = shown(picture.read())
     for tracker, inputs in _asked([t for t in trackers if isinstance(t, Tracker)], ways):
         progress(f"{picture.name}: {tracker.name}, {inputs}", 0)
         answers = _kept(kept, picture.name, tracker.name, inputs, partial(discover, tracker, ways[inputs]))
-        yield tracker.name, inputs, score_picture(picture, **answers)
+        yield tracker.name, inputs, score_picture(picture, answers)
     progress(picture.name, 1)
 
 
@@ -210,23 +208,24 @@ def _follow(tracker: ClipTracker, clip: Clip, labels: Labels) -> dict[str, np.nd
     return {"uv_px": tracks.uv_px[at], "visible": tracks.visible[at], "lost_p": lost_p}
 
 
+def grips_of(found: Found) -> Found:
+    """Handles and knobs of what was found."""
+    return found.select(~np.isnan(found.box_px[:, 0]))
+
+
 def discover(tracker: Tracker, clip: Clip) -> dict[str, np.ndarray]:
-    """Handles and knobs that a tracker discovers in a clip of one frame, and what it chose them from.
+    """Handles, knobs, doors and drawers that a tracker finds in a clip of one frame.
 
     Returns:
-        ``uv_px`` of its answers, best first, ``candidates_px`` and their ``score``.
+        Best first, however unlikely: ``uv_px``, ``box_px`` and ``score`` (log odds of being right) of grips,
+        ``panel_px``, ``panel_kind`` and ``panel_score`` of panels; and the ``least`` score that discovery follows.
     """
-    tracks = tracker.track(clip)
-    order = np.argsort(-tracks.confidence[0], kind="stable")
-    answers = [k for k in order if tracks.labels[k] in HANDLES]
-    peaks, size = tracker.candidates(clip.camera, clip.frame(0)), tracker.network.config.encoder.image_size
-    hold = np.isin(peaks.label.cpu().numpy(), [LABELS.index(name) for name in HANDLES])
-    uv_px = Letterbox(clip.camera, size).to_source(peaks.uv.float().cpu().numpy() * size)
+    found = tracker.find(clip.camera, clip.frame(0))
+    grips, panels, least = grips_of(found), found.panels, tracker.config.threshold
     return {
-        "uv_px": tracks.uv_px[0, answers].astype(np.float64),
-        "candidates_px": uv_px[hold].astype(np.float64),
-        "score": peaks.logit.double().cpu().numpy()[hold],
-    }
+        "uv_px": grips.uv_px, "box_px": grips.box_px, "score": grips.logit, "panel_px": panels.box_px,
+        "panel_kind": panels.kind, "panel_score": panels.logit, "least": np.log(least / (1 - least)),
+    }  # fmt: skip
 
 
 def write_set(path: Path, real: RealSet, rows: Sequence[RealRow], single: Sequence[RealRow], run: Run) -> None:

@@ -5,9 +5,8 @@ A set is a folder of labelled clips, or of labelled pictures; which one is told 
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -18,12 +17,14 @@ from jaxtyping import Bool, Float, Int
 from PIL import Image, UnidentifiedImageError
 from pyarrow import csv
 
+from quest.data.boxed_pictures import kind_of, may_choose, read_boxed_pictures
 from quest.data.camera_file import read_camera
-from quest.data.pictures import colours_of, upright
+from quest.data.pictures import read_picture
 from quest.data.provenance import combined_hash, file_hash
 from quest.data.recording import read_recording
 from quest.depth import clean_depth
 from quest.errors import InputError
+from quest.model.finder import PANELS
 from quest.types import Camera, Clip, Query
 
 STATES = ("visible", "occluded", "out")
@@ -33,7 +34,6 @@ EXPECTED = (
 Part = Literal["choosing", "teaching", "all"]
 """Part of a set of pictures: a fifth of them chooses between settings, the rest may teach."""
 
-_CHOOSING_EVERY = 5
 _BAR_PX = 12.0
 
 
@@ -131,6 +131,8 @@ class Picture:
     """X0, y0, x1, y1 of each handle's box, or the two ends of its bar, pixels."""
     wanted: Bool[np.ndarray, " H"]
     """Which handles count; answers at the others are neither right nor wrong."""
+    panels: Mapping[str, Float[np.ndarray, "M 4"]] = field(default_factory=dict)
+    """Boxes of doors and drawers by their kind; none where they are not labelled."""
     bars: bool = False
     """Whether handles are bars."""
     depth: Path | None = None
@@ -149,7 +151,7 @@ class Picture:
         Raises:
             InputError: a file is damaged.
         """
-        rgb = colours_of(upright(_open(self.path)), f"picture {self.path}")
+        rgb = read_picture(self.path)
         setup = None if self.camera is None else read_camera(self.camera)
         camera = Camera.from_fov(rgb.shape[1], rgb.shape[0]) if setup is None else setup.camera
         depth_m = None
@@ -238,12 +240,6 @@ def open_set(folder: Path, *, part: Part = "choosing") -> RealSet:
     return RealSet(folder, tuple(clips), stills, far_px=40.0 if exact else 16.0)
 
 
-def may_choose(picture: str) -> bool:
-    """Whether a picture is of the fifth that chooses, by the hash of its name; those of one building stay together."""
-    group = "ward" if picture.startswith("ward-") else picture
-    return int(hashlib.sha256(group.encode()).hexdigest(), 16) % _CHOOSING_EVERY == 0
-
-
 def read_labels(path: Path) -> Labels:
     """Read ``labels.csv`` (pixel centres at half-integers) or ``truth.csv`` (at integers).
 
@@ -292,15 +288,12 @@ def _columns(path: Path, kinds: Mapping[str, type], **optional: type) -> dict[st
 
 
 def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
-    edges = ("x0", "y0", "x1", "y1")
-    rows = _columns(folder / "labels.csv", {"file": str, "class": str, **dict.fromkeys(edges, float)})
-    for name in np.unique(rows["file"]).tolist():
-        path = folder / "pictures" / name
-        if part == "all" or may_choose(name) == (part == "choosing"):
-            if not path.is_file():
-                raise InputError(f"{folder / 'labels.csv'}: expected a picture {path}, found none")
-            own = (rows["file"] == name) & (rows["class"] == "handle")
-            yield Picture(path, np.stack([rows[key][own] for key in edges], axis=-1), np.ones(own.sum(), bool))
+    for picture in read_boxed_pictures(folder):
+        if part == "all" or may_choose(picture.path.name) == (part == "choosing"):
+            kind = np.array([kind_of(name)[0] for name in picture.names], object)
+            own = kind == "grip"
+            panels = {name: picture.box_px[kind == name] for name in PANELS}
+            yield Picture(picture.path, picture.box_px[own], np.ones(own.sum(), bool), panels=panels)
 
 
 def _stills(folder: Path) -> Iterator[Picture]:
@@ -309,13 +302,14 @@ def _stills(folder: Path) -> Iterator[Picture]:
     rows = _columns(folder / "handles.csv", {"frame": int, "use": int, **dict.fromkeys(ends, float)})
     for frame in np.unique(rows["frame"]):
         own = rows["frame"] == frame
-        beside = {"depth": folder / f"{frame:04d}.png", "camera": folder / "camera.json"}
+        depth, camera = folder / f"{frame:04d}.png", folder / "camera.json"
         yield Picture(
             folder / f"{frame:04d}.jpg",
             np.stack([rows[key][own] for key in ends], axis=-1) + 0.5,
             rows["use"][own] > 0,
             bars=True,
-            **{key: path for key, path in beside.items() if path.is_file()},
+            depth=depth if depth.is_file() else None,
+            camera=camera if camera.is_file() else None,
         )
 
 

@@ -35,6 +35,10 @@ COLUMNS = (
     Column("recall_16_to_32_px", "16–32", 0, 100.0, 2),
     Column("recall_32_to_64_px", "32–64", 0, 100.0, 2),
     Column("recall_above_64_px", ">64", 0, 100.0, 2),
+    Column("ap50_handle", "AP50 handle", 3, 1.0, 3),
+    Column("ap50_cabinet", "cabinet", 3, 1.0, 4),
+    Column("ap50_door", "door", 3, 1.0, 4),
+    Column("ap50_refrigerator", "refrig.", 3, 1.0, 4),
 )
 """What is shown of a row, in this order; the result file has everything."""
 

@@ -1,0 +1,163 @@
+"""Pictures with boxes around things, as people label them: COCO, YOLO, or a table ``labels.csv``."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import yaml
+from jaxtyping import Float
+from PIL import Image
+from pyarrow import csv
+
+from quest.data.pictures import PICTURES
+from quest.errors import InputError
+
+EXPECTED = (
+    "expected a COCO file (.json), a YOLO data set (data.yaml, or folders images and labels), or a folder with "
+    "pictures/ and labels.csv"
+)
+_CHOOSING_EVERY = 5
+CLASSES: dict[str, tuple[str, bool | None]] = {
+    **dict.fromkeys(("handle", "grip", "door handle", "drawer handle", "pull"), ("grip", False)),
+    **dict.fromkeys(("knob", "door knob"), ("grip", True)),
+    **dict.fromkeys(("cabinet door", "cabinet", "drawer", "cupboard door"), ("cabinet", None)),
+    **dict.fromkeys(("door", "room door"), ("door", None)),
+    **dict.fromkeys(("refrigerator door", "fridge door"), ("refrigerator", None)),
+}
+"""What the finder takes classes of labels for: a grip or a kind of panel, and whether a grip is a knob."""
+
+
+@dataclass(frozen=True)
+class BoxedPicture:
+    """A picture and what is boxed in it."""
+
+    path: Path
+    """The picture."""
+    names: tuple[str, ...]
+    """Class of each box, as the labels say it."""
+    box_px: Float[np.ndarray, "N 4"]
+    """Left, top, right and bottom edges, pixels."""
+    licence: str = ""
+    """Of the picture; empty where the labels do not say."""
+
+
+def read_boxed_pictures(path: Path) -> list[BoxedPicture]:
+    """Read a labelled set.
+
+    Args:
+        path: a COCO file; ``data.yaml`` of a YOLO set, or its folder; or a folder with ``pictures`` and ``labels.csv``
+            (columns file, class, x0, y0, x1, y1 and, if there is one, licence).
+
+    Raises:
+        InputError: it is none of these, or a label cannot be understood.
+    """
+    if path.suffix == ".json" and path.is_file():
+        found = list(_coco(path))
+    elif path.suffix in (".yaml", ".yml") and path.is_file():
+        found = list(_yolo(path.parent, path))
+    elif (path / "labels.csv").is_file():
+        found = list(_table(path))
+    elif any((path / name).is_file() for name in ("data.yaml", "data.yml")):
+        found = list(_yolo(path, next(path / name for name in ("data.yaml", "data.yml") if (path / name).is_file())))
+    else:
+        raise InputError(f"pictures {path}: {EXPECTED}")
+    if not found:
+        raise InputError(f"pictures {path}: it names no picture; {EXPECTED}")
+    for picture in found:
+        if not picture.path.is_file():
+            raise InputError(f"pictures {path}: expected a picture {picture.path}, found none")
+        if not np.isfinite(picture.box_px).all() or (picture.box_px[:, 2:] < picture.box_px[:, :2]).any():
+            raise InputError(f"pictures {path}: expected boxes with finite edges in order for {picture.path.name}")
+    return found
+
+
+def kind_of(name: str) -> tuple[str, bool | None]:
+    """What a class of labels is, as in :data:`CLASSES`; nothing for others."""
+    return CLASSES.get(name.strip().lower(), ("", None))
+
+
+def may_choose(picture: str) -> bool:
+    """Whether a picture is of the fifth that chooses, by the hash of its name; those of one building stay together."""
+    group = "ward" if picture.startswith("ward-") else picture
+    return int(hashlib.sha256(group.encode()).hexdigest(), 16) % _CHOOSING_EVERY == 0
+
+
+def _table(folder: Path) -> Iterator[BoxedPicture]:
+    path = folder / "labels.csv"
+    edges = ("x0", "y0", "x1", "y1")
+    types = {"file": pa.string(), "class": pa.string(), "licence": pa.string(), **dict.fromkeys(edges, pa.float64())}
+    convert = csv.ConvertOptions(column_types=types, include_columns=list(types), include_missing_columns=True)
+    try:
+        table = csv.read_csv(path, csv.ReadOptions(use_threads=False), convert_options=convert)
+    except pa.ArrowInvalid as error:
+        raise InputError(f"{path}: cannot be read ({error})") from error
+    file, name, licence = (table[key].fill_null("").to_numpy().astype(str) for key in ("file", "class", "licence"))
+    box = np.stack([table[key].fill_null(np.nan).to_numpy() for key in edges], axis=-1)
+    for picture in np.unique(file[file != ""]).tolist():
+        own = file == picture
+        boxed = own & (name != "")
+        yield BoxedPicture(folder / "pictures" / picture, tuple(name[boxed]), box[boxed], str(licence[own][0]))
+
+
+def _coco(path: Path) -> Iterator[BoxedPicture]:
+    try:
+        raw = json.loads(path.read_text(encoding="utf-8"))
+        names = {category["id"]: str(category["name"]) for category in raw["categories"]}
+        licences = {licence["id"]: str(licence.get("name", "")) for licence in raw.get("licenses", ())}
+        boxes: dict[int, list[tuple[str, list[float]]]] = {}
+        for mark in raw["annotations"]:
+            x, y, width, height = map(float, mark["bbox"])
+            boxes.setdefault(mark["image_id"], []).append((names[mark["category_id"]], [x, y, x + width, y + height]))
+        pictures = [(image["id"], str(image["file_name"]), licences.get(image.get("license"), "")) for image in
+                    raw["images"]]  # fmt: skip
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path}: expected a COCO file with images, annotations and categories ({error!r})") from error
+    for number, file, licence in pictures:
+        beside = [folder / file for folder in (path.parent, path.parent / "images", path.parent.parent / "images")]
+        place = next((p for p in beside if p.is_file()), beside[0])
+        own = boxes.get(number, [])
+        yield BoxedPicture(place, tuple(name for name, _ in own), _stacked([box for _, box in own]), licence)
+
+
+def _yolo(folder: Path, config: Path) -> Iterator[BoxedPicture]:
+    try:
+        raw = yaml.safe_load(config.read_text(encoding="utf-8"))
+        names = raw["names"]
+        names = {int(k): str(v) for k, v in (names.items() if isinstance(names, dict) else enumerate(names))}
+    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{config}: expected the names of the classes under 'names' ({error!r})") from error
+    images = sorted(p for p in (folder / "images").rglob("*") if p.suffix.lower() in PICTURES)
+    images = images or sorted(p for p in folder.rglob("images/*") if p.suffix.lower() in PICTURES)
+    for path in images:
+        parts = list(path.parts)
+        at = len(parts) - 1 - parts[::-1].index("images")
+        labels = Path(*parts[:at], "labels", *parts[at + 1 :]).with_suffix(".txt")
+        own: list[tuple[str, list[float]]] = []
+        with Image.open(path) as image:
+            width, height = image.size
+        for line in labels.read_text(encoding="utf-8").splitlines() if labels.is_file() else ():
+            if not line.strip():
+                continue
+            try:
+                number, *values = line.split()
+                xy = np.array([float(value) for value in values])
+                if len(xy) == 4:
+                    low, high = xy[:2] - xy[2:] / 2, xy[:2] + xy[2:] / 2
+                else:  # an outline
+                    low, high = xy.reshape(-1, 2).min(axis=0), xy.reshape(-1, 2).max(axis=0)
+                own.append(
+                    (names[int(number)], (np.concatenate((low, high)) * [width, height, width, height]).tolist())
+                )
+            except (ValueError, KeyError) as error:
+                raise InputError(f"{labels}: expected a class and its box, got {line!r} ({error!r})") from error
+        yield BoxedPicture(path, tuple(name for name, _ in own), _stacked([box for _, box in own]))
+
+
+def _stacked(boxes: list[list[float]]) -> Float[np.ndarray, "N 4"]:
+    return np.array(boxes, np.float64).reshape(-1, 4)

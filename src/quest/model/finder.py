@@ -1,0 +1,204 @@
+"""The finder's network: what in a picture can be taken hold of, and of which door or drawer.
+
+Two branches see the picture: a vision transformer, coarsely, knows what things are; EfficientNet-Lite0 sees them at up
+to a quarter of the picture's resolution. A pyramid joins them, and two dense maps are read off it: what one takes hold
+of, at a stride of 4 pixels, and the doors and drawers behind it, at a stride of 8.
+
+References: Zhou et al., Objects as Points, 2019, for maps of centres; Lin et al., Feature Pyramid Networks, CVPR 2017.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from quest.errors import ConfigError
+from quest.model.efficientnet import WIDTHS, EfficientNet
+from quest.model.encoder import Encoder, EncoderConfig
+from quest.model.relief import relief
+
+PLACES = ("grip", "rim", "front", "hinge")
+"""What the fine map finds; a grip is a handle or a knob."""
+PANELS = ("cabinet", "door", "refrigerator")
+"""What the coarse map finds: doors and drawer fronts of furniture, doors of rooms, doors of refrigerators."""
+OPENINGS = ("slides", "left", "right", "top", "bottom")
+"""How a panel opens: it slides out, or turns about one of its edges."""
+FINE_PX, COARSE_PX = 4, 8
+"""Strides of the maps."""
+CONTEXT_BLOCKS = (5, 8, 11)
+"""Blocks of the vision transformer whose tokens are read."""
+CONTEXT_SHARE = 0.7
+"""Size of the picture that the vision transformer sees, in parts of the one that EfficientNet sees."""
+_RADII_PX = (12, 40)
+"""Of the squares whose relief is seen."""
+RELIEF = 1 + len(_RADII_PX)
+"""Channels of :func:`relief_of`."""
+_GROUPS = 8
+_RARE = -4.6
+"""Logit of a place before anything is learned: one in a hundred."""
+
+
+@dataclass(frozen=True)
+class FinderConfig:
+    """Shape of the network."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """Of the vision transformer; the side of its image says for which grid its places are stored."""
+    width: int = 64
+    """Channels of the pyramid."""
+
+    def to_json(self) -> str:
+        """One line, stored with the weights."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str) -> FinderConfig:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            ConfigError: the text is no configuration of this version.
+        """
+        try:
+            values = json.loads(text)
+            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ConfigError(f"configuration of a finder cannot be read: {error}") from error
+
+
+@dataclass(frozen=True)
+class FinderMaps:
+    """What is found where."""
+
+    place: Float[Tensor, "B P h w"]
+    """Logits of :data:`PLACES` at a stride of :data:`FINE_PX`."""
+    knob: Float[Tensor, "B h w"]
+    """Logit that a grip is a knob."""
+    lift: Float[Tensor, "B h w"]
+    """Logit that one takes hold of it to lift the whole thing."""
+    extent: Float[Tensor, "B 4 h w"]
+    """From a cell's centre to the left, upper, right and lower edges of the grip there, pixels."""
+    panel: Float[Tensor, "B Q H W"]
+    """Logits of :data:`PANELS` at a stride of :data:`COARSE_PX`."""
+    panel_extent: Float[Tensor, "B 4 H W"]
+    """As ``extent``, of the panel."""
+    opening: Float[Tensor, "B O H W"]
+    """Logits of :data:`OPENINGS`, which exclude each other."""
+
+
+def relief_of(depth_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B R H W"]:
+    """How far each pixel stands before what is around it (see :func:`quest.model.relief.relief`), and where depth is.
+
+    Args:
+        depth_m: metres along +z, 0 where missing.
+    """
+    stands = relief(depth_m, _RADII_PX)
+    return torch.cat((stands, (depth_m > 0).to(stands.dtype)[:, None]), dim=1)
+
+
+class _Mix(nn.Module):
+    """A 3 x 3 convolution, normalised."""
+
+    def __init__(self, inputs: int, outputs: int) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+        self.norm = nn.GroupNorm(_GROUPS, outputs)
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
+        return F.relu(self.norm(self.conv(x)), inplace=True)
+
+
+class _Head(nn.Module):
+    """Maps of one level, and extents in units of its stride, which never are negative."""
+
+    def __init__(self, width: int, scores: int, *, rare: int, stride: int) -> None:
+        super().__init__()
+        self.mix = _Mix(width, width)
+        self.score = nn.Conv2d(width, scores, 1)
+        self.extent = nn.Conv2d(width, 4, 1)
+        self.stride = stride
+        nn.init.constant_(self.score.bias[:rare], _RARE)  # type: ignore[index]
+        nn.init.constant_(self.extent.bias, 1.0)  # type: ignore[arg-type]
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> tuple[Float[Tensor, "B S H W"], Float[Tensor, "B 4 H W"]]:
+        x = self.mix(x)
+        return self.score(x).float(), self.stride * self.extent(x).float().clamp(-3, 6).exp()
+
+
+class FinderNetwork(nn.Module):
+    """Pictures to maps of what is found.
+
+    Args:
+        config: its shape.
+    """
+
+    def __init__(self, config: FinderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.encoder = Encoder(config.encoder).requires_grad_(requires_grad=False)
+        self.detail = EfficientNet()
+        width, context = config.width, len(CONTEXT_BLOCKS) * config.encoder.width
+        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in WIDTHS)
+        self.context = nn.Sequential(nn.Conv2d(context, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, width, 1))
+        self.relief = nn.Sequential(
+            nn.Conv2d(RELIEF, 24, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(24, 48, 3, 2, 1),
+            nn.ReLU(),
+            nn.Conv2d(48, width, 1),
+        )
+        self.mix = nn.ModuleList(_Mix(width, width) for _ in WIDTHS)
+        self.fine = _Head(width, len(PLACES) + 2, rare=len(PLACES), stride=FINE_PX)
+        self.coarse = _Head(width, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
+        self.dropout = nn.Dropout2d(0.1)
+        self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on processors
+
+    def busiest(self) -> list[nn.Module]:
+        """The parts that do most of the work, for which it pays to be compiled."""
+        return [self.detail, self.fine, self.coarse]
+
+    def context_of(self, rgb: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B E r c"]:
+        """What the vision transformer sees in pictures, in rows and columns."""
+        patch = self.config.encoder.patch_size
+        size = [max(1, round(CONTEXT_SHARE * side / patch)) * patch for side in rgb.shape[-2:]]
+        small = F.interpolate(rgb, size, mode="bilinear", align_corners=False, antialias=True)
+        with torch.no_grad():
+            return self.encoder.depths(small, CONTEXT_BLOCKS)
+
+    def forward(
+        self,
+        rgb: Float[Tensor, "B 3 H W"],
+        stands_out: Float[Tensor, "B R H W"] | None = None,
+        *,
+        context: Float[Tensor, "B E r c"] | None = None,
+    ) -> FinderMaps:
+        """The maps.
+
+        Args:
+            rgb: colours from 0 to 1; sides are multiples of 32.
+            stands_out: see :func:`relief_of`; None without depth.
+            context: of the pictures, where it is known already.
+        """
+        rgb = rgb.contiguous(memory_format=torch.channels_last)
+        tokens = self.context_of(rgb) if context is None else context
+        levels = [lateral(x) for lateral, x in zip(self.lateral, self.detail(rgb), strict=True)]
+        seen = self.context(self.dropout(tokens))
+        levels[2] = levels[2] + F.interpolate(seen, levels[2].shape[-2:], mode="bilinear", align_corners=False)
+        if stands_out is not None:
+            # Multiplied, so that where there is no depth it is as without.
+            known = F.avg_pool2d(stands_out[:, -1:], FINE_PX)
+            levels[0] = levels[0] + known * self.relief(stands_out)
+        x = self.mix[3](levels[3])
+        joined = [x]
+        for level, mix in zip(levels[2::-1], list(self.mix)[2::-1], strict=True):
+            x = mix(level + F.interpolate(x, level.shape[-2:], mode="nearest"))
+            joined.append(x)
+        place, extent = self.fine(joined[3])
+        panel, panel_extent = self.coarse(joined[2])
+        places, knob, lift = place.split((len(PLACES), 1, 1), dim=1)
+        panels, opening = panel.split((len(PANELS), len(OPENINGS)), dim=1)
+        return FinderMaps(places, knob[:, 0], lift[:, 0], extent, panels, panel_extent, opening)

@@ -1,0 +1,229 @@
+"""From the finder's maps to a list of what can be taken hold of in a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+from torch import Tensor
+
+from quest.model.finder import COARSE_PX, FINE_PX, PLACES, FinderMaps, FinderNetwork, relief_of
+from quest.types import LABELS
+
+LABELS_FOUND = (*LABELS, "hinge")
+"""Labels of what is found; hinges are no queries."""
+
+_SIDE_PX = 32
+"""Sides of what the network sees are multiples of this."""
+_LEAST = -4.0
+"""Logit below which nothing is a candidate."""
+_MOST = 200
+_SAME_BOX = 0.5
+"""Boxes that share so much of their union are one."""
+APART_PX = 12.0
+"""Rims, fronts and hinges closer than this in what the network sees are one."""
+_GREY = 114
+
+
+@dataclass(frozen=True)
+class Panels:
+    """Doors and drawers, best first."""
+
+    box_px: Float[np.ndarray, "M 4"]
+    """Left, top, right and bottom edges, pixels of the source."""
+    kind: Int[np.ndarray, " M"]
+    """Index into :data:`quest.model.finder.PANELS`."""
+    logit: Float[np.ndarray, " M"]
+    """Log odds of being one."""
+    opening_p: Float[np.ndarray, "M O"]
+    """Probability of each of :data:`quest.model.finder.OPENINGS`."""
+
+    def __len__(self) -> int:
+        return len(self.kind)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What can be taken hold of, best first."""
+
+    uv_px: Float[np.ndarray, "N 2"]
+    """Where, pixels of the source."""
+    logit: Float[np.ndarray, " N"]
+    """Log odds that there is something to take hold of."""
+    label_p: Float[np.ndarray, "N L"]
+    """Probability of each of :data:`LABELS_FOUND`, given that there is."""
+    lift_p: Float[np.ndarray, " N"]
+    """Probability that one takes hold of it to lift the whole thing, not to open a part of it."""
+    box_px: Float[np.ndarray, "N 4"]
+    """Left, top, right and bottom edges of handles and knobs; NaN of the others."""
+    panel: Int[np.ndarray, " N"]
+    """The door or drawer that it is on, as an index into ``panels``; -1 for none."""
+    panels: Panels
+    """Doors and drawers."""
+
+    def __len__(self) -> int:
+        return len(self.logit)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The likeliest label of each."""
+        return tuple(LABELS_FOUND[int(i)] for i in self.label_p.argmax(axis=1))
+
+    def select(self, rows: Sequence[int] | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]) -> Found:
+        """Some of them, with all panels."""
+        own = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "panels"}
+        return Found(**own, panels=self.panels)
+
+
+def find(
+    network: FinderNetwork,
+    rgb: UInt8[np.ndarray, "H W 3"],
+    depth_m: Float32[np.ndarray, "H W"] | None = None,
+    *,
+    size_px: int,
+) -> Found:
+    """What can be taken hold of in a picture.
+
+    Args:
+        network: in evaluation mode.
+        rgb: the picture.
+        depth_m: metres along +z, 0 where missing; None without depth.
+        size_px: longer side of what the network sees.
+    """
+    height, width = rgb.shape[:2]
+    device = next(network.parameters()).device
+    scale = size_px / max(height, width)
+    inside = (max(1, round(height * scale)), max(1, round(width * scale)))
+    canvas = torch.from_numpy(_placed(rgb, inside, _GREY)).to(device)
+    seen = None
+    if depth_m is not None:
+        depth = torch.from_numpy(_placed(depth_m, inside, 0.0)).to(device)
+        seen = relief_of(depth[None])
+    with torch.inference_mode():
+        maps = network(canvas.permute(2, 0, 1)[None] / 255, seen)
+    return read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
+
+
+def _placed(image: np.ndarray, inside: tuple[int, int], fill: float) -> np.ndarray:
+    """An image at another size, in the upper left corner of one with sides in whole steps."""
+    rows, columns = inside
+    if image.ndim == 2:
+        how = cv2.INTER_NEAREST_EXACT
+    else:
+        how = cv2.INTER_AREA if columns < image.shape[1] else cv2.INTER_LINEAR
+    canvas = np.full((-(-rows // _SIDE_PX) * _SIDE_PX, -(-columns // _SIDE_PX) * _SIDE_PX, *image.shape[2:]), fill,
+                     image.dtype)  # fmt: skip
+    canvas[:rows, :columns] = cv2.resize(image, (columns, rows), interpolation=how)
+    return canvas
+
+
+def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int, int]) -> Found:
+    """What the maps of one picture (B = 1) show.
+
+    Args:
+        maps: of the network.
+        scale: pixels of what the network saw per pixel of the source, along x and y.
+        size: width and height of the source.
+    """
+    two = np.tile(scale, 2)
+    end = np.array(size, np.float64)
+    panels = _panels(maps, two, np.tile(end, 2))
+    cell, place, logit = _peaks(maps.place[0])
+    uv = (cell + _within(maps.place[0], place, cell)) * FINE_PX
+    column, row = cell.T
+    knob, lift = (m[0].sigmoid().double().cpu().numpy()[row, column] for m in (maps.knob, maps.lift))
+    label_p = np.zeros((len(logit), len(LABELS_FOUND)))
+    for k, name in enumerate(PLACES):
+        own = place == k
+        if name == "grip":
+            label_p[own, LABELS_FOUND.index("handle")], label_p[own, LABELS_FOUND.index("knob")] = (
+                (1 - knob)[own], knob[own],
+            )  # fmt: skip
+        else:
+            label_p[own, LABELS_FOUND.index(name)] = 1
+    box = np.where((place == PLACES.index("grip"))[:, None], _boxes(maps.extent[0], cell, FINE_PX), np.nan)
+    keep = _apart(uv, box, place)
+    uv, box = np.clip(uv[keep] / scale, 0, end), np.clip(box[keep] / two, 0, np.tile(end, 2))
+    return Found(uv, logit[keep], label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
+
+
+def _peaks(
+    logits: Float[Tensor, "P h w"],
+) -> tuple[Int[np.ndarray, "N 2"], Int[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Column and row, channel and logit of local maxima, best first."""
+    highest = (logits == F.max_pool2d(logits[None], 3, 1, 1)[0]) & (logits > _LEAST)
+    channel, row, column = torch.nonzero(highest, as_tuple=True)
+    value = logits[channel, row, column]
+    order = value.argsort(descending=True, stable=True)[:_MOST]
+    cell = torch.stack((column, row), dim=-1)[order]
+    return cell.cpu().numpy(), channel[order].cpu().numpy(), value[order].double().cpu().numpy()
+
+
+def _within(
+    logits: Float[Tensor, "P h w"], channel: Int[np.ndarray, " N"], cell: Int[np.ndarray, "N 2"]
+) -> Float[np.ndarray, "N 2"]:
+    """Where in its cell a peak is: the mean of the 3 x 3 cells around it by their probability, in cells."""
+    padded = F.pad(logits, (1, 1, 1, 1), value=-torch.inf).sigmoid().double().cpu().numpy()
+    step = np.arange(3)
+    around = padded[channel[:, None, None], cell[:, 1, None, None] + step[:, None], cell[:, 0, None, None] + step]
+    weight = around / around.sum(axis=(1, 2), keepdims=True)
+    return np.stack((weight.sum(axis=1) @ (step - 0.5), weight.sum(axis=2) @ (step - 0.5)), axis=-1)
+
+
+def _boxes(extent: Float[Tensor, "4 h w"], cell: Int[np.ndarray, "N 2"], stride: int) -> Float[np.ndarray, "N 4"]:
+    """Edges around cells, pixels of what the network saw."""
+    out = extent[:, torch.from_numpy(cell[:, 1]), torch.from_numpy(cell[:, 0])].T.double().cpu().numpy()
+    centre = (cell + 0.5) * stride
+    return np.concatenate((centre - out[:, :2], centre + out[:, 2:]), axis=1)
+
+
+def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"]) -> Panels:
+    cell, kind, logit = _peaks(maps.panel[0])
+    box = _boxes(maps.panel_extent[0], cell, COARSE_PX)
+    keep: list[int] = []
+    for i in range(len(kind)):
+        if not keep or shared(box[i], box[keep]).max() < _SAME_BOX:
+            keep.append(i)
+    opening = maps.opening[0].softmax(dim=0).double().cpu().numpy()[:, cell[keep, 1], cell[keep, 0]].T
+    return Panels(np.clip(box[keep] / scale, 0, end), kind[keep], logit[keep], opening)
+
+
+def _apart(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"], place: Int[np.ndarray, " N"]) -> list[int]:
+    """Of candidates that are one thing the best: grips with a better one's box, other places near a better one."""
+    keep: list[int] = []
+    for i in range(len(uv)):
+        rivals = [j for j in keep if place[j] == place[i]]
+        if not rivals:
+            keep.append(i)
+        elif np.isnan(box[i, 0]):
+            if np.linalg.norm(uv[rivals] - uv[i], axis=1).min() >= APART_PX:
+                keep.append(i)
+        else:
+            theirs = box[rivals]
+            in_theirs = ((uv[i] >= theirs[:, :2]) & (uv[i] <= theirs[:, 2:])).all(axis=1)
+            in_mine = ((uv[rivals] >= box[i, :2]) & (uv[rivals] <= box[i, 2:])).all(axis=1)
+            if not (in_theirs | in_mine).any() and shared(box[i], theirs).max() < _SAME_BOX:
+                keep.append(i)
+    return keep
+
+
+def shared(box: Float[np.ndarray, "4"], others: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, " N"]:
+    """Intersection of a box with others over their union."""
+    both = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    inner = both.clip(0).prod(axis=1)
+    return inner / ((box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1) - inner)
+
+
+def _carrier(uv: Float[np.ndarray, "N 2"], panels: Panels) -> Int[np.ndarray, " N"]:
+    """The smallest panel around each point that is likelier there than not, -1 for none."""
+    box = panels.box_px
+    around = ((uv[:, None] >= box[:, :2]) & (uv[:, None] <= box[:, 2:])).all(axis=-1) & (panels.logit > 0)
+    if not around.any():
+        return np.full(len(uv), -1)
+    area = np.where(around, (box[:, 2:] - box[:, :2]).prod(axis=1), np.inf)
+    return np.where(around.any(axis=1), area.argmin(axis=1), -1)

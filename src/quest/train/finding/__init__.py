@@ -1,0 +1,1 @@
+"""How the finder learns: from labelled pictures and from takes."""

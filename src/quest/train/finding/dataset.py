@@ -1,0 +1,103 @@
+"""From labelled pictures and take stores to cuts: which of them teach, which choose, and their views."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from quest.data.boxed_pictures import BoxedPicture, may_choose, read_boxed_pictures
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.model.finder import FinderNetwork
+from quest.train.dataset import part_of
+from quest.train.finding.sampler import FinderSampler
+from quest.train.finding.settings import FinderSamplerConfig
+from quest.train.finding.views import Source, ViewCache, of_pictures, of_takes
+
+_CHOOSING_VIEWS = 1
+_UNKNOWN = ("", "unknown")
+
+
+@dataclass(frozen=True)
+class FinderData:
+    """Cuts to learn from and views to choose by."""
+
+    training: FinderSampler
+    """Of what teaches."""
+    validation: FinderSampler
+    """Of what chooses."""
+    about: str
+    """How much teaches, in words."""
+    sources: frozenset[str]
+    """Of the takes that teach."""
+
+
+def open_finder_data(
+    network: FinderNetwork,
+    *,
+    pictures: Sequence[Path],
+    free: bool,
+    stores: Sequence[str | Path],
+    validation_stores: Sequence[str | Path],
+    cache: Path,
+    views: int,
+    frames: int,
+    config: FinderSamplerConfig,
+    report: Callable[[int, int], None],
+) -> FinderData:
+    """Divide pictures and takes, and make their views.
+
+    Args:
+        network: whose transformer looks.
+        pictures: labelled sets (see :func:`quest.data.boxed_pictures.read_boxed_pictures`).
+        free: whether only pictures that name a licence are used.
+        stores: take stores; with ``validation_stores``, objects that are in no part of the split teach too.
+        validation_stores: take stores to choose by.
+        cache: folder of the views.
+        views: views of each picture or frame that teaches.
+        frames: frames of each view of a take.
+        config: how cuts are drawn.
+        report: told pictures and frames done, and all of them.
+
+    Raises:
+        InputError: labels cannot be read.
+        ConfigError: nothing is left to teach or to choose.
+    """
+    boxed = [p for path in pictures for p in read_boxed_pictures(path) if p.licence not in _UNKNOWN or not free]
+    labelled = {part: _of(boxed, choosing=part == "validation") for part in ("train", "validation")}
+    simulated: dict[str, list[Source]] = {"train": [], "validation": []}
+    takes, taught_by = 0, set[str]()
+    for folders, role in ((stores, "train"), (validation_stores or stores, "validation")):
+        for folder in folders:
+            store = TakeStore(folder)
+            for name, info in store.infos().items():
+                part = part_of(info)
+                if part == role or (part == "unlisted" and validation_stores):
+                    simulated[role] += of_takes(store, [name], frames=frames)
+                    if role == "train":
+                        takes, taught_by = takes + 1, taught_by | {info.source}
+    for part, verb in (("train", "teach"), ("validation", "choose")):
+        if not labelled[part] and not simulated[part]:
+            raise ConfigError(f"training: no pictures and no takes are left to {verb}; give more of them")
+    known = ViewCache(cache, network)
+    total, done = sum(len(s) for sources in (labelled, simulated) for s in sources.values()), 0
+    paths: dict[tuple[str, str], list[Path]] = {}
+    for kind, sources in (("pictures", labelled), ("takes", simulated)):
+        for part, own in sources.items():
+            count = views if part == "train" else _CHOOSING_VIEWS
+            paths[kind, part] = []
+            for source in own:
+                paths[kind, part] += known.build([source], views=count)
+                done += 1
+                report(done, total)
+    return FinderData(
+        FinderSampler(paths["pictures", "train"], paths["takes", "train"], config),
+        FinderSampler(paths["pictures", "validation"], paths["takes", "validation"], config),
+        f"{len(labelled['train'])} pictures and {takes} takes",
+        frozenset(taught_by),
+    )
+
+
+def _of(pictures: Sequence[BoxedPicture], *, choosing: bool) -> list[Source]:
+    return of_pictures(pictures, only=[may_choose(picture.path.name) == choosing for picture in pictures])

@@ -1,0 +1,251 @@
+"""Batches of cuts of views, and the maps that the finder should give for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from quest.errors import ConfigError
+from quest.model.finder import COARSE_PX, FINE_PX, PANELS, PLACES, RELIEF, relief_of
+from quest.train.finding.marks import UNKNOWN, Marks
+from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
+from quest.train.finding.views import View, read_view
+
+_CONTEXT_PX = 16
+"""Side of what one token of a cut stands for, pixels."""
+_LEAST_CELLS = 0.6
+"""Standard deviation of the smallest mark in cells of its map ..."""
+_SPREAD = 6.0
+"""... and of larger ones, as a part of their side."""
+_ZOOM = (0.5, 1.5)
+"""How much larger than the view a cut shows it."""
+_EXTENT_WHERE = 0.3
+"""Extents are learned where a mark's weight is above this."""
+
+
+@dataclass(frozen=True)
+class FinderInputs:
+    """What the network sees."""
+
+    rgb: Float[Tensor, "B 3 S S"]
+    """Colours from 0 to 1."""
+    context: Float[Tensor, "B E r c"]
+    """What the transformer sees."""
+    relief: Float[Tensor, "B R S S"]
+    """Zero where there is no depth."""
+
+    def to(self, device: torch.device) -> FinderInputs:
+        """The same on a device."""
+        return FinderInputs(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class FinderTruth:
+    """What the maps should be."""
+
+    place: Float[Tensor, "B P h w"]
+    """1 at a place, falling off around it."""
+    panel: Float[Tensor, "B Q H W"]
+    """The same of panels."""
+    known: Bool[Tensor, "B C"]
+    """Which kinds are labelled in the picture."""
+    extent: Float[Tensor, "B 4 h w"]
+    """Pixels to the edges of the grip that a cell belongs to."""
+    weight: Float[Tensor, "B h w"]
+    """How much a cell belongs to it, 0 for none."""
+    panel_extent: Float[Tensor, "B 4 H W"]
+    """The same of panels."""
+    panel_weight: Float[Tensor, "B H W"]
+    """The same of panels."""
+    knob: Int[Tensor, "B h w"]
+    """Of cells in which a grip is, -1 where not known."""
+    lift: Int[Tensor, "B h w"]
+    """Of cells in which a place is, -1 where not known."""
+    opening: Int[Tensor, "B H W"]
+    """Of cells that belong to a panel, -1 where not known."""
+
+    def to(self, device: torch.device) -> FinderTruth:
+        """The same on a device."""
+        return FinderTruth(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """A cut of a view, everything random about it drawn."""
+
+    path: Path
+    seed: int
+    """Of what is random about it."""
+    aimed: bool
+    """Whether a labelled thing is in it."""
+    no_depth: bool
+
+
+@dataclass(frozen=True)
+class FinderPlan:
+    """The cuts of one batch."""
+
+    cuts: tuple[_Cut, ...]
+    size_px: int
+
+    def part(self, rows: slice) -> FinderPlan:
+        """Some of them."""
+        return FinderPlan(self.cuts[rows], self.size_px)
+
+    def __len__(self) -> int:
+        return len(self.cuts)
+
+
+class FinderSampler:
+    """Draws batches of cuts.
+
+    Args:
+        pictures: views of labelled pictures.
+        takes: views of simulated frames.
+        config: how they are drawn.
+
+    Raises:
+        ConfigError: there are no views.
+    """
+
+    def __init__(self, pictures: Sequence[Path], takes: Sequence[Path], config: FinderSamplerConfig) -> None:
+        self.config = config
+        self.pictures, self.takes = list(pictures), list(takes)
+        if not self.pictures and not self.takes:
+            raise ConfigError("finding: expected labelled pictures or takes to learn from, got none")
+
+    def plan(self, rng: np.random.Generator, *, disturb: bool = True) -> FinderPlan:
+        """The cuts of one batch."""
+        config, cuts = self.config, []
+        share = config.take_share if self.pictures and self.takes else float(not self.pictures)
+        for _ in range(config.batch):
+            views = self.takes if rng.random() < share else self.pictures
+            path = views[int(rng.integers(len(views)))]
+            aimed, no_depth = rng.random(2) < (config.aimed_share, config.depth_drop_share)
+            cuts.append(_Cut(path, int(rng.integers(2**31)), bool(aimed), bool(no_depth)))
+        return FinderPlan(tuple(cuts), config.cut_px)
+
+    def load(self, plan: FinderPlan) -> tuple[FinderInputs, FinderTruth]:
+        """Read what a plan, or a part of one, names."""
+        size = plan.size_px
+        seen = [_see(read_view(cut.path), cut, size) for cut in plan.cuts]
+        rgb, context, relief, marks = zip(*seen, strict=True)
+        maps = [targets(each, size) for each in marks]
+        truth = {name: torch.from_numpy(np.stack([m[name] for m in maps])) for name in maps[0]}
+        return FinderInputs(torch.stack(rgb), torch.stack(context), torch.stack(relief)), FinderTruth(**truth)
+
+
+def whole_view(view: View) -> FinderInputs:
+    """A view as the network sees it, uncut (B = 1)."""
+    rgb = torch.from_numpy(view.rgb).permute(2, 0, 1).float() / 255
+    stands_out = torch.zeros(1, RELIEF, VIEW_PX, VIEW_PX)
+    if view.depth_m is not None:
+        stands_out = relief_of(torch.from_numpy(view.depth_m)[None])
+    return FinderInputs(rgb[None], torch.from_numpy(view.context).float()[None], stands_out)
+
+
+def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor, Tensor, Marks]:
+    """A part of a view at another scale, perhaps mirrored, in other colours."""
+    rng = np.random.default_rng(cut.seed)
+    side = min(round(size / np.exp(rng.uniform(*np.log(_ZOOM)))), VIEW_PX)
+    corner, mirrored = _corner(view.marks, rng, side, aimed=cut.aimed), bool(rng.random() < 0.5)
+
+    def part(image: np.ndarray, how: int) -> np.ndarray:
+        own = image[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
+        return cv2.resize(own[:, ::-1] if mirrored else own, (size, size), interpolation=how)
+
+    rgb = part(view.rgb, cv2.INTER_AREA if side > size else cv2.INTER_LINEAR).astype(np.float32) / 255
+    rgb = rgb * np.exp(rng.normal(0, 0.1, 3) + rng.normal(0, 0.1)).astype(np.float32)
+    if rng.random() < 0.3:
+        rgb = rgb + rng.normal(0, rng.uniform(0.01, 0.05), rgb.shape).astype(np.float32)
+    if rng.random() < 0.1:
+        rgb = np.repeat(rgb.mean(axis=-1, keepdims=True), 3, axis=-1)
+    stands_out = torch.zeros(RELIEF, size, size)
+    if view.depth_m is not None and not cut.no_depth:
+        stands_out = relief_of(torch.from_numpy(part(view.depth_m, cv2.INTER_NEAREST_EXACT))[None])[0]
+    scale = np.full(2, size / side)
+    shift = -corner * scale
+    if mirrored:
+        scale[0], shift[0] = -scale[0], size - shift[0]
+    marks = view.marks.warped(scale, shift, (size, size))
+    image = torch.from_numpy(np.ascontiguousarray(rgb.clip(0, 1))).permute(2, 0, 1)
+    return image, _context(view, corner, side, size, mirrored=mirrored), stands_out, marks
+
+
+def _corner(marks: Marks, rng: np.random.Generator, side: int, *, aimed: bool) -> Int[np.ndarray, "2"]:
+    """Left and upper edge of a cut."""
+    room = VIEW_PX - side
+    low, high = np.zeros(2), np.full(2, room)
+    if aimed and len(marks):
+        at = marks.point_px[rng.integers(len(marks))]
+        low, high = (np.clip(at - share * side, 0, room) for share in (0.9, 0.1))
+    return np.floor(rng.uniform(low, high + 1e-6)).astype(int)
+
+
+def _context(
+    view: View, corner: Int[np.ndarray, "2"], side: int, size: int, *, mirrored: bool
+) -> Float[Tensor, "E r c"]:
+    """What the transformer sees in a cut: tokens of the view, interpolated."""
+    tokens = view.context.shape[-1]
+    # In tokens, as an index of the first one and a place after it.
+    step = (np.arange(size // _CONTEXT_PX) + 0.5) * _CONTEXT_PX / size
+    place = (corner[:, None] + step * side) * tokens / VIEW_PX - 0.5
+    low = np.clip(np.floor(place[:, 0]).astype(int), 0, tokens - 1)
+    high = np.clip(np.ceil(place[:, -1]).astype(int), 0, tokens - 1) + 1
+    seen = torch.from_numpy(view.context[:, low[1] : high[1], low[0] : high[0]]).float()
+    x, y = ((2 * (place[i] - low[i]) + 1) / (high[i] - low[i]) - 1 for i in (0, 1))
+    axes = [torch.from_numpy(axis.copy()).float() for axis in (x[::-1] if mirrored else x, y)]
+    grid = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)
+    return F.grid_sample(seen[None], grid[None], padding_mode="border", align_corners=False)[0]
+
+
+def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
+    """The maps that a cut should give, by their names in :class:`FinderTruth`."""
+    fine, coarse = size // FINE_PX, size // COARSE_PX
+    place = np.zeros((len(PLACES), fine, fine), np.float32)
+    panel = np.zeros((len(PANELS), coarse, coarse), np.float32)
+    extents = {FINE_PX: np.ones((4, fine, fine), np.float32), COARSE_PX: np.ones((4, coarse, coarse), np.float32)}
+    weights = {FINE_PX: np.zeros((fine, fine), np.float32), COARSE_PX: np.zeros((coarse, coarse), np.float32)}
+    knob, lift = (np.full((fine, fine), UNKNOWN) for _ in range(2))
+    opening = np.full((coarse, coarse), UNKNOWN)
+    # Larger panels first, so that of two that overlap the smaller one is learned.
+    area = (marks.box_px[:, 2:] - marks.box_px[:, :2]).prod(axis=1)
+    for i in np.argsort(-area, kind="stable"):
+        kind, box = int(marks.kind[i]), marks.box_px[i]
+        on_panel = kind >= len(PLACES)
+        stride = COARSE_PX if on_panel else FINE_PX
+        maps, index = (panel, kind - len(PLACES)) if on_panel else (place, kind)
+        cells = maps.shape[-1]
+        middle = np.clip(np.round(marks.point_px[i] / stride - 0.5), 0, cells - 1)
+        spread = np.maximum((box[2:] - box[:2]) / stride / _SPREAD, _LEAST_CELLS)
+        step = np.arange(cells)
+        across, down = (np.exp(-np.square(step - middle[k]) / (2 * spread[k] ** 2)) for k in (0, 1))
+        bump = (down[:, None] * across).astype(np.float32)
+        maps[index] = np.maximum(maps[index], bump)
+        own = bump > _EXTENT_WHERE
+        if on_panel:
+            opening[own] = marks.opening[i]
+        else:
+            lift[own] = marks.lift[i]
+        if on_panel or index == PLACES.index("grip"):
+            centre = (step + 0.5) * stride
+            edges = np.stack(np.broadcast_arrays(centre - box[0], (centre - box[1])[:, None], box[2] - centre,
+                                                 (box[3] - centre)[:, None]))  # fmt: skip
+            whole = (box[:2] > 0).all() and (box[2:] < size).all()  # edges out of sight cannot be learned
+            own = own & (edges > 0).all(axis=0) & whole
+            extents[stride][:, own], weights[stride][own] = edges[:, own], bump[own]
+            if not on_panel:
+                knob[own] = marks.knob[i]
+    return {
+        "place": place, "panel": panel, "known": marks.known, "extent": extents[FINE_PX], "weight": weights[FINE_PX],
+        "panel_extent": extents[COARSE_PX], "panel_weight": weights[COARSE_PX], "knob": knob, "lift": lift,
+        "opening": opening,
+    }  # fmt: skip

@@ -1,0 +1,239 @@
+"""Views: what the finder learns from, a square each, with what the frozen transformer sees in it, kept in a folder.
+
+A view is a picture scaled, mirrored, cut and degraded at random. Views are made once, because the transformer takes
+most of the time; what else is random comes when a view is drawn (:mod:`quest.train.finding.sampler`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from zipfile import BadZipFile
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+
+from quest.data.boxed_pictures import CLASSES, BoxedPicture, kind_of
+from quest.data.pictures import read_picture
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.model.finder import PLACES, FinderNetwork
+from quest.model.weights import weights_digest
+from quest.train.finding.marks import KINDS, UNKNOWN, Marks
+from quest.train.finding.settings import VIEW_PX
+from quest.train.finding.takes import marks_of
+from quest.whole_file import whole_file
+
+_LONGER_PX = (480.0, 1500.0)
+"""Longer side of the scaled picture."""
+_ASPECT = 1.1
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where views come from: a picture, or a frame of a take."""
+
+    name: str
+    """Unique; two with the same name give the same views."""
+    read: Callable[[], tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"] | None, Marks]]
+    """Colours, depth in metres (0 where missing) or None, and marks."""
+
+
+def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> list[Source]:
+    """Labelled pictures as sources.
+
+    Kinds count as labelled throughout that any picture has; a set without knobs calls them handles.
+
+    Args:
+        pictures: a whole set.
+        only: which of them are wanted.
+
+    Raises:
+        ConfigError: no class is one that the finder knows.
+    """
+    if not pictures:
+        return []
+    classes = {name for picture in pictures for name in picture.names}
+    known = {name: kind for name in classes if (kind := kind_of(name))[0]}
+    if not known:
+        raise ConfigError(
+            f"pictures: expected classes such as {', '.join(CLASSES)}, got {', '.join(sorted(classes)) or 'none'}"
+        )
+    labelled = np.isin(KINDS, [kind for kind, _ in known.values()])
+    tells_knobs = any(knob for _, knob in known.values())
+
+    def reader(picture: BoxedPicture) -> Callable[[], tuple[np.ndarray, None, Marks]]:
+        def read() -> tuple[np.ndarray, None, Marks]:
+            rows = [i for i, name in enumerate(picture.names) if name in known]
+            kind = np.array([KINDS.index(known[picture.names[i]][0]) for i in rows], np.int64)
+            told = [known[picture.names[i]][1] if tells_knobs else None for i in rows]
+            knob = np.array([UNKNOWN if k is None else int(k) for k in told], np.int64)
+            unknown = np.full(len(rows), UNKNOWN)
+            # What one takes hold of in a picture of a room opens something.
+            lift = np.where(kind < len(PLACES), 0, UNKNOWN)
+            box = picture.box_px[rows]
+            middle = (box[:, :2] + box[:, 2:]) / 2
+            return read_picture(picture.path), None, Marks(kind, box, middle, knob, lift, unknown, known=labelled)
+
+        return read
+
+    return [
+        Source(f"{picture.path.parent.parent.name}-{picture.path.name}", reader(picture))
+        for picture, wanted in zip(pictures, only, strict=True)
+        if wanted
+    ]
+
+
+def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Source]:
+    """Frames of takes as sources.
+
+    Args:
+        store: where they are.
+        names: of the takes.
+        frames: how many of each view, spread over its time; the first is one of them.
+    """
+    sources = []
+    for name in names:
+        header = store.header(name)
+        picked = np.unique(np.linspace(0, header.frames, frames, endpoint=False).astype(int)).tolist()
+        for v in range(len(header.cameras)):
+            for t in picked:
+
+                def read(name: str = name, v: int = v, t: int = t) -> tuple[np.ndarray, np.ndarray | None, Marks]:
+                    take = store.read(name, frames=slice(0, t + 1))
+                    clip = take.views[v].clip
+                    depth_m = None if clip.depth_m is None else clip.depth_m[t]
+                    return clip.rgb[t], depth_m, marks_of(take, take.views[v], t)
+
+                sources.append(Source(f"{name}-{v}-{t}", read))
+    return sources
+
+
+@dataclass(frozen=True)
+class View:
+    """A square cut of a picture."""
+
+    rgb: UInt8[np.ndarray, "S S 3"]
+    """Colours."""
+    depth_m: Float32[np.ndarray, "S S"] | None
+    """Metres, 0 where missing."""
+    context: np.ndarray
+    """What the transformer sees in it, float16 [E, r, c]."""
+    marks: Marks
+    """What is labelled in it."""
+
+
+class ViewCache:
+    """A folder of views; what is there is not made again.
+
+    Args:
+        folder: where; one below it for every transformer.
+        network: whose transformer looks.
+    """
+
+    def __init__(self, folder: Path, network: FinderNetwork) -> None:
+        self._network = network
+        self._folder = folder / weights_digest(network.encoder)[:16]
+
+    def path(self, source: Source, number: int) -> Path:
+        """Where a view of a source is kept."""
+        return self._folder / f"{hashlib.sha256(source.name.encode()).hexdigest()[:20]}-{number}.npz"
+
+    def build(self, sources: Sequence[Source], *, views: int) -> Iterator[Path]:
+        """Files of the views of sources, one after the other as they are there."""
+        for source in sources:
+            missing = [n for n in range(views) if not self.path(source, n).is_file()]
+            picture = source.read() if missing else None
+            for number in range(views):
+                path = self.path(source, number)
+                if picture is not None and number in missing:
+                    seed = int(hashlib.sha256(f"{source.name} {number}".encode()).hexdigest()[:12], 16)
+                    _write(path, self._look(*draw_view(*picture, np.random.default_rng(seed))))
+                yield path
+
+    def _look(self, rgb: np.ndarray, depth_m: np.ndarray | None, marks: Marks) -> View:
+        image = torch.from_numpy(rgb).permute(2, 0, 1)[None].to(next(self._network.parameters()).device) / 255
+        context = self._network.context_of(image)[0].half().cpu().numpy()
+        return View(rgb, depth_m, context, marks)
+
+
+def read_view(path: Path) -> View:
+    """A view of a cache.
+
+    Raises:
+        ConfigError: the file is torn.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            marks = Marks(**{f.name: file[f.name] for f in fields(Marks)})
+            depth_m = file.get("depth_m")
+            return View(file["rgb"], depth_m, file["context"], marks)
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
+        raise ConfigError(f"{path}: a torn view ({error}); delete it, it is made again") from error
+
+
+def _write(path: Path, view: View) -> None:
+    arrays = {"rgb": view.rgb, "context": view.context, **{f.name: getattr(view.marks, f.name) for f in fields(Marks)}}
+    if view.depth_m is not None:
+        arrays["depth_m"] = view.depth_m.astype(np.float32)
+    with whole_file(path) as unfinished:
+        np.savez(unfinished, **arrays)
+
+
+def draw_view(
+    rgb: UInt8[np.ndarray, "H W 3"], depth_m: np.ndarray | None, marks: Marks, rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "S S 3"], np.ndarray | None, Marks]:
+    """A picture scaled, mirrored, cut to a square, and degraded."""
+    size = np.array([rgb.shape[1], rgb.shape[0]], float)
+    longer = np.exp(rng.uniform(*np.log(_LONGER_PX)))
+    stretch = _ASPECT ** rng.uniform(-0.5, 0.5)
+    scale = longer / size.max() * np.array([stretch, 1 / stretch])
+    room = VIEW_PX - size * scale
+    shift = rng.uniform(np.minimum(room, 0), np.maximum(room, 0))
+    signed, mirrored = scale.copy(), bool(rng.random() < 0.5)
+    if mirrored:
+        signed[0], shift[0] = -scale[0], shift[0] + size[0] * scale[0]
+    fill = rng.integers(0, 256, 3)
+    how = cv2.INTER_AREA if scale.max() < 1 else cv2.INTER_LINEAR
+    whole = np.maximum(1, np.round(size * scale)).astype(int)
+    # Scaled first, so that what shrinks is averaged; then moved by whole pixels.
+    view = _cut(cv2.resize(rgb, tuple(whole.tolist()), interpolation=how), mirrored, shift, fill)
+    deep = None
+    if depth_m is not None:
+        nearest = cv2.resize(depth_m, tuple(whole.tolist()), interpolation=cv2.INTER_NEAREST_EXACT)
+        deep = _cut(nearest, mirrored, shift, np.zeros(1))
+    return _degraded(view, rng), deep, marks.warped(signed, shift, (VIEW_PX, VIEW_PX))
+
+
+def _cut(image: np.ndarray, mirrored: bool, shift: np.ndarray, fill: np.ndarray) -> np.ndarray:
+    """A square out of an image, whose left upper corner (mirrored: right upper) lies at a shift."""
+    rows, columns = image.shape[:2]
+    image = image[:, ::-1] if mirrored else image
+    x, y = np.round(shift).astype(int).tolist()
+    x -= columns if mirrored else 0
+    out = np.empty((VIEW_PX, VIEW_PX, *image.shape[2:]), image.dtype)
+    out[:] = fill if image.ndim == 3 else fill[0]
+    left, top, right, bottom = max(x, 0), max(y, 0), min(x + columns, VIEW_PX), min(y + rows, VIEW_PX)
+    out[top:bottom, left:right] = image[top - y : bottom - y, left - x : right - x]
+    return out
+
+
+def _degraded(rgb: UInt8[np.ndarray, "S S 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "S S 3"]:
+    """Another exposure, white balance and sharpness, and a real JPEG encoder."""
+    if rng.random() < 0.8:
+        gain = np.exp(rng.normal(0, 0.15, 3) + rng.normal(0, 0.2))
+        gamma = np.exp(rng.normal(0, 0.2))
+        table = (255 * (np.arange(256)[:, None] / 255 * gain).clip(0, 1) ** gamma).round().astype(np.uint8)
+        rgb = np.stack([table[rgb[..., i], i] for i in range(3)], axis=-1)
+    if rng.random() < 0.25:
+        rgb = cv2.GaussianBlur(rgb, (0, 0), rng.uniform(0.5, 2.0))
+    if rng.random() < 0.5:
+        quality = [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(30, 95))]
+        decoded = cv2.imdecode(cv2.imencode(".jpg", rgb[..., ::-1], quality)[1], cv2.IMREAD_COLOR)
+        assert decoded is not None
+        rgb = decoded[..., ::-1]
+    return np.ascontiguousarray(rgb)

@@ -1,0 +1,171 @@
+"""Stage find: marks, views, targets, losses, and that it learns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from quest.data.boxed_pictures import BoxedPicture
+from quest.errors import ConfigError
+from quest.model.finder import OPENINGS, PANELS, PLACES, FinderMaps
+from quest.model.found import read_off
+from quest.train.finding.marks import KINDS, UNKNOWN, Marks
+from quest.train.finding.objective import StageFind, _focal, _giou
+from quest.train.finding.sampler import FinderSampler, FinderTruth, targets
+from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
+from quest.train.finding.takes import marks_of
+from quest.train.finding.views import ViewCache, draw_view, of_pictures, read_view
+from tests.synthetic import make_take
+from tests.tiny import make_finder
+
+GRIP, CABINET = KINDS.index("grip"), KINDS.index("cabinet")
+
+
+def make_marks() -> Marks:
+    """A handle on a cabinet door that turns about its left edge, and a rim."""
+    return Marks(
+        kind=np.array([GRIP, CABINET, KINDS.index("rim")]),
+        box_px=np.array([[80.0, 40, 120, 56], [20, 10, 220, 210], [220, 110, 220, 110]]),
+        point_px=np.array([[100.0, 48], [120, 110], [220, 110]]),
+        knob=np.array([0, UNKNOWN, UNKNOWN]),
+        lift=np.array([0, UNKNOWN, 0]),
+        opening=np.array([UNKNOWN, OPENINGS.index("left"), UNKNOWN]),
+        known=np.ones(len(KINDS), bool),
+    )
+
+
+def test_mirrored_marks_open_the_other_way_round() -> None:
+    marks = make_marks().warped(np.array([-1.0, 1.0]), np.array([256.0, 0.0]), (256, 256))
+    assert OPENINGS[marks.opening[1]] == "right"
+    np.testing.assert_allclose(marks.box_px[0], [136, 40, 176, 56])
+    np.testing.assert_allclose(marks.point_px[2], [36, 110])
+
+
+def test_marks_whose_point_is_cut_off_are_left_out() -> None:
+    marks = make_marks().warped(np.ones(2), np.array([-115.0, 0.0]), (256, 256))
+    assert [KINDS[k] for k in marks.kind] == ["cabinet", "rim"]
+    np.testing.assert_allclose(marks.box_px[0], [-95, 10, 105, 210])
+
+
+def test_edges_that_are_cut_off_are_not_learned() -> None:
+    whole, cut = (targets(make_marks().warped(np.ones(2), np.array([x, 0.0]), (256, 256)), 256) for x in (0.0, -30.0))
+    assert (whole["panel_weight"] > 0).any()
+    assert not (cut["panel_weight"] > 0).any()
+    assert cut["panel"].max() == 1
+
+
+def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
+    marks = make_marks()
+    maps = targets(marks, 256)
+    found = read_off(_perfect(maps), scale=np.array([2.0, 2.0]), size=(128, 128))
+    likely = found.select(found.logit > 0)
+    assert sorted(likely.labels) == ["handle", "rim"]
+    grip = likely.labels.index("handle")
+    np.testing.assert_allclose(likely.uv_px[grip], [50, 24], atol=2)
+    np.testing.assert_allclose(likely.box_px[grip], [40, 20, 60, 28], atol=0.1)
+    panel = likely.panel[grip]
+    np.testing.assert_allclose(likely.panels.box_px[panel], [10, 5, 110, 105], atol=0.1)
+    assert OPENINGS[likely.panels.opening_p[panel].argmax()] == "left"
+
+
+def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
+    truth = {name: torch.from_numpy(value)[None] for name, value in maps.items()}
+    logit = lambda p: 20 * (p - 0.9)  # noqa: E731
+    opening = torch.nn.functional.one_hot(truth["opening"].clamp(min=0), len(OPENINGS)).permute(0, 3, 1, 2).float()
+    return FinderMaps(
+        logit(truth["place"]), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
+        logit(truth["panel"]), truth["panel_extent"], 10 * opening,
+    )  # fmt: skip
+
+
+def test_what_is_not_labelled_costs_nothing() -> None:
+    logit, nothing = torch.full((1, 2, 8, 8), 3.0), torch.zeros(1, 2, 8, 8)
+    assert float(_focal(logit, nothing, torch.tensor([[False, False]]))) == 0
+    assert float(_focal(logit, nothing, torch.tensor([[True, False]]))) > 1
+
+
+def test_extents_of_the_same_box_cost_nothing_and_others_more() -> None:
+    true = torch.rand(2, 4, 6, 6) * 20 + 1
+    weight = torch.rand(2, 6, 6)
+    assert float(_giou(true, true, weight)) == pytest.approx(0, abs=1e-5)
+    assert float(_giou(2 * true, true, weight)) == pytest.approx(0.75, abs=1e-4)
+
+
+def test_views_are_squares_whose_boxes_stay_on_what_they_marked() -> None:
+    rgb = np.zeros((240, 320, 3), np.uint8)
+    rgb[100:140, 200:260] = 255
+    marks = replace(make_marks().only(np.array([True, False, False])), box_px=np.array([[200.0, 100, 260, 140]]),
+                    point_px=np.array([[230.0, 120]]))  # fmt: skip
+    depth_m = np.where(rgb[..., 0] > 0, 1.0, 2.0).astype(np.float32)
+    for seed in range(8):
+        view, deep, moved = draw_view(rgb, depth_m, marks, np.random.default_rng(seed))
+        assert view.shape == (VIEW_PX, VIEW_PX, 3)
+        assert deep is not None
+        for box in moved.box_px:
+            x0, y0, x1, y1 = box.round().astype(int)
+            assert (deep[y0 + 3 : y1 - 3, x0 + 3 : x1 - 3] == 1).all()
+            edge = deep[max(y0 - 8, 0) : y1 + 8, max(x0 - 8, 0) : x1 + 8]
+            assert (edge == 1).sum() < 1.15 * max((x1 - x0) * (y1 - y0), 1) + 100
+
+
+def test_marks_of_a_take_say_what_is_seen() -> None:
+    take = make_take()
+    marks = marks_of(take, take.views[0], 0)
+    seen = [e for i, e in enumerate(take.info.entities) if take.views[0].visible[0, i]]
+    assert (marks.kind < len(PLACES)).sum() == len(seen)
+    assert marks.known[: len(PLACES)].all()
+    for box, point in zip(marks.box_px, marks.point_px, strict=True):
+        assert (point >= box[:2]).all()
+        assert (point <= box[2:]).all()
+
+
+def test_pictures_without_known_classes_are_refused() -> None:
+    picture = BoxedPicture(Path("a.jpg"), ("cat",), np.array([[0.0, 0, 1, 1]]))
+    with pytest.raises(ConfigError, match="handle"):
+        of_pictures([picture], only=[True])
+
+
+def test_a_finder_learns_a_white_handle(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    rng = np.random.default_rng(0)
+    pictures = []
+    (tmp_path / "set" / "pictures").mkdir(parents=True)
+    for i in range(2):
+        rgb = np.full((480, 640, 3), 60, np.uint8)
+        x, y = rng.integers(100, 400, 2).tolist()
+        rgb[y : y + 30, x : x + 90] = 255
+        path = tmp_path / "set" / "pictures" / f"{i}.png"
+        Image.fromarray(rgb).save(path)
+        pictures.append(BoxedPicture(path, ("handle",), np.array([[x, y, x + 90, y + 30]], float)))
+    network = make_finder()
+    paths = list(ViewCache(tmp_path / "cache", network).build(of_pictures(pictures, only=[True, True]), views=2))
+    assert paths == list(
+        ViewCache(tmp_path / "cache", network).build(of_pictures(pictures, only=[True, True]), views=2)
+    )
+    assert read_view(paths[0]).rgb.shape == (VIEW_PX, VIEW_PX, 3)
+    sampler = FinderSampler(paths, [], FinderSamplerConfig(batch=2, cut_px=320))
+    stage = StageFind(network)
+    optimizer = torch.optim.AdamW(stage.trained(), lr=2e-3)
+    first = last = 0.0
+    network.train()
+    for _ in range(12):
+        frames, truth = sampler.load(sampler.plan(rng))
+        assert isinstance(truth, FinderTruth)
+        losses = stage.losses(frames, truth)
+        total = sum(stage.weights[name] * value for name, value in losses.items())
+        assert isinstance(total, torch.Tensor)
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        value = float(total.detach())
+        first, last = first or value, value
+    assert last < 0.8 * first
+    scores = stage.validate(sampler, batches=1, device=torch.device("cpu"))
+    assert scores.present == 2
+    assert 0 <= scores.precision <= 1
+    assert all(name in PANELS or name in PLACES for name in KINDS)
