@@ -30,7 +30,7 @@ import quest
 from quest.cli.main import main
 from quest.data.boxed_pictures import read_boxed_pictures
 from quest.model.weights import DEFAULTS, load_network, shipped_weights
-from quest.train.dataset import licence_after
+from quest.train.dataset import PARTNET, UNSTATED, licence_after
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
@@ -166,7 +166,7 @@ class Release:
 
     def _ship(self) -> None:
         made = load_network(self._weights)
-        licence = licence_after("Apache-2.0", [] if self.free else ["partnet-mobility"])
+        licence = licence_after("Apache-2.0", [] if self.free else [PARTNET, UNSTATED])
         (ASSETS / "weights").mkdir(parents=True, exist_ok=True)
         shipped = replace(made, licence=licence, version=quest.__version__)
         beside = None if self.beside is None else shipped_weights()[self.beside]

@@ -218,13 +218,6 @@ RESULTS = Page(
             rows="",
             about="Three views of 224 × 224 pixels.",
         ),
-        Table(
-            "speed/training.json",
-            "Training steps beside bare steps of the same network",
-            "windows = batch | frames/s = frames_per_s | bare steps = bare_frames_per_s | "
-            "share of bare % = %share_of_bare",
-            rows="",
-        ),
     ),
 )
 
@@ -254,6 +247,13 @@ HISTORY = Page(
             "Scene flow: EPE3D",
             OBJECTS + "stride = stride | reading = reading | objects/takes/entities = objects/takes/entities | "
             "flow head = epe.head | zero flow = epe.zero | lifted points = epe.lifted",
+        ),
+        Table(
+            "speed/training.json",
+            "Training steps beside bare steps of the same network",
+            "windows = batch | frames/s = frames_per_s | bare steps = bare_frames_per_s | "
+            "share of bare % = %share_of_bare",
+            rows="",
         ),
         Table(
             "endurance/endurance.json",

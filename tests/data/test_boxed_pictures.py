@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import ExifTags, Image
 
 from quest.data.boxed_pictures import kind_of, may_choose, read_boxed_pictures
 from quest.errors import InputError
@@ -75,13 +75,28 @@ def test_what_cannot_be_understood_is_said(tmp_path: Path) -> None:
     (folder / "labels" / "train" / "b.txt").write_text("9 0.5 0.5 0.1 0.1\n")
     with pytest.raises(InputError, match=r"b\.txt"):
         read_boxed_pictures(folder)
+    (folder / "labels" / "train" / "b.txt").unlink()
+    (folder / "images" / "train" / "b.png").write_bytes(b"no picture")
+    with pytest.raises(InputError, match=r"b\.png"):
+        read_boxed_pictures(folder)
     table = make_table(tmp_path / "table")
     (table / "pictures" / "b.png").unlink()
     with pytest.raises(InputError, match="expected a picture"):
         read_boxed_pictures(table)
+    (table / "labels.csv").write_text("file,x0,y0,x1,y1\na.png,10,20,50,40\n")
+    with pytest.raises(InputError, match="none named class"):
+        read_boxed_pictures(table)
     (table / "labels.csv").write_text("file,class,x0,y0,x1,y1\na.png,handle,50,20,10,40\n")
     with pytest.raises(InputError, match="in order"):
         read_boxed_pictures(table)
+
+
+def test_pictures_that_are_to_be_turned_have_boxes_as_they_are_seen(tmp_path: Path) -> None:
+    folder = make_yolo(tmp_path)
+    exif = Image.Exif()
+    exif[ExifTags.Base.Orientation] = 6
+    Image.fromarray(np.zeros((100, 80, 3), np.uint8)).save(folder / "images" / "train" / "a.png", exif=exif)
+    np.testing.assert_allclose(read_boxed_pictures(folder)[0].box_px[0], BOX)
 
 
 def test_a_fifth_chooses() -> None:

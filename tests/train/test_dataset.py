@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from quest.errors import ConfigError
-from quest.train.dataset import Dataset, licence_after, open_dataset
+from quest.train.dataset import UNSTATED, Dataset, licence_after, open_dataset
 from quest.train.settings import WindowConfig
 from tests.paper.tiny import make_paper
 from tests.train.prepared import CPU, make_store
@@ -51,6 +51,9 @@ def test_the_licence_says_what_taught():
     assert licence_after("Apache-2.0", {"procedural", "partnet-mobility"}) == bound
     assert licence_after(bound, {"partnet-mobility"}) == bound
     assert licence_after("", {"partnet-mobility"}) == ""
+    unstated = licence_after("Apache-2.0", {UNSTATED})
+    assert "pictures" in unstated
+    assert licence_after(unstated, {UNSTATED}) == unstated
 
 
 def test_own_objects_need_a_store_to_choose_by(tmp_path: Path):

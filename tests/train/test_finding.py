@@ -10,10 +10,12 @@ import pytest
 import torch
 from PIL import Image
 
-from quest.data.boxed_pictures import BoxedPicture
+from quest.data.boxed_pictures import BoxedPicture, may_choose
 from quest.errors import ConfigError
 from quest.model.finder import OPENINGS, PANELS, PLACES, FinderMaps
 from quest.model.found import read_off
+from quest.train.dataset import UNSTATED
+from quest.train.finding.dataset import FinderData, open_finder_data
 from quest.train.finding.marks import KINDS, UNKNOWN, Marks
 from quest.train.finding.objective import StageFind, _focal, _giou
 from quest.train.finding.sampler import FinderSampler, FinderTruth, targets
@@ -128,6 +130,41 @@ def test_pictures_without_known_classes_are_refused() -> None:
     picture = BoxedPicture(Path("a.jpg"), ("cat",), np.array([[0.0, 0, 1, 1]]))
     with pytest.raises(ConfigError, match="handle"):
         of_pictures([picture], only=[True])
+
+
+def make_set(folder: Path, *, name: str, value: int, licence: str = "") -> Path:
+    """A labelled set of ten pictures ``0.png`` ... with one box each."""
+    (folder / "pictures").mkdir(parents=True)
+    lines = ["file,class,x0,y0,x1,y1,licence"]
+    for i in range(10):
+        Image.fromarray(np.full((60, 80, 3), value + i, np.uint8)).save(folder / "pictures" / f"{i}.png")
+        lines.append(f"{i}.png,{name},10,10,40,30,{licence}")
+    (folder / "labels.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def test_sets_of_pictures_keep_apart(tmp_path: Path) -> None:
+    """Files of one name in two sets are two pictures; what one set has labelled says nothing of the other."""
+    handles = make_set(tmp_path / "a" / "same", name="handle", value=10, licence="CC BY 4.0")
+    knobs = make_set(tmp_path / "b" / "same", name="knob", value=200)
+    network = make_finder()
+
+    def opened(*, free: bool = False) -> FinderData:
+        return open_finder_data(
+            network, pictures=[handles, knobs], free=free, stores=[], validation_stores=[], cache=tmp_path / "cache",
+            views=1, frames=1, config=FinderSamplerConfig(), report=lambda done, total: None,
+        )  # fmt: skip
+
+    data = opened()
+    views = [read_view(path) for path in data.training.pictures]
+    assert len(set(data.training.pictures)) == 2 * sum(not may_choose(f"{i}.png") for i in range(10))
+    told = {int(knob) for view in views for knob in view.marks.knob}
+    assert told == {UNKNOWN, 1}  # a set without knobs has grips of either kind
+    assert data.sources == {UNSTATED}
+    assert opened(free=True).sources == set()
+    before = data.training.pictures[0]
+    (handles / "labels.csv").write_text((handles / "labels.csv").read_text().replace("10,10,40,30", "12,10,40,30"))
+    assert before not in opened().training.pictures  # other labels, other views
 
 
 def test_a_finder_learns_a_white_handle(tmp_path: Path) -> None:

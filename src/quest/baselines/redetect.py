@@ -96,11 +96,10 @@ class Redetect:
     def detect(self, clip: Clip, t: int) -> Detections:
         """What is found in frame ``t``."""
         found = self.tracker.find(clip.camera, clip.frame(t))
-        exists = 1 / (1 + np.exp(-found.logit))
-        kept = np.flatnonzero((exists > self.tracker.config.threshold) & np.isin(found.labels, LABELS))
+        kept = np.flatnonzero((found.p > self.tracker.config.threshold) & np.isin(found.labels, LABELS))
         found, uv_px = found.select(kept), found.uv_px[kept].astype(np.float32)
         point = lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None])[0]
-        return Detections(uv_px, point, found.labels, exists[kept].astype(np.float32))
+        return Detections(uv_px, point, found.labels, found.p.astype(np.float32))
 
     def _discover(self, clip: Clip) -> Tracks:
         start = self.detect(clip, 0)

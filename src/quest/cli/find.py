@@ -98,7 +98,7 @@ def listed(found: Found, *, least: float) -> list[dict[str, Any]]:
 
     things = []
     for i, label in enumerate(found.labels):
-        p = 1 / (1 + np.exp(-found.logit[i]))
+        p = found.p[i]
         if p < least:
             continue
         thing: dict[str, Any] = {"label": label, "p": round(float(p), 3), "uv_px": found.uv_px[i].round(1).tolist()}

@@ -9,20 +9,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import yaml
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from PIL import Image
-from pyarrow import csv
 
-from quest.data.pictures import PICTURES
+from quest.data.columns import read_columns
+from quest.data.pictures import PICTURES, is_turned, upright
 from quest.errors import InputError
 
 EXPECTED = (
-    "expected a COCO file (.json), a YOLO data set (data.yaml, or folders images and labels), or a folder with "
-    "pictures/ and labels.csv"
+    "expected a COCO file (.json), a YOLO data set (its data.yaml or the folder of that), or a folder with pictures/ "
+    "and labels.csv"
 )
 _CHOOSING_EVERY = 5
+_OUT_PX, _OUT = 4.0, 0.125
 CLASSES: dict[str, tuple[str, bool | None]] = {
     **dict.fromkeys(("handle", "grip", "door handle", "drawer handle", "pull"), ("grip", False)),
     **dict.fromkeys(("knob", "door knob"), ("grip", True)),
@@ -82,6 +82,13 @@ def kind_of(name: str) -> tuple[str, bool | None]:
     return CLASSES.get(name.strip().lower(), ("", None))
 
 
+def in_boxes(box_px: Float[np.ndarray, "H 4"], uv_px: Float[np.ndarray, "A 2"]) -> Bool[np.ndarray, "A H"]:
+    """Which points are right about which boxes: inside, where every edge is moved out by an eighth, at least 4 px."""
+    low, high = box_px[:, :2], box_px[:, 2:]
+    out = np.maximum(_OUT_PX, _OUT * (high - low))
+    return np.asarray(((uv_px[:, None] >= low - out) & (uv_px[:, None] <= high + out)).all(axis=-1))
+
+
 def may_choose(picture: str) -> bool:
     """Whether a picture is of the fifth that chooses, by the hash of its name; those of one building stay together."""
     group = "ward" if picture.startswith("ward-") else picture
@@ -89,16 +96,10 @@ def may_choose(picture: str) -> bool:
 
 
 def _table(folder: Path) -> Iterator[BoxedPicture]:
-    path = folder / "labels.csv"
     edges = ("x0", "y0", "x1", "y1")
-    types = {"file": pa.string(), "class": pa.string(), "licence": pa.string(), **dict.fromkeys(edges, pa.float64())}
-    convert = csv.ConvertOptions(column_types=types, include_columns=list(types), include_missing_columns=True)
-    try:
-        table = csv.read_csv(path, csv.ReadOptions(use_threads=False), convert_options=convert)
-    except pa.ArrowInvalid as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
-    file, name, licence = (table[key].fill_null("").to_numpy().astype(str) for key in ("file", "class", "licence"))
-    box = np.stack([table[key].fill_null(np.nan).to_numpy() for key in edges], axis=-1)
+    rows = read_columns(folder / "labels.csv", {"file": str, "class": str, **dict.fromkeys(edges, float)}, licence=str)
+    file, name, licence = (rows[key] for key in ("file", "class", "licence"))
+    box = np.stack([rows[key] for key in edges], axis=-1)
     for picture in np.unique(file[file != ""]).tolist():
         own = file == picture
         boxed = own & (name != "")
@@ -139,9 +140,13 @@ def _yolo(folder: Path, config: Path) -> Iterator[BoxedPicture]:
         at = len(parts) - 1 - parts[::-1].index("images")
         labels = Path(*parts[:at], "labels", *parts[at + 1 :]).with_suffix(".txt")
         own: list[tuple[str, list[float]]] = []
-        with Image.open(path) as image:
-            width, height = image.size
-        for line in labels.read_text(encoding="utf-8").splitlines() if labels.is_file() else ():
+        try:
+            with Image.open(path) as image:
+                width, height = (upright(image) if is_turned(image) else image).size
+            lines = labels.read_text(encoding="utf-8").splitlines() if labels.is_file() else []
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{path}: it or its labels {labels} cannot be read ({error}); copy them again") from error
+        for line in lines:
             if not line.strip():
                 continue
             try:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.optimize import minimize
+from scipy.special import expit
 
 from quest.errors import ConfigError
 from quest.evaluation.real.measures import score_picture
@@ -79,7 +80,7 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
     gain, bias = _fit(sets)
     threshold = _best_threshold([replace(a, logit=gain * a.logit + bias) for a in sets])
     rates = [_rates(replace(a, logit=gain * a.logit + bias), np.array([threshold])) for a in sets]
-    config = replace(tracker.config, gain=gain, bias=bias, threshold=float(1 / (1 + np.exp(-threshold))))
+    config = replace(tracker.config, gain=gain, bias=bias, threshold=float(expit(threshold)))
     precision, recall = zip(*((float(p[0]), float(r[0])) for p, r in rates), strict=True)
     return Tuned(config, tuple(found), precision, recall)
 

@@ -9,17 +9,16 @@ References: Zhou et al., Objects as Points, 2019, for maps of centres; Lin et al
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from quest.errors import ConfigError
+from quest.model.config import NetworkConfig
 from quest.model.efficientnet import WIDTHS, EfficientNet
-from quest.model.encoder import Encoder, EncoderConfig
+from quest.model.encoder import Encoder
 from quest.model.relief import relief
 
 PLACES = ("grip", "rim", "front", "hinge")
@@ -43,31 +42,12 @@ _RARE = -4.6
 """Logit of a place before anything is learned: one in a hundred."""
 
 
-@dataclass(frozen=True)
-class FinderConfig:
+@dataclass(frozen=True, kw_only=True)
+class FinderConfig(NetworkConfig):
     """Shape of the network."""
 
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    """Of the vision transformer; the side of its image says for which grid its places are stored."""
     width: int = 64
     """Channels of the pyramid."""
-
-    def to_json(self) -> str:
-        """One line, stored with the weights."""
-        return json.dumps(asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> FinderConfig:
-        """Read what :meth:`to_json` wrote.
-
-        Raises:
-            ConfigError: the text is no configuration of this version.
-        """
-        try:
-            values = json.loads(text)
-            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ConfigError(f"configuration of a finder cannot be read: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.special import expit
 from torch import Tensor
 
 from quest.model.finder import COARSE_PX, FINE_PX, PLACES, FinderMaps, FinderNetwork, relief_of
@@ -70,14 +71,18 @@ class Found:
         return len(self.logit)
 
     @property
+    def p(self) -> Float[np.ndarray, " N"]:
+        """Probability that there is something to take hold of."""
+        return expit(self.logit)
+
+    @property
     def labels(self) -> tuple[str, ...]:
         """The likeliest label of each."""
         return tuple(LABELS_FOUND[int(i)] for i in self.label_p.argmax(axis=1))
 
     def select(self, rows: Sequence[int] | Int[np.ndarray, " K"] | Bool[np.ndarray, " N"]) -> Found:
         """Some of them, with all panels."""
-        own = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "panels"}
-        return Found(**own, panels=self.panels)
+        return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "panels"})
 
 
 def find(
@@ -86,6 +91,8 @@ def find(
     depth_m: Float32[np.ndarray, "H W"] | None = None,
     *,
     size_px: int,
+    gain: float = 1.0,
+    bias: float = 0.0,
 ) -> Found:
     """What can be taken hold of in a picture.
 
@@ -94,6 +101,8 @@ def find(
         rgb: the picture.
         depth_m: metres along +z, 0 where missing; None without depth.
         size_px: longer side of what the network sees.
+        gain: multiplies the network's logits of what can be taken hold of ...
+        bias: ... and is added to them, so that they are log odds of being right.
     """
     height, width = rgb.shape[:2]
     device = next(network.parameters()).device
@@ -106,7 +115,8 @@ def find(
         seen = relief_of(depth[None])
     with torch.inference_mode():
         maps = network(canvas.permute(2, 0, 1)[None] / 255, seen)
-    return read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
+    found = read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
+    return replace(found, logit=gain * found.logit + bias)
 
 
 def _placed(image: np.ndarray, inside: tuple[int, int], fill: float) -> np.ndarray:

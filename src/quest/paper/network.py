@@ -36,8 +36,7 @@ protocol that gives no point asks for them, so a linear layer tells them.
 
 from __future__ import annotations
 
-import json
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
@@ -45,7 +44,8 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
 from quest.errors import ConfigError, WeightsError
-from quest.model.encoder import Encoder, EncoderConfig, load_exactly
+from quest.model.config import NetworkConfig
+from quest.model.encoder import Encoder, load_exactly
 from quest.model.frames import FrameBatch
 from quest.model.tensor_file import read_tensors, save_tensors
 from quest.paper.decoder import DecoderLayer
@@ -56,11 +56,9 @@ FORMAT = "quest-paper-1"
 
 
 @dataclass(frozen=True, kw_only=True)
-class PaperConfig:
+class PaperConfig(NetworkConfig):
     """Shapes of the published network; the defaults are the published ones."""
 
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    """The image encoder."""
     window: int = 4
     """T, frames that the decoder sees together."""
     cell_px: int = 8
@@ -87,23 +85,6 @@ class PaperConfig:
             raise ConfigError("network: cell_px, window, slots and decoder_layers must be at least 1")
         if self.encoder.image_size % self.cell_px:
             raise ConfigError(f"network: expected whole cells of {self.cell_px} px in {self.encoder.image_size} px")
-
-    def to_json(self) -> str:
-        """The configuration as one line, stored beside the weights."""
-        return json.dumps(asdict(self), sort_keys=True)
-
-    @classmethod
-    def from_json(cls, text: str) -> PaperConfig:
-        """Read what :meth:`to_json` wrote.
-
-        Raises:
-            ConfigError: the text is not a network configuration of this version.
-        """
-        try:
-            values = json.loads(text)
-            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ConfigError(f"network configuration cannot be read: {error}") from error
 
 
 @dataclass(frozen=True)

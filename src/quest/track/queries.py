@@ -194,9 +194,8 @@ class StreamQueries:
     ) -> tuple[list[Following], list[np.ndarray]]:
         """Discovered entities, labels and slots, and their pixels."""
         config, following = self._config, self.state.following
-        exists = 1 / (1 + np.exp(-(config.gain * found.logit + config.bias)))
         label_p = found.label_p[:, : len(LABELS)]
-        exists = exists * label_p.sum(axis=1)
+        exists = found.p * label_p.sum(axis=1)
         likeliest = [LABELS[int(i)] for i in label_p.argmax(axis=1)]
         intent = ["lift" if p > 0.5 else "open" for p in found.lift_p]
         near = self._near(found, at_px)

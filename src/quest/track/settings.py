@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
+from typing import TypedDict
 
 from quest.errors import WeightsError
 
 REVISION = 10
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
+
+
+class Looking(TypedDict):
+    """Arguments of :func:`quest.model.found.find`."""
+
+    size_px: int
+    gain: float
+    bias: float
 
 
 @dataclass(frozen=True)
@@ -27,6 +36,11 @@ class TrackerConfig:
     """Longer side of the picture that the finder sees, pixels."""
     most: int = 32
     """Most entities that discovery follows."""
+
+    @property
+    def looking(self) -> Looking:
+        """How the finder looks, as arguments of :func:`quest.model.found.find`."""
+        return {"size_px": self.size_px, "gain": self.gain, "bias": self.bias}
 
     def to_json(self) -> str:
         """One line, stored with the weights."""

@@ -213,7 +213,7 @@ class Stream:
         at_px = filtering.read_off(state, self._noise).uv_px
         new_px = self._queries.bind(
             memory.frame - 1, preprocessor.state.now_s, at_px,
-            lambda: find(self._network, rgb, frame.depth_m, size_px=self._config.size_px),
+            lambda: find(self._network, rgb, frame.depth_m, **self._config.looking),
         )  # fmt: skip
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
         if self._monitor is not None:

@@ -143,8 +143,7 @@ class Tracker:
         preprocessor = Preprocessor(camera)
         preprocessor.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
         depth_m = preprocessor.prepare(frame.rgb, frame.depth_m, frame.cam_from_world).depth_m
-        found = find(self.network, frame.rgb, depth_m, size_px=self.config.size_px)
-        return replace(found, logit=self.config.gain * found.logit + self.config.bias)
+        return find(self.network, frame.rgb, depth_m, **self.config.looking)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""

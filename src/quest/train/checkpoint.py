@@ -10,7 +10,6 @@ import shutil
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import UInt8
@@ -19,6 +18,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from quest.errors import WeightsError
+from quest.model.config import NetworkConfig
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import save_tensors
 
@@ -135,17 +135,7 @@ def _load_optimizer(
         ) from error
 
 
-@runtime_checkable
-class Config(Protocol):
-    """What determines the shapes of a network."""
-
-    @classmethod
-    def from_json(cls, text: str) -> Config:
-        """Read what it was stored as."""
-        ...
-
-
-def check_same_run(progress: Progress, config: Config, objective: str, begun: str, folder: Path) -> None:
+def check_same_run(progress: Progress, config: NetworkConfig, objective: str, begun: str, folder: Path) -> None:
     """Refuse to resume with another network or objective, or from other weights: what is not trained is kept too.
 
     Raises:

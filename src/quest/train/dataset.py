@@ -18,6 +18,11 @@ from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler, WindowShape
 from quest.types import TakeInfo
 
+UNSTATED = "pictures of unstated licence"
+"""Source of weights that learned from such."""
+UNSTATED_TERMS = "and the terms of the pictures that taught, which name no licence"
+"""What the licence of weights says beside, if they did."""
+PARTNET = "partnet-mobility"
 PARTNET_TERMS = "research use only for the PartNet-Mobility objects that taught"
 """What the licence of weights says beside, if such objects taught."""
 
@@ -132,10 +137,11 @@ def open_dataset(
 
 
 def licence_after(licence: str, sources: Collection[str]) -> str:
-    """The licence of weights after objects of these sources taught; one that is not said stays so."""
-    if not licence or "PartNet-Mobility" in licence or "partnet-mobility" not in sources:
-        return licence
-    return f"{licence}, {PARTNET_TERMS}"
+    """The licence of weights after objects and pictures of these sources taught; one that is not said stays so."""
+    for source, terms in ((PARTNET, PARTNET_TERMS), (UNSTATED, UNSTATED_TERMS)):
+        if licence and source in sources and terms not in licence:
+            licence = f"{licence}, {terms}"
+    return licence
 
 
 def load_initial_encoder(network: EncodingNetwork, path: Path) -> None:

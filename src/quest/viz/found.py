@@ -23,7 +23,7 @@ def draw_found(rgb: UInt8[np.ndarray, "H W 3"], found: Found, *, least: float) -
     canvas = np.ascontiguousarray(rgb).copy()
     unit = max(canvas.shape[:2]) / 640
     thick, size = max(1, round(1.5 * unit)), max(9, round(11 * unit))
-    shown = np.flatnonzero(1 / (1 + np.exp(-found.logit)) >= least)
+    shown = np.flatnonzero(found.p >= least)
     panels = found.panels
     carriers = set(found.panel[shown].tolist()) | set(np.flatnonzero(panels.logit > 0).tolist())
     for k in sorted(carriers - {-1}):
@@ -46,6 +46,5 @@ def draw_found(rgb: UInt8[np.ndarray, "H W 3"], found: Found, *, least: float) -
         else:
             left, top, right, bottom = found.box_px[i].round().astype(int).tolist()
             cv2.rectangle(canvas, (left, top), (right, bottom), colour, 2 * thick, cv2.LINE_AA)
-        p = 1 / (1 + np.exp(-found.logit[i]))
-        draw_outlined(canvas, f"{label} {p:.2f}", (x, top - size * 0.8), size=size, align="centre")
+        draw_outlined(canvas, f"{label} {found.p[i]:.2f}", (x, top - size * 0.8), size=size, align="centre")
     return canvas

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+from scipy.special import logit
 
 from quest.baselines import TRACKERS, ClipTracker, Inputs
 from quest.errors import InputError
@@ -224,7 +225,7 @@ def discover(tracker: Tracker, clip: Clip) -> dict[str, np.ndarray]:
     grips, panels, least = grips_of(found), found.panels, tracker.config.threshold
     return {
         "uv_px": grips.uv_px, "box_px": grips.box_px, "score": grips.logit, "panel_px": panels.box_px,
-        "panel_kind": panels.kind, "panel_score": panels.logit, "least": np.log(least / (1 - least)),
+        "panel_kind": panels.kind, "panel_score": panels.logit, "least": logit(least),
     }  # fmt: skip
 
 

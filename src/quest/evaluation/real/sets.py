@@ -12,13 +12,12 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
 from jaxtyping import Bool, Float, Int
 from PIL import Image, UnidentifiedImageError
-from pyarrow import csv
 
-from quest.data.boxed_pictures import kind_of, may_choose, read_boxed_pictures
+from quest.data.boxed_pictures import in_boxes, kind_of, may_choose, read_boxed_pictures
 from quest.data.camera_file import read_camera
+from quest.data.columns import read_columns
 from quest.data.pictures import read_picture
 from quest.data.provenance import combined_hash, file_hash
 from quest.data.recording import read_recording
@@ -162,8 +161,7 @@ class Picture:
     def closeness(self, uv_px: Float[np.ndarray, "A 2"]) -> Float[np.ndarray, "A H"]:
         """How far answers are from handles, in parts of the handle; infinite where they are not right.
 
-        Right is an answer in a box whose edges are moved out by an eighth of its size, at least 4 px, or within 12 px
-        of a bar.
+        Right is an answer in a box (see :func:`quest.data.boxed_pictures.in_boxes`), or within 12 px of a bar.
         """
         low, high = self.boxes[:, :2], self.boxes[:, 2:]
         if self.bars:
@@ -171,10 +169,8 @@ class Picture:
             share = np.clip(((uv_px[:, None] - low) * (high - low)).sum(axis=-1) / along, 0, 1)
             gap = np.linalg.norm(uv_px[:, None] - low - share[..., None] * (high - low), axis=-1) / _BAR_PX
             return np.where(gap <= 1, gap, np.inf)
-        out = np.maximum(4.0, 0.125 * (high - low))
-        inside = ((uv_px[:, None] >= low - out) & (uv_px[:, None] <= high + out)).all(axis=-1)
         gap = np.abs((uv_px[:, None] - (low + high) / 2) / np.maximum((high - low) / 2, 1)).max(axis=-1)
-        return np.where(inside, gap, np.inf)
+        return np.where(in_boxes(self.boxes, uv_px), gap, np.inf)
 
     def sizes_px(self) -> Float[np.ndarray, " H"]:
         """The longer side of each handle in a picture 640 pixels wide."""
@@ -246,7 +242,7 @@ def read_labels(path: Path) -> Labels:
     Raises:
         InputError: a column is missing, a value makes no sense, or a track is nowhere visible.
     """
-    rows = _columns(path, {"track": str, "frame": int, "x": float, "y": float, "state": str}, moves=str)
+    rows = read_columns(path, {"track": str, "frame": int, "x": float, "y": float, "state": str}, moves=str)
     order = np.lexsort((rows["frame"], rows["track"]))
     name, frame, x, y, state, moves = (rows[key][order] for key in ("track", "frame", "x", "y", "state", "moves"))
     uv_px = np.stack([x, y], axis=-1) + (0.5 if path.name == "truth.csv" else 0.0)
@@ -268,25 +264,6 @@ def read_labels(path: Path) -> Labels:
     return Labels(tuple(names.tolist()), np.isin(names, name[moves == "yes"]), track, frame, uv_px, state)
 
 
-def _columns(path: Path, kinds: Mapping[str, type], **optional: type) -> dict[str, np.ndarray]:
-    """Columns of a CSV file; empty numbers are NaN, empty words and what is optional and missing are empty."""
-    if not path.is_file():
-        raise InputError(f"labels {path}: no such file; {EXPECTED}")
-    types = {str: pa.string(), int: pa.int64(), float: pa.float64()}
-    wanted = {key: types[kind] for key, kind in {**kinds, **optional}.items()}
-    convert = csv.ConvertOptions(column_types=wanted, include_columns=list(wanted), include_missing_columns=True)
-    try:
-        missing = sorted(set(kinds) - set(csv.open_csv(path).schema.names))
-        if missing:
-            raise InputError(f"{path}: expected columns {', '.join(kinds)}, got none named {', '.join(missing)}")
-        table = csv.read_csv(path, csv.ReadOptions(use_threads=False), convert_options=convert)
-    except pa.ArrowInvalid as error:
-        raise InputError(f"{path}: cannot be read ({error})") from error
-    fill = {pa.string(): "", pa.int64(): -1, pa.float64(): np.nan}
-    columns = {key: table[key].fill_null(fill[kind]).to_numpy() for key, kind in wanted.items()}
-    return {key: c.astype(str) if wanted[key] == pa.string() else c for key, c in columns.items()}
-
-
 def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
     for picture in read_boxed_pictures(folder):
         if part == "all" or may_choose(picture.path.name) == (part == "choosing"):
@@ -299,7 +276,7 @@ def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
 def _stills(folder: Path) -> Iterator[Picture]:
     """Pictures whose handles are bars, pixel centres at integers, with depth images of the same name."""
     ends = ("x1", "y1", "x2", "y2")
-    rows = _columns(folder / "handles.csv", {"frame": int, "use": int, **dict.fromkeys(ends, float)})
+    rows = read_columns(folder / "handles.csv", {"frame": int, "use": int, **dict.fromkeys(ends, float)})
     for frame in np.unique(rows["frame"]):
         own = rows["frame"] == frame
         depth, camera = folder / f"{frame:04d}.png", folder / "camera.json"

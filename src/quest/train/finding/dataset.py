@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from quest.data.boxed_pictures import BoxedPicture, may_choose, read_boxed_pictures
+from quest.data.boxed_pictures import may_choose, read_boxed_pictures
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.model.finder import FinderNetwork
-from quest.train.dataset import part_of
+from quest.train.dataset import UNSTATED, part_of
 from quest.train.finding.sampler import FinderSampler
 from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.finding.views import Source, ViewCache, of_pictures, of_takes
@@ -30,7 +30,7 @@ class FinderData:
     about: str
     """How much teaches, in words."""
     sources: frozenset[str]
-    """Of the takes that teach."""
+    """Of the takes that teach, and whether there are pictures without a licence, as for ``licence_after``."""
 
 
 def open_finder_data(
@@ -64,8 +64,15 @@ def open_finder_data(
         InputError: labels cannot be read.
         ConfigError: nothing is left to teach or to choose.
     """
-    boxed = [p for path in pictures for p in read_boxed_pictures(path) if p.licence not in _UNKNOWN or not free]
-    labelled = {part: _of(boxed, choosing=part == "validation") for part in ("train", "validation")}
+    labelled: dict[str, list[Source]] = {"train": [], "validation": []}
+    unstated = False
+    for boxed in map(read_boxed_pictures, pictures):  # each by itself: what one has labelled says nothing of another
+        stated = [picture.licence not in _UNKNOWN for picture in boxed]
+        chooses = [may_choose(picture.path.name) for picture in boxed]
+        for part, own in (("train", False), ("validation", True)):
+            wanted = [c == own and (s or not free) for c, s in zip(chooses, stated, strict=True)]
+            labelled[part] += of_pictures(boxed, only=wanted)
+            unstated |= part == "train" and any(w and not s for w, s in zip(wanted, stated, strict=True))
     simulated: dict[str, list[Source]] = {"train": [], "validation": []}
     takes, taught_by = 0, set[str]()
     for folders, role in ((stores, "train"), (validation_stores or stores, "validation")):
@@ -95,9 +102,5 @@ def open_finder_data(
         FinderSampler(paths["pictures", "train"], paths["takes", "train"], config),
         FinderSampler(paths["pictures", "validation"], paths["takes", "validation"], config),
         f"{len(labelled['train'])} pictures and {takes} takes",
-        frozenset(taught_by),
+        frozenset(taught_by | ({UNSTATED} if unstated else set())),
     )
-
-
-def _of(pictures: Sequence[BoxedPicture], *, choosing: bool) -> list[Source]:
-    return of_pictures(pictures, only=[may_choose(picture.path.name) == choosing for picture in pictures])

@@ -15,6 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from quest.data.boxed_pictures import in_boxes
 from quest.model.finder import PLACES, FinderNetwork
 from quest.model.found import read_off
 from quest.train.finding.marks import UNKNOWN
@@ -29,8 +30,6 @@ WEIGHTS = {"place": 1.0, "panel": 0.5, "extent": 0.5, "panel_extent": 0.5, "knob
 _FROZEN = ("encoder.", "detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
 """What stays as it was: edges and textures, which ImageNet has taught, and which cost most of a step."""
 _SURE = 0.999
-_ROOM_PX = 4.0
-_ROOM = 0.125
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class FinderScores:
     """Grips in whole views that did not teach, of pictures or, where there are none, of takes."""
 
     precision: float
-    """Average precision over all answers: right in a box whose edges are moved out by an eighth, at least 4 pixels."""
+    """Average precision over all answers (see :func:`quest.data.boxed_pictures.in_boxes`)."""
     recall: float
     """Share of the grips that any answer is right about."""
     present: int
@@ -102,12 +101,11 @@ class StageFind:
                 found = found.select(~np.isnan(found.box_px[:, 0]))
                 box = view.marks.box_px[view.marks.kind == PLACES.index("grip")]
                 taken = np.zeros(len(box), bool)
-                for uv, logit in zip(found.uv_px, found.logit, strict=True):
-                    room = np.maximum(_ROOM_PX, _ROOM * (box[:, 2:] - box[:, :2]))
-                    hit = ((uv >= box[:, :2] - room) & (uv <= box[:, 2:] + room)).all(axis=1) & ~taken
+                for inside, logit in zip(in_boxes(box, found.uv_px), found.logit, strict=True):
+                    hit = np.flatnonzero(inside & ~taken)
                     scores.append(float(logit))
-                    first.append(bool(hit.any()))
-                    taken[np.flatnonzero(hit)[:1]] = True
+                    first.append(len(hit) > 0)
+                    taken[hit[:1]] = True
                 present += len(box)
         self.network.train()
         right = np.array(first, bool)[np.argsort(-np.array(scores), kind="stable")]

@@ -100,9 +100,6 @@ class FinderPlan:
         """Some of them."""
         return FinderPlan(self.cuts[rows], self.size_px)
 
-    def __len__(self) -> int:
-        return len(self.cuts)
-
 
 class FinderSampler:
     """Draws batches of cuts.
@@ -122,7 +119,7 @@ class FinderSampler:
         if not self.pictures and not self.takes:
             raise ConfigError("finding: expected labelled pictures or takes to learn from, got none")
 
-    def plan(self, rng: np.random.Generator, *, disturb: bool = True) -> FinderPlan:
+    def plan(self, rng: np.random.Generator) -> FinderPlan:
         """The cuts of one batch."""
         config, cuts = self.config, []
         share = config.take_share if self.pictures and self.takes else float(not self.pictures)

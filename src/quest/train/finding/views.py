@@ -19,6 +19,7 @@ from jaxtyping import Float32, UInt8
 
 from quest.data.boxed_pictures import CLASSES, BoxedPicture, kind_of
 from quest.data.pictures import read_picture
+from quest.data.provenance import file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.model.finder import PLACES, FinderNetwork
@@ -31,6 +32,8 @@ from quest.whole_file import whole_file
 _LONGER_PX = (480.0, 1500.0)
 """Longer side of the scaled picture."""
 _ASPECT = 1.1
+_VERSION = 1
+"""Of how views are made; another one makes all of them again."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +41,7 @@ class Source:
     """Where views come from: a picture, or a frame of a take."""
 
     name: str
-    """Unique; two with the same name give the same views."""
+    """Digest of its picture and marks: what changed has other views."""
     read: Callable[[], tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"] | None, Marks]]
     """Colours, depth in metres (0 where missing) or None, and marks."""
 
@@ -81,8 +84,9 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
 
         return read
 
+    told = repr(sorted(known.items()))
     return [
-        Source(f"{picture.path.parent.parent.name}-{picture.path.name}", reader(picture))
+        Source(_digest(file_hash(picture.path), picture.names, picture.box_px.tolist(), told), reader(picture))
         for picture, wanted in zip(pictures, only, strict=True)
         if wanted
     ]
@@ -109,7 +113,7 @@ def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Sou
                     depth_m = None if clip.depth_m is None else clip.depth_m[t]
                     return clip.rgb[t], depth_m, marks_of(take, take.views[v], t)
 
-                sources.append(Source(f"{name}-{v}-{t}", read))
+                sources.append(Source(_digest(header.data_hash, v, t), read))
     return sources
 
 
@@ -141,7 +145,7 @@ class ViewCache:
 
     def path(self, source: Source, number: int) -> Path:
         """Where a view of a source is kept."""
-        return self._folder / f"{hashlib.sha256(source.name.encode()).hexdigest()[:20]}-{number}.npz"
+        return self._folder / f"{source.name}-{number}.npz"
 
     def build(self, sources: Sequence[Source], *, views: int) -> Iterator[Path]:
         """Files of the views of sources, one after the other as they are there."""
@@ -151,14 +155,18 @@ class ViewCache:
             for number in range(views):
                 path = self.path(source, number)
                 if picture is not None and number in missing:
-                    seed = int(hashlib.sha256(f"{source.name} {number}".encode()).hexdigest()[:12], 16)
-                    _write(path, self._look(*draw_view(*picture, np.random.default_rng(seed))))
+                    rng = np.random.default_rng([int(source.name, 16), number])
+                    _write(path, self._look(*draw_view(*picture, rng)))
                 yield path
 
     def _look(self, rgb: np.ndarray, depth_m: np.ndarray | None, marks: Marks) -> View:
         image = torch.from_numpy(rgb).permute(2, 0, 1)[None].to(next(self._network.parameters()).device) / 255
         context = self._network.context_of(image)[0].half().cpu().numpy()
         return View(rgb, depth_m, context, marks)
+
+
+def _digest(*parts: object) -> str:
+    return hashlib.sha256(repr((_VERSION, *parts)).encode()).hexdigest()[:20]
 
 
 def read_view(path: Path) -> View:

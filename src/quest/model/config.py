@@ -1,0 +1,37 @@
+"""What determines the shapes of a network, as it is stored beside its weights."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import TypeVar
+
+from quest.errors import ConfigError
+from quest.model.encoder import EncoderConfig
+
+_Config = TypeVar("_Config", bound="NetworkConfig")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig:
+    """A network with a vision transformer."""
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """The vision transformer; the side of its image says for which grid its places are stored."""
+
+    def to_json(self) -> str:
+        """One line, stored beside the weights."""
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls: type[_Config], text: str) -> _Config:
+        """Read what :meth:`to_json` wrote.
+
+        Raises:
+            ConfigError: the text is not a network configuration of this version.
+        """
+        try:
+            values = json.loads(text)
+            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
+        except (json.JSONDecodeError, KeyError, TypeError) as error:
+            raise ConfigError(f"network configuration cannot be read: {error}") from error
