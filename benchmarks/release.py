@@ -81,8 +81,8 @@ class Release:
     """Cuts per step."""
     learning_rate: float = 2e-3
     """Peak of the schedule."""
-    views: int = 2
-    """Views of each picture and simulated frame."""
+    views: int = 4
+    """Views of each picture."""
     real: tuple[Path, ...] = ()
     """Real sets to evaluate on."""
 

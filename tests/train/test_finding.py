@@ -77,18 +77,35 @@ def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
 
 def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
     truth = {name: torch.from_numpy(value)[None] for name, value in maps.items()}
-    logit = lambda p: 20 * (p - 0.9)  # noqa: E731
+
+    def logit(name: str) -> torch.Tensor:
+        return 20 * (truth[name] + truth[f"{name}_share"] - 0.9)
+
     opening = torch.nn.functional.one_hot(truth["opening"].clamp(min=0), len(OPENINGS)).permute(0, 3, 1, 2).float()
     return FinderMaps(
-        logit(truth["place"]), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
-        logit(truth["panel"]), truth["panel_extent"], 10 * opening,
+        logit("place"), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
+        logit("panel"), truth["panel_extent"], 10 * opening,
     )  # fmt: skip
 
 
 def test_what_is_not_labelled_costs_nothing() -> None:
     logit, nothing = torch.full((1, 2, 8, 8), 3.0), torch.zeros(1, 2, 8, 8)
-    assert float(_focal(logit, nothing, torch.tensor([[False, False]]))) == 0
-    assert float(_focal(logit, nothing, torch.tensor([[True, False]]))) > 1
+    assert float(_focal(logit, nothing, nothing, torch.tensor([[False, False]]))) == 0
+    assert float(_focal(logit, nothing, nothing, torch.tensor([[True, False]]))) > 1
+
+
+def test_any_place_on_the_inner_half_of_a_long_bar_is_right_and_bars_count_as_much_as_knobs() -> None:
+    bar, knob = np.array([20.0, 96, 220, 112]), np.array([120.0, 200, 132, 212])
+    marks = replace(make_marks(), kind=np.zeros(2, int), box_px=np.stack((bar, knob)),
+                    point_px=np.array([[120.0, 104], [126, 206]]), knob=np.zeros(2, int), lift=np.zeros(2, int),
+                    opening=np.full(2, UNKNOWN))  # fmt: skip
+    maps = targets(marks, 256)
+    row = maps["place"][0, 104 // 4]
+    assert (row[80 // 4 : 160 // 4] == 1).all()
+    assert row[4 // 4] < 0.3
+    share = maps["place_share"][0]
+    assert share[: 150 // 4].sum() == pytest.approx(1)
+    assert share[150 // 4 :].sum() == pytest.approx(1)
 
 
 def test_extents_of_the_same_box_cost_nothing_and_others_more() -> None:

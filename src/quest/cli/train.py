@@ -87,8 +87,8 @@ class Train:
     """How windows of stages 1 and 2 are drawn."""
     finding: FinderSamplerConfig = field(default_factory=FinderSamplerConfig)
     """How cuts of stage find are drawn."""
-    views: int = 2
-    """Stage find: views that are made of every picture and simulated frame."""
+    views: int = 4
+    """Stage find: views that are made of every picture."""
     frames: int = 2
     """Stage find: frames that are taken of every view of a take."""
     losses: dict[str, float] = field(default_factory=dict)

@@ -1,8 +1,8 @@
 """The finder's network: what in a picture can be taken hold of, and of which door or drawer.
 
 Two branches see the picture: a vision transformer, coarsely, knows what things are; EfficientNet-Lite0 sees them at up
-to a quarter of the picture's resolution. A pyramid joins them, and two dense maps are read off it: what one takes hold
-of, at a stride of 4 pixels, and the doors and drawers behind it, at a stride of 8.
+to a quarter of the picture's resolution. They are joined at a stride of 16 pixels, where the doors and drawers are read
+off; going down from there to a stride of 4 pixels, what one takes hold of.
 
 References: Zhou et al., Objects as Points, 2019, for maps of centres; Lin et al., Feature Pyramid Networks, CVPR 2017.
 """
@@ -27,7 +27,7 @@ PANELS = ("cabinet", "door", "refrigerator")
 """What the coarse map finds: doors and drawer fronts of furniture, doors of rooms, doors of refrigerators."""
 OPENINGS = ("slides", "left", "right", "top", "bottom")
 """How a panel opens: it slides out, or turns about one of its edges."""
-FINE_PX, COARSE_PX = 4, 8
+FINE_PX, COARSE_PX = 4, 16
 """Strides of the maps."""
 CONTEXT_BLOCKS = (5, 8, 11)
 """Blocks of the vision transformer whose tokens are read."""
@@ -37,6 +37,8 @@ _RADII_PX = (12, 40)
 """Of the squares whose relief is seen."""
 RELIEF = 1 + len(_RADII_PX)
 """Channels of :func:`relief_of`."""
+_STEPS = (1, 2, 3)
+"""Dilations where the branches are joined, so that a door's middle sees its edges."""
 _GROUPS = 8
 _RARE = -4.6
 """Logit of a place before anything is learned: one in a hundred."""
@@ -47,7 +49,9 @@ class FinderConfig(NetworkConfig):
     """Shape of the network."""
 
     width: int = 64
-    """Channels of the pyramid."""
+    """Channels of the fine levels."""
+    deep_width: int = 128
+    """Channels where the branches are joined."""
 
 
 @dataclass(frozen=True)
@@ -83,13 +87,18 @@ def relief_of(depth_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B R H W"]:
 class _Mix(nn.Module):
     """A 3 x 3 convolution, normalised."""
 
-    def __init__(self, inputs: int, outputs: int) -> None:
+    def __init__(self, inputs: int, outputs: int, *, step: int = 1) -> None:
         super().__init__()
-        self.conv = nn.Conv2d(inputs, outputs, 3, padding=1, bias=False)
+        self.conv = nn.Conv2d(inputs, outputs, 3, padding=step, dilation=step, bias=False)
         self.norm = nn.GroupNorm(_GROUPS, outputs)
 
     def forward(self, x: Float[Tensor, "B C H W"]) -> Float[Tensor, "B D H W"]:
         return F.relu(self.norm(self.conv(x)), inplace=True)
+
+
+def _onto(map: Float[Tensor, "B C h w"], other: Float[Tensor, "B C _ _"]) -> Float[Tensor, "B C h w"]:
+    """Another map at the size of a map."""
+    return F.interpolate(other, map.shape[-2:], mode="bilinear", align_corners=False)
 
 
 class _Head(nn.Module):
@@ -121,9 +130,11 @@ class FinderNetwork(nn.Module):
         self.config = config
         self.encoder = Encoder(config.encoder).requires_grad_(requires_grad=False)
         self.detail = EfficientNet()
-        width, context = config.width, len(CONTEXT_BLOCKS) * config.encoder.width
-        self.lateral = nn.ModuleList(nn.Conv2d(channels, width, 1) for channels in WIDTHS)
-        self.context = nn.Sequential(nn.Conv2d(context, 2 * width, 1), nn.ReLU(), nn.Conv2d(2 * width, width, 1))
+        width, deep, context = config.width, config.deep_width, len(CONTEXT_BLOCKS) * config.encoder.width
+        self.lateral = nn.ModuleList(
+            nn.Conv2d(channels, deep if i > 1 else width, 1) for i, channels in enumerate(WIDTHS)
+        )
+        self.context = nn.Conv2d(context, deep, 1)
         self.relief = nn.Sequential(
             nn.Conv2d(RELIEF, 24, 3, 2, 1),
             nn.ReLU(),
@@ -131,9 +142,11 @@ class FinderNetwork(nn.Module):
             nn.ReLU(),
             nn.Conv2d(48, width, 1),
         )
-        self.mix = nn.ModuleList(_Mix(width, width) for _ in WIDTHS)
+        self.deep = nn.ModuleList(_Mix(deep, deep, step=step) for step in _STEPS)
+        self.down = nn.Conv2d(deep, width, 1)
+        self.mix = nn.ModuleList(_Mix(width, width) for _ in range(2))
         self.fine = _Head(width, len(PLACES) + 2, rare=len(PLACES), stride=FINE_PX)
-        self.coarse = _Head(width, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
+        self.coarse = _Head(deep, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
         self.dropout = nn.Dropout2d(0.1)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on processors
 
@@ -165,20 +178,18 @@ class FinderNetwork(nn.Module):
         """
         rgb = rgb.contiguous(memory_format=torch.channels_last)
         tokens = self.context_of(rgb) if context is None else context
-        levels = [lateral(x) for lateral, x in zip(self.lateral, self.detail(rgb), strict=True)]
-        seen = self.context(self.dropout(tokens))
-        levels[2] = levels[2] + F.interpolate(seen, levels[2].shape[-2:], mode="bilinear", align_corners=False)
+        fine, middle, deep, deepest = (lateral(x) for lateral, x in zip(self.lateral, self.detail(rgb), strict=True))
+        deep = deep + _onto(deep, deepest) + _onto(deep, self.context(self.dropout(tokens)))
+        for mix in self.deep:
+            deep = deep + mix(deep)
         if stands_out is not None:
             # Multiplied, so that where there is no depth it is as without.
             known = F.avg_pool2d(stands_out[:, -1:], FINE_PX)
-            levels[0] = levels[0] + known * self.relief(stands_out)
-        x = self.mix[3](levels[3])
-        joined = [x]
-        for level, mix in zip(levels[2::-1], list(self.mix)[2::-1], strict=True):
-            x = mix(level + F.interpolate(x, level.shape[-2:], mode="nearest"))
-            joined.append(x)
-        place, extent = self.fine(joined[3])
-        panel, panel_extent = self.coarse(joined[2])
+            fine = fine + known * self.relief(stands_out)
+        middle = self.mix[0](middle + _onto(middle, self.down(deep)))
+        fine = self.mix[1](fine + _onto(fine, middle))
+        place, extent = self.fine(fine)
+        panel, panel_extent = self.coarse(deep)
         places, knob, lift = place.split((len(PLACES), 1, 1), dim=1)
         panels, opening = panel.split((len(PANELS), len(OPENINGS)), dim=1)
         return FinderMaps(places, knob[:, 0], lift[:, 0], extent, panels, panel_extent, opening)

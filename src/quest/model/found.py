@@ -143,7 +143,7 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
     two = np.tile(scale, 2)
     end = np.array(size, np.float64)
     panels = _panels(maps, two, np.tile(end, 2))
-    cell, place, logit = _peaks(maps.place[0])
+    cell, place, logit = _highest(maps.place[0], around=1)
     uv = (cell + _within(maps.place[0], place, cell)) * FINE_PX
     column, row = cell.T
     knob, lift = (m[0].sigmoid().double().cpu().numpy()[row, column] for m in (maps.knob, maps.lift))
@@ -162,11 +162,11 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
     return Found(uv, logit[keep], label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
 
 
-def _peaks(
-    logits: Float[Tensor, "P h w"],
+def _highest(
+    logits: Float[Tensor, "P h w"], *, around: int
 ) -> tuple[Int[np.ndarray, "N 2"], Int[np.ndarray, " N"], Float[np.ndarray, " N"]]:
-    """Column and row, channel and logit of local maxima, best first."""
-    highest = (logits == F.max_pool2d(logits[None], 3, 1, 1)[0]) & (logits > _LEAST)
+    """Column and row, channel and logit of cells that nothing so many cells around them is above, best first."""
+    highest = (logits == F.max_pool2d(logits[None], 2 * around + 1, 1, around)[0]) & (logits > _LEAST)
     channel, row, column = torch.nonzero(highest, as_tuple=True)
     value = logits[channel, row, column]
     order = value.argsort(descending=True, stable=True)[:_MOST]
@@ -193,7 +193,7 @@ def _boxes(extent: Float[Tensor, "4 h w"], cell: Int[np.ndarray, "N 2"], stride:
 
 
 def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"]) -> Panels:
-    cell, kind, logit = _peaks(maps.panel[0])
+    cell, kind, logit = _highest(maps.panel[0], around=0)
     box = _boxes(maps.panel_extent[0], cell, COARSE_PX)
     keep: list[int] = []
     for i in range(len(kind)):

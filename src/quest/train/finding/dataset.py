@@ -15,7 +15,6 @@ from quest.train.finding.sampler import FinderSampler
 from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.finding.views import Source, ViewCache, of_pictures, of_takes
 
-_CHOOSING_VIEWS = 1
 _UNKNOWN = ("", "unknown")
 
 
@@ -55,7 +54,7 @@ def open_finder_data(
         stores: take stores; with ``validation_stores``, objects that are in no part of the split teach too.
         validation_stores: take stores to choose by.
         cache: folder of the views.
-        views: views of each picture or frame that teaches.
+        views: views of each picture that teaches; frames of takes have one, as takes hold many that are alike.
         frames: frames of each view of a take.
         config: how cuts are drawn.
         report: told pictures and frames done, and all of them.
@@ -77,13 +76,14 @@ def open_finder_data(
     takes, taught_by = 0, set[str]()
     for folders, role in ((stores, "train"), (validation_stores or stores, "validation")):
         for folder in folders:
-            store = TakeStore(folder)
+            store, names = TakeStore(folder), []
             for name, info in store.infos().items():
                 part = part_of(info)
                 if part == role or (part == "unlisted" and validation_stores):
-                    simulated[role] += of_takes(store, [name], frames=frames)
+                    names.append(name)
                     if role == "train":
                         takes, taught_by = takes + 1, taught_by | {info.source}
+            simulated[role] += of_takes(store, names, frames=frames)
     for part, verb in (("train", "teach"), ("validation", "choose")):
         if not labelled[part] and not simulated[part]:
             raise ConfigError(f"training: no pictures and no takes are left to {verb}; give more of them")
@@ -92,7 +92,7 @@ def open_finder_data(
     paths: dict[tuple[str, str], list[Path]] = {}
     for kind, sources in (("pictures", labelled), ("takes", simulated)):
         for part, own in sources.items():
-            count = views if part == "train" else _CHOOSING_VIEWS
+            count = views if (kind, part) == ("pictures", "train") else 1
             paths[kind, part] = []
             for source in own:
                 paths[kind, part] += known.build([source], views=count)

@@ -25,11 +25,10 @@ from quest.train.finding.views import read_view
 from quest.train.losses import changed, masked_mean
 from quest.train.pooling import pooled
 
-WEIGHTS = {"place": 1.0, "panel": 0.5, "extent": 0.5, "panel_extent": 0.5, "knob": 0.1, "lift": 0.1, "opening": 0.1}
+WEIGHTS = {"place": 1.0, "panel": 0.5, "extent": 1.0, "panel_extent": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1}
 """How much every loss counts."""
 _FROZEN = ("encoder.", "detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
 """What stays as it was: edges and textures, which ImageNet has taught, and which cost most of a step."""
-_SURE = 0.999
 
 
 @dataclass(frozen=True)
@@ -75,8 +74,8 @@ class StageFind:
         maps = self.network(frames.rgb, frames.relief, context=frames.context)
         places = len(PLACES)
         return {
-            "place": _focal(maps.place, truth.place, truth.known[:, :places]),
-            "panel": _focal(maps.panel, truth.panel, truth.known[:, places:]),
+            "place": _focal(maps.place, truth.place, truth.place_share, truth.known[:, :places]),
+            "panel": _focal(maps.panel, truth.panel, truth.panel_share, truth.known[:, places:]),
             "extent": _giou(maps.extent, truth.extent, truth.weight),
             "panel_extent": _giou(maps.panel_extent, truth.panel_extent, truth.panel_weight),
             "knob": _binary(maps.knob, truth.knob),
@@ -115,14 +114,16 @@ class StageFind:
 
 
 def _focal(
-    logit: Float[Tensor, "B C h w"], target: Float[Tensor, "B C h w"], known: Bool[Tensor, "B C"]
+    logit: Float[Tensor, "B C h w"],
+    near: Float[Tensor, "B C h w"],
+    share: Float[Tensor, "B C h w"],
+    known: Bool[Tensor, "B C"],
 ) -> Float[Tensor, ""]:
-    """Focal loss of maps of centres, in pictures where the kind is labelled, per centre."""
-    p, here = logit.sigmoid(), target > _SURE
-    seen, unseen = F.logsigmoid(logit), F.logsigmoid(-logit)
-    loss = torch.where(here, -((1 - p) ** 2) * seen, -((1 - target) ** 4) * p**2 * unseen)
+    """Focal loss per mark, in pictures where its kind is labelled."""
+    p = logit.sigmoid()
+    here, elsewhere = share * (1 - p) ** 2 * F.logsigmoid(logit), (1 - near) ** 4 * p**2 * F.logsigmoid(-logit)
     counted = known[..., None, None]
-    return (loss * counted).sum() / pooled((here & counted).sum().float()).clamp(min=1)
+    return -((here + elsewhere) * counted).sum() / pooled((share * counted).sum()).clamp(min=1)
 
 
 def _giou(

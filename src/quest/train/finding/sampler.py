@@ -23,12 +23,12 @@ _CONTEXT_PX = 16
 """Side of what one token of a cut stands for, pixels."""
 _LEAST_CELLS = 0.6
 """Standard deviation of the smallest mark in cells of its map ..."""
-_SPREAD = 6.0
+_SPREAD = 4.0
 """... and of larger ones, as a part of their side."""
-_ZOOM = (0.5, 1.5)
+_ON = 0.5
+"""A cell is a right answer where its mark is at least this high: anywhere on the inner half of a long bar."""
+_ZOOM = (0.67, 1.5)
 """How much larger than the view a cut shows it."""
-_EXTENT_WHERE = 0.3
-"""Extents are learned where a mark's weight is above this."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +52,19 @@ class FinderTruth:
     """What the maps should be."""
 
     place: Float[Tensor, "B P h w"]
-    """1 at a place, falling off around it."""
+    """1 on a place, falling off around it."""
+    place_share: Float[Tensor, "B P h w"]
+    """What each cell counts of its place; the cells of one sum to 1."""
     panel: Float[Tensor, "B Q H W"]
-    """The same of panels."""
+    """As ``place``, of panels."""
+    panel_share: Float[Tensor, "B Q H W"]
+    """As ``place_share``, of panels."""
     known: Bool[Tensor, "B C"]
     """Which kinds are labelled in the picture."""
     extent: Float[Tensor, "B 4 h w"]
     """Pixels to the edges of the grip that a cell belongs to."""
     weight: Float[Tensor, "B h w"]
-    """How much a cell belongs to it, 0 for none."""
+    """What each cell counts of a grip whose edges are all seen."""
     panel_extent: Float[Tensor, "B 4 H W"]
     """The same of panels."""
     panel_weight: Float[Tensor, "B H W"]
@@ -207,8 +211,8 @@ def _context(
 def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
     """The maps that a cut should give, by their names in :class:`FinderTruth`."""
     fine, coarse = size // FINE_PX, size // COARSE_PX
-    place = np.zeros((len(PLACES), fine, fine), np.float32)
-    panel = np.zeros((len(PANELS), coarse, coarse), np.float32)
+    place, place_share = np.zeros((2, len(PLACES), fine, fine), np.float32)
+    panel, panel_share = np.zeros((2, len(PANELS), coarse, coarse), np.float32)
     extents = {FINE_PX: np.ones((4, fine, fine), np.float32), COARSE_PX: np.ones((4, coarse, coarse), np.float32)}
     weights = {FINE_PX: np.zeros((fine, fine), np.float32), COARSE_PX: np.zeros((coarse, coarse), np.float32)}
     knob, lift = (np.full((fine, fine), UNKNOWN) for _ in range(2))
@@ -219,15 +223,16 @@ def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
         kind, box = int(marks.kind[i]), marks.box_px[i]
         on_panel = kind >= len(PLACES)
         stride = COARSE_PX if on_panel else FINE_PX
-        maps, index = (panel, kind - len(PLACES)) if on_panel else (place, kind)
-        cells = maps.shape[-1]
+        maps, shares = (panel, panel_share) if on_panel else (place, place_share)
+        index, cells = kind - len(PLACES) if on_panel else kind, maps.shape[-1]
         middle = np.clip(np.round(marks.point_px[i] / stride - 0.5), 0, cells - 1)
         spread = np.maximum((box[2:] - box[:2]) / stride / _SPREAD, _LEAST_CELLS)
         step = np.arange(cells)
         across, down = (np.exp(-np.square(step - middle[k]) / (2 * spread[k] ** 2)) for k in (0, 1))
         bump = (down[:, None] * across).astype(np.float32)
-        maps[index] = np.maximum(maps[index], bump)
-        own = bump > _EXTENT_WHERE
+        own = bump >= _ON
+        maps[index] = np.maximum(maps[index], np.minimum(bump / _ON, 1))
+        shares[index][own] = bump[own] / bump[own].sum()
         if on_panel:
             opening[own] = marks.opening[i]
         else:
@@ -238,11 +243,11 @@ def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
                                                  (box[3] - centre)[:, None]))  # fmt: skip
             whole = (box[:2] > 0).all() and (box[2:] < size).all()  # edges out of sight cannot be learned
             own = own & (edges > 0).all(axis=0) & whole
-            extents[stride][:, own], weights[stride][own] = edges[:, own], bump[own]
+            extents[stride][:, own], weights[stride][own] = edges[:, own], shares[index][own]
             if not on_panel:
                 knob[own] = marks.knob[i]
     return {
-        "place": place, "panel": panel, "known": marks.known, "extent": extents[FINE_PX], "weight": weights[FINE_PX],
-        "panel_extent": extents[COARSE_PX], "panel_weight": weights[COARSE_PX], "knob": knob, "lift": lift,
-        "opening": opening,
+        "place": place, "place_share": place_share, "panel": panel, "panel_share": panel_share, "known": marks.known,
+        "extent": extents[FINE_PX], "weight": weights[FINE_PX], "panel_extent": extents[COARSE_PX],
+        "panel_weight": weights[COARSE_PX], "knob": knob, "lift": lift, "opening": opening,
     }  # fmt: skip

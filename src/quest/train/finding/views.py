@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -27,12 +28,13 @@ from quest.model.weights import weights_digest
 from quest.train.finding.marks import KINDS, UNKNOWN, Marks
 from quest.train.finding.settings import VIEW_PX
 from quest.train.finding.takes import marks_of
+from quest.types import Take
 from quest.whole_file import whole_file
 
-_LONGER_PX = (480.0, 1500.0)
+_LONGER_PX = (450.0, 1200.0)
 """Longer side of the scaled picture."""
 _ASPECT = 1.1
-_VERSION = 1
+_VERSION = 2
 """Of how views are made; another one makes all of them again."""
 
 
@@ -101,14 +103,21 @@ def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Sou
         frames: how many of each view, spread over its time; the first is one of them.
     """
     sources = []
+
+    @lru_cache(maxsize=1)  # its frames come one after the other
+    def taken(name: str, until: int) -> Take:
+        return store.read(name, frames=slice(0, until))
+
     for name in names:
         header = store.header(name)
         picked = np.unique(np.linspace(0, header.frames, frames, endpoint=False).astype(int)).tolist()
         for v in range(len(header.cameras)):
             for t in picked:
 
-                def read(name: str = name, v: int = v, t: int = t) -> tuple[np.ndarray, np.ndarray | None, Marks]:
-                    take = store.read(name, frames=slice(0, t + 1))
+                def read(
+                    name: str = name, until: int = picked[-1] + 1, v: int = v, t: int = t
+                ) -> tuple[np.ndarray, np.ndarray | None, Marks]:
+                    take = taken(name, until)
                     clip = take.views[v].clip
                     depth_m = None if clip.depth_m is None else clip.depth_m[t]
                     return clip.rgb[t], depth_m, marks_of(take, take.views[v], t)
