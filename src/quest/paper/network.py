@@ -40,6 +40,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor, nn
 
@@ -48,7 +49,7 @@ from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder, load_exactly
 from quest.model.frames import FrameBatch
 from quest.model.tensor_file import read_tensors, save_tensors
-from quest.paper.decoder import DecoderLayer
+from quest.paper.decoder import DecoderLayer, Tokens
 from quest.paper.flow_head import FlowHead
 from quest.types import LABELS
 
@@ -128,7 +129,6 @@ class PaperNetwork(nn.Module):
         self.project = nn.Linear(config.encoder.width, d)
         self.place = nn.Parameter(0.02 * torch.randn(config.encoder.grid**2, d))
         self.time = nn.Parameter(0.02 * torch.randn(config.window, d))
-        self.token_norm = nn.LayerNorm(d)
         # As large as what they read from the tokens: small ones would drown in it and all answer alike.
         self.queries = nn.Parameter(torch.randn(config.slots, d))
         self.layers = nn.ModuleList(DecoderLayer(d, config.heads) for _ in range(config.decoder_layers))
@@ -152,7 +152,7 @@ class PaperNetwork(nn.Module):
         i-th frame, it has learned to answer from i frames.
         """
         b, t = features.shape[:2]
-        tokens = self.token_norm(self.project(features) + self.place) + self.time[:t, None]
+        tokens = Tokens(F.layer_norm(features, features.shape[-1:]), self.project, self.place, self.time[:t])
         x = self.queries.expand(b, t, -1, -1)
         for layer in self.layers:
             x = layer(x, tokens)

@@ -194,6 +194,8 @@ def _check(clip: Clip, queries: Sequence[Query] | None) -> None:
     if len(set(names)) < len(names):
         raise InputError(f"queries: expected a name each, got {', '.join(names)}; choose other names")
     for query in queries or ():
+        if query.words is not None:
+            raise InputError(f"text {query.words!r}: the published network finds no doors; use weights of the finder")
         if query.intent is not None:
             raise InputError(
                 f"query {query.name or query.kind!r}: the published network cannot tell what to {query.intent}; omit "
