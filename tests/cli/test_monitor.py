@@ -129,8 +129,9 @@ def test_a_file_of_calibrations_that_is_not_there(take: str, weights: dict[str, 
     assert "quest calibrate" in capsys.readouterr().err
 
 
-def test_discovery(take: str, weights: dict[str, list[str]], capsys):
-    assert main(["monitor", take, *weights["calm"]]) == 0
+@pytest.mark.parametrize("how", [[], ["--online"]], ids=["first frame", "online"])
+def test_discovery(take: str, weights: dict[str, list[str]], how: list[str], capsys):
+    assert main(["monitor", take, *weights["calm"], *how]) == 0
     assert "now following" in capsys.readouterr().out
 
 

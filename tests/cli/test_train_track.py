@@ -117,9 +117,10 @@ def test_train_the_finder_track_evaluate(store: Path, weights: Path, tmp_path: P
     assert json.loads(result.read_text())
 
 
-def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, capsys):
-    take = str(store / "panels-3.zarr") + "/"
-    assert main(["track", take, "--weights", str(weights), "--out", str(tmp_path), "--no-overlay", "--view", "1"]) == 0
+@pytest.mark.parametrize("how", [[], ["--online"]], ids=["first frame", "online"])
+def test_discovery_without_a_video(store: Path, weights: Path, how: list[str], tmp_path: Path, capsys):
+    take, chosen = str(store / "panels-3.zarr") + "/", ["--weights", str(weights), "--no-overlay", "--view", "1"]
+    assert main(["track", take, *chosen, "--out", str(tmp_path), *how]) == 0
     assert len(read_tracks(tmp_path / "tracks.parquet").names) >= 1
     assert not (tmp_path / "overlay.mp4").exists()
 
@@ -137,6 +138,7 @@ def test_discovery_without_a_video(store: Path, weights: Path, tmp_path: Path, c
         (["--device", "abacus"], "abacus"),
         (["--alpha", "0"], "--alpha"),
         (["--alpha-frames", "0"], "--alpha-frames"),
+        (["--online", "--label", "handle"], "online"),
         (["--weights", "none.safetensors"], "none.safetensors"),
         (["--out", __file__], "cannot be made a folder"),
         (["--out", "/proc"], "not be written to"),

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from quest.model.finder import FinderConfig
+from quest.model.finder import OPENINGS, FinderConfig
+from quest.model.found import LABELS_FOUND, Found, Panels
 from quest.monitor import Calibration
 from quest.monitor.statistic import Cusum
 from quest.track import Tracker, TrackerConfig
@@ -23,6 +24,21 @@ EAGER = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64)
 def make_tracker(network: FinderConfig = FINDER, config: TrackerConfig = EAGER, *, seed: int = 0) -> Tracker:
     """A tracker without a monitor, whose network finds anything."""
     return Tracker(make_finder(network, seed=seed), config, device=torch.device("cpu"))
+
+
+def make_found(*places: tuple[str, str, tuple[float, float]], p: tuple[float, ...] | None = None) -> Found:
+    """What a finder says, the surest first: label, intent and pixel of each; it is sure where no probabilities are."""
+    n = len(places)
+    odds = np.exp(9.0 - np.arange(n)) if p is None else np.array(p) / (1 - np.array(p))
+    return Found(
+        uv_px=np.array([at for *_, at in places], np.float64).reshape(-1, 2),
+        logit=np.log(odds),
+        label_p=np.eye(len(LABELS_FOUND))[[LABELS_FOUND.index(label) for label, *_ in places]],
+        lift_p=np.array([float(intent == "lift") for _, intent, _ in places]),
+        box_px=np.full((n, 4), np.nan),
+        panel=np.full(n, -1),
+        panels=Panels(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, len(OPENINGS)))),
+    )
 
 
 def make_clip(*, frames: int = 6, size: tuple[int, int] = (64, 64)) -> Clip:

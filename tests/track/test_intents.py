@@ -6,10 +6,8 @@ import numpy as np
 import pytest
 
 from quest.errors import InputError
-from quest.model.finder import OPENINGS
-from quest.model.found import LABELS_FOUND, Found, Panels
 from quest.types import Clip, Query
-from tests.track.clips import make_clip, make_tracker
+from tests.track.clips import make_clip, make_found, make_tracker
 
 
 @pytest.fixture(scope="module")
@@ -17,22 +15,8 @@ def clip() -> Clip:
     return make_clip()
 
 
-def seen(*places: tuple[str, str, tuple[float, float]]) -> Found:
-    """What a finder is sure of, the surest first: label, intent and pixel of each."""
-    n = len(places)
-    return Found(
-        uv_px=np.array([at for *_, at in places], np.float64),
-        logit=9.0 - np.arange(n),
-        label_p=np.eye(len(LABELS_FOUND))[[LABELS_FOUND.index(label) for label, *_ in places]],
-        lift_p=np.array([float(intent == "lift") for _, intent, _ in places]),
-        box_px=np.full((n, 4), np.nan),
-        panel=np.full(n, -1),
-        panels=Panels(np.zeros((0, 4)), np.zeros(0, np.int64), np.zeros(0), np.zeros((0, len(OPENINGS)))),
-    )
-
-
 def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
-    found = seen(("rim", "open", (16, 16)), ("rim", "lift", (48, 48)), ("handle", "lift", (16, 48)))
+    found = make_found(("rim", "open", (16, 16)), ("rim", "lift", (48, 48)), ("handle", "lift", (16, 48)))
     monkeypatch.setattr("quest.track.stream.find", lambda *_, **__: found)
     tracker = make_tracker()
     tracks = tracker.track(clip, [Query.semantic("rim", intent=intent) for intent in ("lift", "open")])
@@ -40,7 +24,7 @@ def test_prompts_choose_by_intent(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     assert tracker.track(clip).names == ("rim 0", "rim 1 (lift)", "handle 2 (lift)")
 
 
-ALL_AT_ONE_PLACE = seen(("handle", "open", (32, 32)), ("rim", "open", (32, 32)), ("rim", "lift", (32, 32)))
+ALL_AT_ONE_PLACE = make_found(("handle", "open", (32, 32)), ("rim", "open", (32, 32)), ("rim", "lift", (32, 32)))
 """A handle, a rim to open and the same rim to lift."""
 
 

@@ -34,6 +34,13 @@ class Tree:
     first: Twig | None = None
 
 
+@dataclass(frozen=True)
+class Sprout:
+    flags: tuple[str, ...]
+    height_m: float = 0.1
+    leaves: list[int] = field(default_factory=list)
+
+
 def make_tree() -> Tree:
     twig = Twig(JointKind.REVOLUTE, float("nan"), np.arange(6, dtype=np.int64).reshape(2, 3).T)
     twig._learned = torch.arange(4, dtype=torch.bfloat16)[::2]
@@ -61,6 +68,16 @@ def test_a_tree_comes_back():
     assert [array.shape for _, array in again.recent] == [(0, 3), ()]
     assert (again.asked, again.flags, again.first) == (tree.asked, tree.flags, None)
     assert save(again) == save(tree)
+
+
+def test_what_an_older_version_did_not_save_takes_its_default():
+    @dataclass(frozen=True)
+    class Seed:
+        flags: tuple[str, ...]
+
+    assert load(save({"": Seed(("late",))}), dict[str, Sprout]) == {"": Sprout(("late",))}
+    with pytest.raises(InputError, match="saved stream"):
+        load(save({"": Seed(("late",))}), dict[str, Twig])
 
 
 def test_what_was_saved_shares_no_memory_with_what_goes_on():

@@ -31,6 +31,8 @@ class Find:
     """Name, file, or owner/name on the Hugging Face hub."""
     frame: int = 0
     """Which frame of a recording."""
+    text: str | None = None
+    """Only what a text means, such as "the lever of the left door"; how it is understood is printed."""
     threshold: float | None = None
     """Least probability; default: that of the weights."""
     json: bool = False
@@ -44,11 +46,13 @@ class Find:
         from quest.data.pictures import PICTURES, read_picture
         from quest.data.recording import read_recording
         from quest.errors import ConfigError, InputError
+        from quest.text import choose, understand
         from quest.track import Tracker
         from quest.types import Clip
 
         if self.threshold is not None and not 0 <= self.threshold <= 1:
             raise ConfigError(f"find: expected a threshold from 0 to 1, got {self.threshold}")
+        meaning = None if self.text is None else understand(self.text)
         tracker = quest.load(self.weights, monitor=False)
         if not isinstance(tracker, Tracker):
             raise ConfigError(f"find: {self.weights} is the published network, which finds nothing in single pictures")
@@ -60,17 +64,23 @@ class Find:
         if not 0 <= self.frame < len(clip):
             raise InputError(f"{self.source}: expected a frame from 0 to {len(clip) - 1}, got {self.frame}")
         found = tracker.find(clip.camera, clip.frame(self.frame))
-        least = tracker.config.threshold if self.threshold is None else self.threshold
-        things = listed(found, least=least)
+        config, missing = tracker.config, ""
+        least = config.threshold if self.threshold is None else self.threshold
         console = Console(highlight=False, soft_wrap=True)
+        if meaning is not None:
+            of_any = config.prompt_threshold if self.threshold is None else least
+            chosen = choose(found, meaning, least=least, least_of_any=of_any)
+            found, least, missing = found.select(chosen.rows), 0.0, chosen.missing
+            Console(highlight=False, soft_wrap=True, stderr=self.json).print(f"understood: {escape(str(meaning))}")
+        things = listed(found, least=least)
+        if not things and not missing:
+            missing = "nothing found; a lower --threshold shows what is less sure"
         if self.json:
             print(json.dumps(things, indent=1))
         else:
             for thing in things:
                 console.print(escape(_line(thing)))
-            console.print(
-                f"{len(things)} found" if things else "nothing found; a lower --threshold shows what is less sure"
-            )
+            console.print("; ".join(filter(None, (f"{len(things)} found" * bool(things), escape(missing)))))
         if self.out is not None:
             self._write(clip.rgb[self.frame], found, things, least)
             console.print(f"wrote {escape(str(self.out / 'found.png'))} and found.json")
@@ -85,7 +95,8 @@ class Find:
         assert self.out is not None
         self.out.mkdir(parents=True, exist_ok=True)
         with whole_file(self.out / "found.png") as unfinished:
-            Image.fromarray(draw_found(rgb, found, least=least)).save(unfinished, format="PNG")
+            drawn = draw_found(rgb, found, least=least, all_panels=self.text is None)
+            Image.fromarray(drawn).save(unfinished, format="PNG")
         with whole_file(self.out / "found.json") as unfinished:
             unfinished.write_text(json.dumps(coco(things, Path(self.source).name, rgb.shape), indent=1) + "\n")
 

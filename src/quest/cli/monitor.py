@@ -57,7 +57,14 @@ class Monitor(Source):
         length = source.length
         queries = self.queries(source)
         tracker = self.tracker()
-        stream = tracker.stream(source.camera, queries, alpha=self.alpha, alpha_frames=self.alpha_frames)
+        stream = tracker.stream(
+            source.camera,
+            queries,
+            online=self.online,
+            wait=not self.realtime,
+            alpha=self.alpha,
+            alpha_frames=self.alpha_frames,
+        )
         frames = "" if length is None else f"{counted(length, 'frame')}, "
         console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
         if stream.budget is None:

@@ -37,6 +37,10 @@ class Source:
     label: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """The most confident entity of a label: handle, knob, rim or front; for one intent only, such as rim:lift or
     rim:open; give it again for more."""
+    text: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """An entity in words, such as "the lever of the left door"; give it again for each entity."""
+    online: bool = False
+    """Without queries: discover entities in later frames too, not in the first one alone."""
     depth: Path | None = None
     """Folder of 16-bit depth images; default: depth beside the colours."""
     camera: Path | None = None
@@ -127,6 +131,7 @@ class Source:
         for text in self.label:
             label, _, intent = text.partition(":")
             queries.append(Query.semantic(label, intent=intent or None))
+        queries += [Query.text(words) for words in self.text]
         return queries or None
 
     def check_alpha(self) -> None:

@@ -53,7 +53,9 @@ class Track(Source):
         size = f"{clip.camera.width} x {clip.camera.height}"
         console.print(f"tracking {counted(len(clip), 'frame')} of {size}{depth} on {tracker.device}")
         with counting(console, "tracking", len(clip)) as report:
-            tracks = tracker.track(clip, queries, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report)
+            tracks = tracker.track(
+                clip, queries, online=self.online, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report
+            )
         tracks.save(out)
         console.print(_summary(clip, tracks))
         console.print("\n".join(map(escape, narrate(tracks))))

@@ -8,14 +8,16 @@ Without depth nothing is known to ride, and the own patch, guided by the camera'
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from quest.filter.appearance import CELL_REACH_PX, Likeness
 from quest.filter.joints import Joint, joints_of
-from quest.filter.landmarks import CameraMotion, Landmarks, observe, ray_error, sow
+from quest.filter.landmarks import Landmarks, observe, ray_error, sow
+from quest.filter.local_motion import follow
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.posterior import weigh
@@ -33,6 +35,8 @@ class FilterState:
     stamp_s: float
     landmarks: Landmarks
     queries: Queries
+    warp: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
+    """Homography of the picture since the previous frame, for places without depth."""
 
 
 def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterState:
@@ -73,11 +77,12 @@ def step(
     view = View(state.view.matrix, camera.cam_from_world, depth_m)
     queries = state.queries.meet(len(landmarks.pose))
     if len(queries):
-        expected_px = _expect(queries, state, landmarks, view, camera)
+        body = np.where(queries.rides, queries.body, 0)
+        expected_px = _carried(queries.own_px, body, state, landmarks, view, camera.picture)
         queries = follow_patches(queries, state.picture, picture, expected_px, state.view, view, dt_s, noise)
         queries = weigh(queries, landmarks, picture, view, dt_s, noise)
     landmarks = sow(landmarks, picture, view, _at(queries, landmarks, view), noise)
-    return replace(state, picture=picture, view=view, stamp_s=stamp_s, landmarks=landmarks, queries=queries)
+    return FilterState(picture, view, stamp_s, landmarks, queries, camera.picture)
 
 
 def _at(queries: Queries, landmarks: Landmarks, view: View) -> Float[np.ndarray, "K 2"]:
@@ -101,15 +106,59 @@ def keep(state: FilterState, rows: Sequence[int]) -> FilterState:
     return replace(state, queries=state.queries.only(np.array(rows, dtype=np.int64)))
 
 
-def _expect(
-    queries: Queries, state: FilterState, landmarks: Landmarks, view: View, camera: CameraMotion
-) -> Float[np.ndarray, "K 2"]:
-    """Where the patches are if they went on with their most probable body since the previous frame."""
-    warped = cv2.perspectiveTransform(queries.own_px[None], camera.picture)[0]
-    depth_m = state.view.near_depth_at(queries.own_px)
-    body = np.where(queries.rides, queries.body, 0)
-    before = np.concatenate([state.landmarks.pose, np.tile(np.eye(4), (len(landmarks.pose), 1, 1))])[body]
-    rode, _ = view.project(move(landmarks.pose[body], move_back(before, state.view.lift(queries.own_px, depth_m))))
+def carry(
+    old: FilterState, new: FilterState, warp: Float[np.ndarray, "3 3"], uv_px: Float[np.ndarray, "N 2"]
+) -> Float[np.ndarray, "N 2"]:
+    """Where pixels of an earlier frame are in a later one: where the body at each went, corrected by its patch.
+
+    Args:
+        old: state after the earlier frame.
+        new: state after the later one.
+        warp: homography of the picture from one to the other: the product of :attr:`FilterState.warp` in between.
+        uv_px: pixels of the earlier frame.
+    """
+    if old is new or not len(uv_px):
+        return uv_px
+    expected_px = _carried(uv_px, _body_at(old, uv_px), old, new.landmarks, new.view, warp)
+    return follow(old.picture, new.picture, uv_px, expected_px).uv_px
+
+
+def moves_alone(state: FilterState, uv_px: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
+    """Whether pixels lie on a body that moved against the world and that no query rides on."""
+    body = _body_at(state, uv_px)
+    return (body > 0) & ~np.isin(body, state.queries.body[state.queries.rides])
+
+
+def returns(state: FilterState, uv_px: Float[np.ndarray, "N 2"], noise: Noise) -> Bool[np.ndarray, " N"]:
+    """Whether each pixel is more probably than not a query that is not seen where it is followed."""
+    queries = state.queries.only(np.flatnonzero(state.queries.seen_log_odds <= 0))
+    if not (len(queries) and len(uv_px)):
+        return np.zeros(len(uv_px), dtype=bool)
+    likeness = Likeness.of(state.picture, queries.descriptor, queries.patch)
+    alike = likeness.at(np.repeat(uv_px[None], len(queries), axis=0), noise, CELL_REACH_PX).log_odds
+    left = np.minimum(queries.lost_log_odds, 0)
+    return np.asarray((alike + noise.jump_log_odds + left[:, None] > 0).any(axis=0))
+
+
+def _body_at(state: FilterState, uv_px: Float[np.ndarray, "N 2"]) -> Int[np.ndarray, " N"]:
+    """The body that carries most points around each pixel; the world without depth."""
+    point = state.view.lift(uv_px, state.view.near_depth_at(uv_px))
+    return np.asarray(state.landmarks.share(point, state.landmarks.point_world).argmax(axis=1))
+
+
+def _carried(
+    uv_px: Float[np.ndarray, "N 2"],
+    body: Int[np.ndarray, " N"],
+    old: FilterState,
+    landmarks: Landmarks,
+    view: View,
+    warp: Float[np.ndarray, "3 3"],
+) -> Float[np.ndarray, "N 2"]:
+    """Where pixels of an earlier frame are if they went on with their bodies; without depth, with the picture."""
+    warped = cv2.perspectiveTransform(uv_px[None], warp)[0]
+    depth_m = old.view.near_depth_at(uv_px)
+    before = np.concatenate([old.landmarks.pose, np.tile(np.eye(4), (len(landmarks.pose), 1, 1))])[body]
+    rode, _ = view.project(move(landmarks.pose[body], move_back(before, old.view.lift(uv_px, depth_m))))
     return np.where(np.isfinite(rode), rode, warped)
 
 

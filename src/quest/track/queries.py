@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 
 from quest.errors import InputError
 from quest.model.found import APART_PX, Found
+from quest.text import choose, understand
 from quest.track.settings import TrackerConfig
 from quest.types import LABELS, Camera, Query
 
@@ -92,11 +93,18 @@ class StreamQueries:
         """Ask for one more entity from a frame on; returns the query's number.
 
         Raises:
-            InputError: a point query lies outside the image or in a frame that has passed, a query has the name of
-                another one, or is none.
+            InputError: a point query lies outside the image or in a frame that has passed, a text is not understood or
+                means more than one thing, a query has the name of another one, or is none.
+            MissingExtraError: a text has a word that needs the extra ``text``.
         """
         if not isinstance(query, Query):
-            raise InputError(f"queries: expected Query.point(…), Query.semantic(…) or Query.slot(), got {query!r}")
+            raise InputError(
+                f"queries: expected Query.point(…), Query.semantic(…), Query.text(…) or Query.slot(), got {query!r}"
+            )
+        if query.words is not None:
+            meaning = understand(query.words)
+            if not meaning.single or not set(meaning.thing.nouns) <= set(LABELS):
+                raise InputError(f"text {query.words!r}: expected one thing to follow, and no hinge, got: {meaning}")
         if query.name and query.name in self.state.names.values():
             raise InputError(f"query {query.name!r}: another query is called so already; choose another name")
         if query.uv_px is not None:
@@ -181,6 +189,30 @@ class StreamQueries:
         state.following += found
         return np.array(pixels, np.float64).reshape(-1, 2)
 
+    def discover(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> list[int]:
+        """What is found joins those that are followed, but for what one of them follows already.
+
+        Args:
+            found: entities in this frame, best first.
+            at_px: where the queries are that are followed, pixels of the source.
+
+        Returns:
+            Which of the found ones join.
+        """
+        rows: list[int] = []
+        for i in range(len(found)):
+            one, followed_px = found.select([i]), np.concatenate([at_px, found.uv_px[rows]])
+            if len(self.state.following) < self._config.most and not self.near(one, followed_px).any():
+                rows.append(i)
+                self.state.following.append(self._discovered(one))
+        return rows
+
+    def _discovered(self, one: Found) -> Following:
+        """A query of what was found, with a name of its own."""
+        number, label = self._next_number(), LABELS[int(one.label_p[0, : len(LABELS)].argmax())]
+        intent = "lift" if one.lift_p[0] > 0.5 else "open"
+        return Following(number, f"{label} {number}" + " (lift)" * (intent == "lift"), label, intent)
+
     def _next_number(self) -> int:
         self.state.numbered += 1
         return self.state.numbered - 1
@@ -198,16 +230,13 @@ class StreamQueries:
         exists = found.p * label_p.sum(axis=1)
         likeliest = [LABELS[int(i)] for i in label_p.argmax(axis=1)]
         intent = ["lift" if p > 0.5 else "open" for p in found.lift_p]
-        near = self._near(found, at_px)
+        near = self.near(found, at_px)
         begun: list[Following] = []
         chosen: list[int] = []
         if self.state.discover:
             chosen = [i for i in range(len(found)) if exists[i] > config.threshold and not near[i].any()]
             chosen = chosen[: config.most]
-            for i in chosen:
-                number = self._next_number()
-                name = f"{likeliest[i]} {number}" + " (lift)" * (intent[i] == "lift")
-                begun.append(Following(number, name, likeliest[i], intent[i]))
+            begun += [self._discovered(found.select([i])) for i in chosen]
             self.state.discover = False
         for waiting in looking:
             query = waiting.query
@@ -217,6 +246,10 @@ class StreamQueries:
             taken = near & np.array([_same(query, f) for f in following], bool)
             fits[taken.any(axis=1)] = 0
             fits[chosen] = 0
+            if query.words is not None:  # a text means what it says, whatever else is followed there
+                least, least_of_any = config.threshold, config.prompt_threshold
+                fits[:] = 0
+                fits[choose(found, query.words, least=least, least_of_any=least_of_any).rows] = 1
             best = int(fits.argmax()) if len(fits) else -1
             if best >= 0 and fits[best] > config.prompt_threshold:
                 chosen.append(best)
@@ -224,8 +257,8 @@ class StreamQueries:
                 begun.append(self._begin(waiting, query.name or f"{label} {waiting.number}", label, intent[best]))
         return begun, list(found.uv_px[chosen])
 
-    def _near(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "N K"]:
-        """Which queries follow what was found: they are in its box, or close to it."""
+    def near(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "N K"]:
+        """Which places are of what was found: they are in its box, or close to it."""
         apart_px = APART_PX * max(self._camera.width, self._camera.height) / self._config.size_px
         low, high = found.box_px[:, None, :2], found.box_px[:, None, 2:]
         inside = ((at_px >= low) & (at_px <= high)).all(axis=-1)

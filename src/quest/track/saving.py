@@ -99,7 +99,7 @@ def _unflatten(kind: Any, node: Any, tensors: dict[str, Tensor], device: torch.d
     if NoneType in args:
         return item(next(arg for arg in args if arg is not NoneType), node)
     if is_dataclass(kind):
-        return _made(kind, {name: item(of, node[name]) for name, of in get_type_hints(kind).items()})
+        return _made(kind, {name: item(of, node[name]) for name, of in get_type_hints(kind).items() if name in node})
     if origin is dict:
         return {key: item(args[1], value) for key, value in node}
     if origin is deque:
@@ -113,9 +113,9 @@ def _unflatten(kind: Any, node: Any, tensors: dict[str, Tensor], device: torch.d
 
 
 def _made(kind: Any, values: dict[str, Any]) -> Any:
-    """A dataclass of such fields; those that its constructor does not take are set afterwards."""
-    made = kind(**{f.name: values[f.name] for f in fields(kind) if f.init})
+    """A dataclass of such fields, defaults where an older version had none; those not of its constructor come last."""
+    made = kind(**{f.name: values[f.name] for f in fields(kind) if f.init and f.name in values})
     for f in fields(kind):
-        if not f.init:
+        if not f.init and f.name in values:
             setattr(made, f.name, values[f.name])
     return made

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from scipy.special import logit
 
 from quest.filter import step as filtering
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
 from quest.filter.step import Answer, FilterState
-from quest.filter.view import View, move
+from quest.filter.view import View, in_image, move
 from quest.model.finder import FinderNetwork
-from quest.model.found import find
+from quest.model.found import Found, find
 from quest.model.xfeat import XFeat
 from quest.monitor import Alarm, Budget, Calibration, Inputs, Monitor, MonitorState, probability
+from quest.track.finding import FORGOTTEN, Finding, Looker
 from quest.track.preprocess import Arrival, Prepared, Preprocessor, PreprocessorState, to_picture
 from quest.track.queries import QueriesState, StreamQueries
 from quest.track.reasons import reason
 from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
-from quest.types import Camera, Query, State
+from quest.types import LABELS, Camera, Query, State
 
 WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is not calibrated for what the frames bring so far"
 POSES_BEGIN_FLAG = "poses begin: world points were in the first camera's axes before"
@@ -54,6 +57,8 @@ class Memory:
     """Degradations of the newest frame, in words."""
     answer: StreamState | None = None
     """What was answered in the newest frame."""
+    finding: Finding | None = None
+    """What later looks of the finder told; None where finding does not go on."""
 
 
 class Stream:
@@ -68,6 +73,7 @@ class Stream:
         queries: what to follow; None discovers entities in the first frame.
         calibrations: of the monitor, by what frames bring.
         budget: how often alarms may be false; None for no alarms.
+        finding: how finding goes on, from the first frame on; None where it does not.
 
     Raises:
         InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
@@ -84,6 +90,7 @@ class Stream:
         *,
         calibrations: Mapping[Inputs, Calibration],
         budget: Budget | None,
+        finding: Finding | None = None,
     ) -> None:
         self._features = features
         self._noise = noise
@@ -91,13 +98,14 @@ class Stream:
         self._calibrations = calibrations
         self._preprocessor = Preprocessor(camera)
         self._network = network
-        self._queries = StreamQueries(config, camera, queries)
+        self._queries = StreamQueries(config, camera, queries if finding is None else ())
         self._monitor = None
         if budget is not None and calibrations:
             first = next(iter(calibrations.values()))
             self._monitor = Monitor(first, alpha=budget.alpha, alpha_frames=budget.frames)
         state = None if self._monitor is None else self._monitor.state
-        self._memory = Memory(self._preprocessor.state, self._queries.state, state)
+        self._memory = Memory(self._preprocessor.state, self._queries.state, state, finding=finding)
+        self._looker = Looker(behind=finding is not None and finding.behind)
         self._callbacks: list[Callable[[Alarm], None]] = []
 
     @property
@@ -108,6 +116,7 @@ class Stream:
     @memory.setter
     def memory(self, memory: Memory) -> None:
         self._memory, self._preprocessor.state, self._queries.state = memory, memory.preprocessor, memory.queries
+        self._looker = Looker(behind=memory.finding is not None and memory.finding.behind)
         if self._monitor is not None and memory.monitor is not None:
             if memory.inputs is not None and memory.inputs in self._calibrations:
                 self._monitor.calibration = self._calibrations[memory.inputs]
@@ -135,8 +144,8 @@ class Stream:
 
     @property
     def looking(self) -> bool:
-        """Whether a query may still find its entity: labels and slots look for it for a quarter of a second."""
-        return self._queries.looking(self._preprocessor.state.now_s)
+        """Whether something may still be found: labels and slots look for a quarter of a second, ``online`` always."""
+        return self._memory.finding is not None or self._queries.looking(self._preprocessor.state.now_s)
 
     def add(self, query: Query) -> int:
         """Follow one more entity from the next frame on; returns the query's number.
@@ -198,6 +207,7 @@ class Stream:
         Raises:
             InputError: the frame does not have the camera's size or type, its stamp is not finite, or its pose is not
                 rigid; the stream stays as it was.
+            Exception: whatever the finder raises, in a look in the background too; the next frame can be tracked.
         """
         preprocessor, memory, stamp_s = self._preprocessor, self._memory, float(stamp_s)
         preprocessor.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
@@ -212,13 +222,15 @@ class Stream:
         state = self._filter(frame)
         at_px = filtering.read_off(state, self._noise).uv_px
         new_px = self._queries.bind(
-            memory.frame - 1, preprocessor.state.now_s, at_px,
-            lambda: find(self._network, rgb, frame.depth_m, **self._config.looking),
-        )  # fmt: skip
+            memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb, frame.depth_m)
+        )
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
+        if memory.finding is not None:
+            memory.filter = self._find(memory.finding, memory.filter, rgb, frame.depth_m)
         if self._monitor is not None:
-            for following in self._queries.state.following[len(at_px) :]:
-                self._monitor.watch(following.number, following.name)
+            for following in self._queries.state.following:
+                if following.number not in self._monitor.state.name:
+                    self._monitor.watch(following.number, following.name)
         memory.answer, raised = self._answer(memory.filter)
         for alarm in raised:
             for callback in self._callbacks:
@@ -240,6 +252,43 @@ class Stream:
             memory.world_from_filter = np.linalg.inv(frame.first_pose) @ state.view.cam_from_world
             memory.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
         return state
+
+    def _look(self, rgb: UInt8[np.ndarray, "H W 3"], depth_m: Float32[np.ndarray, "H W"] | None) -> Found:
+        return find(self._network, rgb, depth_m, **self._config.looking)
+
+    def _find(
+        self,
+        finding: Finding,
+        state: FilterState,
+        rgb: UInt8[np.ndarray, "H W 3"],
+        depth_m: Float32[np.ndarray, "H W"] | None,
+    ) -> FilterState:
+        """Begin a look if it is time, and take in the last one if it is there: what is likely enough is followed."""
+        config, queries = self._config, self._queries
+        finding.warp = state.warp @ finding.warp
+        if self._looker.idle and finding.due(state.stamp_s):
+            finding.begin(state)
+            self._looker.begin(partial(self._look, rgb.copy(), depth_m))
+        found, look = self._looker.take(), finding.frame
+        if found is None or look is None:
+            return state
+        finding.looked_s = look.stamp_s
+        found = found.select(np.isin(found.labels, LABELS))
+        followed = queries.near(found, filtering.read_off(look, self._noise).uv_px).any(axis=1)
+        found = found.select(np.flatnonzero(~followed))
+        told = finding.candidates.after(found, queries.near(found, finding.candidates.uv_px))
+        alone = filtering.moves_alone(look, found.uv_px)
+        least = logit(np.where(alone, min(config.threshold, config.prompt_threshold), config.threshold))
+        sure = np.flatnonzero(told.log_odds[: len(found)] > least)
+        sure = sure[~filtering.returns(look, found.uv_px[sure], self._noise)]
+        now_px = filtering.carry(look, state, finding.warp, found.uv_px[sure])
+        moved = np.tile(now_px - found.uv_px[sure], 2)
+        now = replace(found.select(sure), uv_px=now_px, box_px=found.box_px[sure] + moved)
+        there = np.flatnonzero(in_image(now_px, state.picture.size))
+        begun = there[queries.discover(now.select(there), filtering.read_off(state, self._noise).uv_px)]
+        left = np.setdiff1d(np.flatnonzero(told.log_odds > FORGOTTEN), sure[begun])
+        finding.candidates = told.only(left[np.argsort(-told.log_odds[left], kind="stable")][: config.most])
+        return filtering.ask(state, now_px[begun], self._noise) if len(begun) else state
 
     def _answer(self, state: FilterState) -> tuple[StreamState, tuple[Alarm, ...]]:
         """What is said of the newest frame, and the alarms that are raised in it."""
@@ -306,6 +355,7 @@ class Stream:
         memory, following = self._memory, self._queries.state.following
         if memory.answer is None:
             raise AssertionError("the first frame is always new")
+        following = [f for f in following if f.number in memory.answer.query]
         rows = [memory.answer.query.index(f.number) for f in following]
         return replace(memory.answer.only(rows), names=tuple(f.name for f in following), flags=memory.flags)
 

@@ -21,6 +21,7 @@ from quest.model.found import Found, find
 from quest.model.weights import load_network
 from quest.model.xfeat import XFeat
 from quest.monitor import Budget, Calibration, Inputs, read_calibrations
+from quest.track.finding import Finding
 from quest.track.preprocess import NO_DEPTH_FLAG, Preprocessor
 from quest.track.saving import load as restored
 from quest.track.saving import save
@@ -33,7 +34,7 @@ DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
 PARTLY_NO_DEPTH_FLAG = "depth missing in some frames: world points there are where the bodies carry them, NaN at first"
 PARTLY_WITHHELD_FLAG = "no P(lost) and no alarms in the frames until depth began: the monitor is calibrated for depth"
-NOTHING_FOUND_FLAG = "discovery found no entity in the first frame; give a point or a label"
+NOTHING_FOUND_FLAG = "discovery found no entity; give a point or a label"
 
 
 @dataclass(frozen=True)
@@ -99,6 +100,8 @@ class Tracker:
         camera: Camera,
         queries: Sequence[Query] | None = None,
         *,
+        online: bool | float | int = False,
+        wait: bool = False,
         alpha: float | None = DEFAULT_ALPHA,
         alpha_frames: int | None = None,
     ) -> Stream:
@@ -107,6 +110,10 @@ class Tracker:
         Args:
             camera: intrinsics of the frames.
             queries: what to follow; None discovers entities in the first frame.
+            online: whether discovery goes on in later frames, every half second or every so many seconds of the
+                stream's clock; ``queries`` are then None, and others are added to the stream.
+            wait: whether a frame in which the finder looks waits for it, so that answers do not depend on the speed of
+                the machine. Otherwise ``online`` looks in the background.
             alpha: probability of any alarm in a stream in which no identity is lost (``docs/monitor.md`` says what is
                 promised); None for no alarms. Without a calibration for what the frames bring there are none either.
             alpha_frames: alpha is for every so many frames instead, such as 300 for ten seconds at 30 frames a second:
@@ -114,8 +121,11 @@ class Tracker:
 
         Raises:
             InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
-            ConfigError: alpha is no probability, or there are no frames.
+            ConfigError: alpha is no probability, there are no frames, or ``online`` is no time or comes with queries.
         """
+        finding = Finding.of(online, behind=not wait)
+        if finding is not None and queries is not None:
+            raise ConfigError("online: expected no queries, got some; leave out either, or add them to the stream")
         return Stream(
             self.network,
             self.features,
@@ -125,6 +135,7 @@ class Tracker:
             queries,
             calibrations=self.calibrations,
             budget=None if alpha is None else Budget(alpha, alpha_frames),
+            finding=finding,
         )
 
     def find(self, camera: Camera, frame: Frame) -> Found:
@@ -172,6 +183,7 @@ class Tracker:
         clip: Clip | str | Path | np.ndarray | torch.Tensor,
         queries: Sequence[Query] | None = None,
         *,
+        online: bool | float | int = False,
         alpha: float | None = DEFAULT_ALPHA,
         alpha_frames: int | None = None,
         report: Callable[[int], object] | None = None,
@@ -182,6 +194,7 @@ class Tracker:
             clip: the frames; or what :func:`quest.read` reads, by its path; or colours alone, [T, H, W, 3], as an array
                 or tensor that :meth:`quest.Clip.from_arrays` takes.
             queries: what to follow; None discovers entities in the first frame.
+            online: as in :meth:`stream`; each frame waits for the finder.
             alpha: as in :meth:`stream`.
             alpha_frames: as in :meth:`stream`; ``len(clip)`` shares alpha among all parts of the clip alike.
             report: called after every frame with the number of frames that are done.
@@ -190,13 +203,13 @@ class Tracker:
             InputError: a point query lies outside the clip, or two queries have one name; or the frames are not as
                 expected.
             TakeError: a path names a take that cannot be read.
-            ConfigError: alpha is no probability, or there are no frames.
+            ConfigError: as in :meth:`stream`.
         """
         if isinstance(clip, str | Path):
             clip = read_recording(clip)
         elif not isinstance(clip, Clip):
             clip = Clip.from_arrays(clip)
-        stream = self.stream(clip.camera, queries, alpha=alpha, alpha_frames=alpha_frames)
+        stream = self.stream(clip.camera, queries, online=online, wait=True, alpha=alpha, alpha_frames=alpha_frames)
         for query in queries or ():
             if query.frame >= len(clip):
                 raise InputError(

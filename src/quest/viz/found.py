@@ -12,20 +12,23 @@ from quest.viz.ink import draw_outlined
 from quest.viz.palette import MUTED, query_colour
 
 
-def draw_found(rgb: UInt8[np.ndarray, "H W 3"], found: Found, *, least: float) -> UInt8[np.ndarray, "H W 3"]:
+def draw_found(
+    rgb: UInt8[np.ndarray, "H W 3"], found: Found, *, least: float, all_panels: bool = True
+) -> UInt8[np.ndarray, "H W 3"]:
     """The picture with boxes of handles and knobs, dots of the rest, and the doors and drawers that carry them.
 
     Args:
         rgb: the picture.
         found: what was found in it.
         least: probability below which nothing is drawn.
+        all_panels: whether doors and drawers are drawn too that carry none of what is drawn.
     """
     canvas = np.ascontiguousarray(rgb).copy()
     unit = max(canvas.shape[:2]) / 640
     thick, size = max(1, round(1.5 * unit)), max(9, round(11 * unit))
     shown = np.flatnonzero(found.p >= least)
     panels = found.panels
-    carriers = set(found.panel[shown].tolist()) | set(np.flatnonzero(panels.logit > 0).tolist())
+    carriers = set(found.panel[shown].tolist()) | set(np.flatnonzero((panels.logit > 0) & all_panels).tolist())
     for k in sorted(carriers - {-1}):
         left, top, right, bottom = panels.box_px[k].round().astype(int).tolist()
         cv2.rectangle(canvas, (left, top), (right, bottom), MUTED, thick, cv2.LINE_AA)
