@@ -75,7 +75,7 @@ class Release:
     """Procedural test objects on which the monitor's promise is checked."""
     start: str | None = None
     """Trained weights to start from, instead of the initial ones."""
-    steps: int = 900
+    steps: int = 1350
     """Optimiser steps."""
     batch: int = 24
     """Cuts per step."""
@@ -133,7 +133,7 @@ class Release:
         _quest("train", "--pictures", *self.pictures, "--data", self._takes_of("train"), "--validation",
                self._takes_of("validation"), *begin, "--out", self.work / "finder", "--views", self.views,
                *(["--free"] if self.free else []), "--finding.batch", self.batch, "--training.steps", self.steps,
-               "--training.learning-rate", self.learning_rate, "--training.warmup-steps", 20, "--training.clip-norm",
+               "--training.learning-rate", self.learning_rate, "--training.warmup-steps", 50, "--training.clip-norm",
                5, "--training.weight-decay", 0.02, "--training.validate-every", 150)  # fmt: skip
 
     def _tune(self) -> None:

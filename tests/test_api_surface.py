@@ -32,7 +32,7 @@ MEMBERS = {
     "Clip": "cam_from_world camera depth_m frame from_arrays name notes rgb stamp_s",
     "Frame": "cam_from_world depth_m rgb stamp_s",
     "Joints": "axis covariance describe kind origin q q_max_seen q_min_seen select unknown",
-    "Query": "frame intent kind label name point semantic slot uv_px",
+    "Query": "frame intent kind label name point semantic slot text uv_px words",
     "State": "HELD LOST TRACKING",
     "Stream": "add budget camera frame looking memory on_alarm rename retire step unbound",
     "StreamState": "alarm confidence flags has_depth joint labels lost_log_odds lost_p names only point_world q "
@@ -44,7 +44,7 @@ MEMBERS = {
 """Fields, methods and properties of the public classes."""
 
 COMMANDS = [
-    *("calibrate", "data", "doctor", "eval", "eval-monitor"),
+    *("bench", "calibrate", "data", "doctor", "eval", "eval-monitor"),
     *("find", "generate", "monitor", "objects", "track", "train", "weights"),
 ]
 

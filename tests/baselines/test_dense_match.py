@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import cv2
 import numpy as np
 import pytest
 import torch
 
 from quest.baselines import dense_match
-from quest.baselines.dense_match import DenseMatch, best_match
+from quest.baselines.dense_match import DenseMatch, best_match, token_features
 from quest.errors import ConfigError
 from quest.types import Camera, Clip, Query, State
+from tests.tiny import make_finder
 
 SHIFT_PX = np.array([[0, 0], [5, 3], [16, -8], [-21, 13]])
 """Of the whole picture against the first one; no small steps, and none that repeats."""
@@ -18,7 +21,7 @@ SHIFT_PX = np.array([[0, 0], [5, 3], [16, -8], [-21, 13]])
 
 @pytest.fixture(scope="module")
 def tracker() -> DenseMatch:
-    return DenseMatch()
+    return DenseMatch.by_xfeat()
 
 
 @pytest.fixture
@@ -61,20 +64,38 @@ def test_what_nothing_resembles_is_not_visible_and_held(
     np.testing.assert_array_equal(tracks.point_world[2], tracks.point_world[1])
 
 
-def test_a_match_lies_between_cells_but_not_beyond_the_border(tracker: DenseMatch) -> None:
+def test_a_match_lies_between_cells_but_not_beyond_the_border() -> None:
     features = torch.zeros(2, 4, 6)
     features[0, 1, 2:4] = torch.tensor([1.0, 0.5])  # vertex of 0, 1, 0.5: a sixth of a cell further
     features[1, 0, 5] = -1.0
     uv_px, similarity = best_match(features, torch.tensor([[1.0, 0.0], [0.0, -1.0]]), (60, 40))
     np.testing.assert_allclose(uv_px, [[25 + 10 / 6, 15], [55, 5]], atol=1e-4)
     assert similarity.tolist() == [1, 1]
-    assert tracker.network is tracker.network
 
 
 @pytest.mark.parametrize("queries", [None, [Query.semantic("handle")]])
 def test_only_points_are_followed(tracker: DenseMatch, clip: Clip, queries: list[Query] | None) -> None:
     with pytest.raises(ConfigError, match="xfeat"):
         tracker.track(clip, queries)
+
+
+def test_tokens_find_a_patch_that_moved() -> None:
+    """By whole tokens, of ten pixels each, since the weights are random."""
+    encoder = make_finder().encoder
+    tracker = DenseMatch("dino", partial(token_features, encoder), weights_hash="0123")
+    places = np.array([[200, 150], [320, 150], [220, 210]], np.float32)
+    rgb = np.full((3, 320, 400, 3), 90, np.uint8)
+    for image, (x, y) in zip(rgb, places.astype(int), strict=True):
+        image[y - 24 : y + 24, x - 24 : x + 24] = (
+            np.random.default_rng(1).integers(0, 256, (6, 6, 3)).repeat(8, 0).repeat(8, 1)
+        )
+    camera = Camera(400.0, 400.0, 200.0, 160.0, 400, 320)
+    clip = Clip("blob", camera, rgb, None, np.arange(3) / 30, np.tile(np.eye(4), (3, 1, 1)))
+    tracks = tracker.track(clip, [Query.point(0, 200, 150)])
+    assert np.linalg.norm(tracks.uv_px[:, 0] - places, axis=-1).max() < 2
+    features = token_features(encoder, rgb[0])
+    assert features.shape == (24, 4 * 32, 4 * 40)
+    np.testing.assert_allclose(features.norm(dim=0), 1, atol=1e-5)
 
 
 def test_no_queries_have_no_answers(tracker: DenseMatch, clip: Clip) -> None:

@@ -35,7 +35,7 @@ def make_tracker() -> Tracker:
 @pytest.mark.slow
 def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, take: Take) -> None:
     monkeypatch.setattr(quest, "load", lambda weights: make_tracker(), raising=False)
-    names = (*TRACKERS, "quest")
+    names = (*(name for name, entry in TRACKERS.items() if not entry.official), "quest")
     trackers = line_up(names, weights="any")
     assert [tracker.name for tracker in trackers] == list(dict.fromkeys(names))
     queries = [Query.point(0, 30.0, 20.0)]
@@ -58,8 +58,13 @@ def test_trackers_of_weights_know_which(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(quest, "load", None, raising=False)
-    names = [name for name, entry in TRACKERS.items() if not entry.of_weights]
+    names = [name for name, entry in TRACKERS.items() if entry.plain]
     assert [t.name for t in line_up(names, weights="none")] == names
+
+
+def test_what_is_official_is_called_so() -> None:
+    assert all(entry.official == name.endswith("-official") for name, entry in TRACKERS.items())
+    assert not any(entry.official and (entry.of_weights or entry.plain) for entry in TRACKERS.values())
 
 
 def test_variants_take_their_pace_from_their_name() -> None:

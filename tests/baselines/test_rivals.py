@@ -10,7 +10,7 @@ import pytest
 
 from quest.baselines.dense_flow import DenseFlow
 from quest.baselines.hold_still import HoldStill
-from quest.baselines.lucas_kanade import LucasKanade, LucasKanadeGrid, checked_flow, flow
+from quest.baselines.lucas_kanade import SEARCH_PX, LucasKanade, LucasKanadeAgain, LucasKanadeGrid, checked_flow, flow
 from quest.baselines.still_world import StillWorld, camera_poses
 from quest.types import Camera, Clip, Query, State
 
@@ -45,7 +45,10 @@ def expected(query: Query) -> np.ndarray:
     return query.uv_px + STEP_PX * np.arange(FRAMES - query.frame)[:, None]
 
 
-@pytest.mark.parametrize("tracker", [LucasKanade(), LucasKanadeGrid(), DenseFlow()], ids=lambda t: t.name)
+CHAINED = [LucasKanade(), LucasKanadeGrid(), LucasKanadeAgain(), DenseFlow()]
+
+
+@pytest.mark.parametrize("tracker", CHAINED, ids=lambda t: t.name)
 def test_chained_flow_follows_a_known_shift(shift_clip: Clip, tracker: LucasKanade) -> None:
     tracks = tracker.track(dataclasses.replace(shift_clip, depth_m=None), QUERIES)
     for k, query in enumerate(QUERIES):
@@ -73,6 +76,43 @@ def test_a_grid_that_is_covered_waits_and_goes_on(shift_clip: Clip) -> None:
     np.testing.assert_array_equal(tracks.uv_px[3, 0], tracks.uv_px[2, 0])
     np.testing.assert_array_equal(tracks.point_world[3, 0], tracks.point_world[2, 0])
     assert tracks.visible[6:, 0].all()
+
+
+def occluded_clip(shift_clip: Clip, *, step_px: int) -> Clip:
+    """A wall that moves on while a board of another texture is in front of it; board and wall part slowly."""
+    rgb = np.repeat(shift_clip.rgb[:1], 14, axis=0)
+    board = np.random.default_rng(3).integers(0, 255, (70, 70, 3))
+    for t in range(14):
+        rgb[t] = np.roll(shift_clip.rgb[0], step_px * t, axis=1)
+        if 3 <= t < 9:
+            rgb[t, 25:95, 30:100] = board
+    poses, depth_m = np.tile(np.eye(4), (14, 1, 1)), np.full((14, 128, 128), 2.0, np.float32)
+    return dataclasses.replace(shift_clip, rgb=rgb, depth_m=depth_m, stamp_s=np.arange(14) / 30, cam_from_world=poses)
+
+
+def test_what_moved_behind_a_board_is_found_again_by_its_first_patch(shift_clip: Clip) -> None:
+    clip = occluded_clip(shift_clip, step_px=5)
+    where = np.add((40.5, 60.5), np.arange(14)[:, None] * (5, 0))
+    tracks = LucasKanadeAgain().track(clip, [Query.point(0, 40.5, 60.5)])
+    assert tracks.visible[:, 0].tolist() == [not 3 <= t < 9 for t in range(14)]
+    off_px = np.linalg.norm(tracks.uv_px[:, 0] - where, axis=-1)
+    assert off_px[tracks.visible[:, 0]].max() < 1
+    np.testing.assert_array_equal(tracks.uv_px[3:9, 0], np.tile(tracks.uv_px[2, 0], (6, 1)))
+    np.testing.assert_array_equal(tracks.point_world[8, 0], tracks.point_world[2, 0])
+    for other in (LucasKanade(), LucasKanadeGrid()):
+        assert np.linalg.norm(other.track(clip, [Query.point(0, 40.5, 60.5)]).uv_px[-1, 0] - where[-1]) > 10
+
+
+def test_what_has_no_patch_or_is_far_away_is_not_found_again(shift_clip: Clip) -> None:
+    grey = dataclasses.replace(shift_clip, rgb=np.full_like(shift_clip.rgb, 128))
+    assert not LucasKanadeAgain().track(grey, [Query.point(0, 60.0, 60.0)]).visible[1:].any()
+    far = shift_clip.rgb.copy()
+    far[3:5] = 0
+    far[5:] = np.roll(far[5:], SEARCH_PX - 15, axis=2)
+    tracks = LucasKanadeAgain().track(dataclasses.replace(shift_clip, rgb=far), [Query.point(0, 30.0, 60.0)])
+    assert not tracks.visible[3:5, 0].any()
+    assert tracks.visible[5:, 0].all()
+    np.testing.assert_allclose(tracks.uv_px[5, 0], (30 + 5 * 1.5 + SEARCH_PX - 15, 60 - 5 * 0.75), atol=1.5)
 
 
 def test_a_still_world_needs_no_poses(shift_clip: Clip) -> None:

@@ -75,6 +75,15 @@ def test_views_without_entities_are_left_out(take: Take, tmp_path: Path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["panels-v1.npz"]
 
 
+def test_depth_only_if_asked_for(take: Take, tmp_path: Path):
+    for depth in (False, True):
+        path = export_tapvid3d(take, tmp_path, depth=depth)[0]
+        with np.load(path, allow_pickle=False) as example:
+            assert ("depth_m" in example) == depth
+    with np.load(path, allow_pickle=False) as example:
+        np.testing.assert_array_equal(example["depth_m"], take.views[0].clip.depth_m)
+
+
 def test_bad_quality(take: Take, tmp_path: Path):
     with pytest.raises(InputError, match="quality of 1 to 100"):
         export_tapvid3d(take, tmp_path, jpeg_quality=0)

@@ -1,7 +1,7 @@
 """Trackers to compare: each is one line in :data:`TRACKERS`, from which commands take names, help and errors.
 
-The plain ones follow pixels and need no weights; the others are QueST without one of its parts. Nothing
-heavy is imported before a tracker is built.
+The plain ones follow pixels and need no weights; others are QueST without one of its parts, or run their authors' code
+and weights, where the user has them. Nothing heavy is imported before a tracker is built.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
 
 from quest.errors import ConfigError, WeightsError
@@ -52,28 +54,45 @@ class Entry:
     about: str
     """What it does, in a few words."""
     maker: str
-    """``module:function`` in this package. It is called with the settings; before them, for trackers of weights,
-    with the name and a :class:`Shared`."""
+    """``module:function`` in this package. It is called with the settings; before them with the name and, for trackers
+    of weights, a :class:`Shared`, for official ones, the folder of code and weights."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the maker."""
     of_weights: bool = False
     """Whether it needs weights of QueST."""
+    official: bool = False
+    """Whether it is its authors' own code and checkpoint, which the user has to have; its name ends so."""
     inputs: tuple[Inputs, ...] = ("colours",)
     """What it is shown of real recordings, one row of the table each; what a recording lacks is left out."""
 
-    def build(self, name: str, shared: Shared | None = None) -> ClipTracker:
+    @property
+    def plain(self) -> bool:
+        """Whether it needs nothing."""
+        return not (self.of_weights or self.official)
+
+    def build(self, name: str, shared: Shared | None = None, *, rivals: Path | None = None) -> ClipTracker:
         """The tracker.
 
         Raises:
-            WeightsError: the network lacks what the tracker needs.
+            ConfigError: official code is not there, or lacks what it needs.
+            WeightsError: the network lacks what the tracker needs, or official weights are not there or do not fit.
         """
+        if self.official and rivals is None:
+            raise ConfigError(
+                f"tracker {name!r}: it runs its authors' code and weights; put both into a folder as docs/metrics.md "
+                "says, and name that with --rivals"
+            )
         module, _, function = self.maker.partition(":")
-        make = getattr(import_module(f"quest.baselines.{module}"), function)
-        return make(name, shared, **self.settings) if self.of_weights else make(**self.settings)
+        make = attrgetter(function)(import_module(f"quest.baselines.{module}"))
+        return make(*(() if self.plain else (name, rivals if self.official else shared)), **self.settings)
 
 
 def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHING, **settings: Any) -> Entry:
     return Entry(about, f"of_weights:{maker}", settings, of_weights=True, inputs=inputs)
+
+
+def _official(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",), **settings: Any) -> Entry:
+    return Entry(about, maker, settings, official=True, inputs=inputs)
 
 
 TRACKERS: dict[str, Entry] = {
@@ -84,25 +103,37 @@ TRACKERS: dict[str, Entry] = {
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
     "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),
+    "lk-reinit": Entry("the same, begun anew by its first patch after occlusions", "lucas_kanade:LucasKanadeAgain"),
     "dis": Entry("dense optical flow, chained", "dense_flow:DenseFlow"),
-    "xfeat": Entry("every frame matched to the query's by dense features", "dense_match:DenseMatch"),
+    "xfeat": Entry("every frame matched to the query's by dense features", "dense_match:DenseMatch.by_xfeat"),
+    "dino": _of_weights("the same by tokens of the vision transformer", "tokens", inputs=("colours",)),
     "world-pnp": Entry("still in the world, camera by LK and PnP", "still_world:StillWorld", inputs=("depth",)),
     "world-given": Entry(
         "still in the world, given poses", "hold_still:HoldStill", {"name": "world-given"}, inputs=("depth and poses",)
     ),
+    "cotracker3-official": _official("CoTracker3, whole clip", "cotracker:CoTracker", online=False),
+    "cotracker3-online-official": _official("CoTracker3, windows of 16 frames", "cotracker:CoTracker", online=True),
+    "tapir-official": _official("TAPIR, whole clip", "tapnet:Tapir", causal=False, boots=False),
+    "bootstapir-official": _official("BootsTAPIR, whole clip", "tapnet:Tapir", causal=False, boots=True),
+    "bootstapir-online-official": _official("BootsTAPIR, frame by frame", "tapnet:Tapir", causal=True, boots=True),
+    "tapnext-official": _official("TAPNext, frame by frame", "tapnet:TapNext"),
+    "tapnextpp-official": _official("TAPNext++, frame by frame", "tapnet:TapNext"),
+    "raft-official": _official("RAFT, chained", "raft:Raft"),
+    "raft-3d-official": _official("RAFT-3D, chained; CUDA", "raft:Raft3D", inputs=("depth",)),
 }
 """Every tracker by the name that commands and tables call it."""
 
 
-def line_up(names: Sequence[str], *, weights: str) -> tuple[ClipTracker, ...]:
+def line_up(names: Sequence[str], *, weights: str, rivals: Path | None = None) -> tuple[ClipTracker, ...]:
     """The trackers of some names; all that need weights share one network.
 
     Args:
         names: of :data:`TRACKERS`; each counts once.
         weights: name or file of the weights.
+        rivals: folder of the code and weights of official trackers.
 
     Raises:
-        ConfigError: no tracker of that name.
+        ConfigError: no tracker of that name, or official code that is not there.
         WeightsError: the weights cannot be loaded, or lack what a tracker needs.
     """
     unknown = [name for name in names if name not in TRACKERS]
@@ -117,4 +148,4 @@ def line_up(names: Sequence[str], *, weights: str) -> tuple[ClipTracker, ...]:
         other = [name for name in names if TRACKERS[name].of_weights and name != "quest"]
         if other and not isinstance(shared.tracker, Tracker):
             raise WeightsError(f"tracker {other[0]!r}: these weights are of the published network; use a finder's")
-    return tuple(TRACKERS[name].build(name, shared) for name in dict.fromkeys(names))
+    return tuple(TRACKERS[name].build(name, shared, rivals=rivals) for name in dict.fromkeys(names))

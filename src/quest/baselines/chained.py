@@ -4,16 +4,20 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from typing import Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, UInt8
 
-from quest.baselines.point_queries import check_point_queries, depth_flags, hold_last, lift_pixels, query_names
+from quest.baselines.point_queries import check_point_queries, tracks_of
 from quest.track.preprocess import grey_of
-from quest.types import Clip, Query, State, Tracks
+from quest.types import Clip, Query, Tracks
+
+Picture = TypeVar("Picture")
+"""What a tracker looks at of a frame."""
 
 
-class Chained(ABC):
+class Chained(ABC, Generic[Picture]):
     """Chains a step from frame to frame.
 
     A point that is not found stays where it was, and is looked for from there in the next frame; one that leaves the
@@ -24,16 +28,37 @@ class Chained(ABC):
     protocols = ("point",)
 
     @abstractmethod
+    def picture(self, clip: Clip, t: int) -> Picture:
+        """What the step looks at of frame ``t``."""
+
+    @abstractmethod
     def step(
-        self, previous: UInt8[np.ndarray, "H W"], grey: UInt8[np.ndarray, "H W"], uv_px: Float32[np.ndarray, "M 2"]
+        self, previous: Picture, picture: Picture, uv_px: Float32[np.ndarray, "M 2"]
     ) -> tuple[Float32[np.ndarray, "M 2"], Bool[np.ndarray, " M"]]:
         """Where points of one frame are in the next one, and which of them were found there.
 
         Args:
-            previous: grey values of the frame in which the points are.
-            grey: grey values of the next one.
+            previous: of the frame in which the points are.
+            picture: of the next one.
             uv_px: pixels, centres at half-integers.
         """
+
+    def resume(
+        self,
+        picture: Picture,
+        origin: tuple[Picture, Float32[np.ndarray, " 2"]],
+        uv_px: Float32[np.ndarray, " 2"],
+        stepped: tuple[Float32[np.ndarray, " 2"], bool],
+    ) -> tuple[Float32[np.ndarray, " 2"], bool]:
+        """Where a point is that was not found in the previous frame; where the step says, if no tracker knows better.
+
+        Args:
+            picture: of this frame.
+            origin: picture of the query's own frame, and its pixel there.
+            uv_px: where the point is held.
+            stepped: where the step has it now, and whether it found it.
+        """
+        return stepped
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
         """Track each point query forward from its frame.
@@ -52,44 +77,42 @@ class Chained(ABC):
         """
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
         assert queries is not None
-        uv_px, alive = self._chain(clip.rgb, first, uv_first)
-        point_world = lift_pixels(clip, uv_px)
-        flags = depth_flags(clip, queries, point_world)
-        # A lost point is held in the world too: its pixel may by now show something else.
-        point_world = hold_last(np.where(alive[..., None], point_world, np.nan).astype(np.float32), first=first)
-        return Tracks(
-            names=query_names(queries),
-            labels=tuple(q.label for q in queries),
-            uv_px=uv_px,
-            point_world=point_world,
-            confidence=alive.astype(np.float32),
-            visible=alive,
-            state=np.where(alive, State.TRACKING.value, State.LOST.value),
-            stamp_s=clip.stamp_s,
-            frame_flags=flags,
-        )
+        uv_px, alive = self._chain(clip, first, uv_first)
+        return tracks_of(clip, queries, uv_px, alive, alive.astype(np.float32))
 
     def _chain(
-        self, rgb: UInt8[np.ndarray, "T H W 3"], first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]
+        self, clip: Clip, first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]
     ) -> tuple[Float32[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"]]:
         """Pixels per frame, and whether the point is still being tracked."""
-        t, k = len(rgb), len(first)
-        height, width = rgb.shape[1:3]
+        t, k = len(clip), len(first)
+        size = (clip.camera.width, clip.camera.height)
         uv_px = np.full((t, k, 2), np.nan, dtype=np.float32)
         alive, gone = np.zeros((t, k), dtype=bool), np.zeros(k, dtype=bool)
-        previous = None
-        for frame in range(t if k else 0):
-            grey = grey_of(rgb[frame])
+        previous, origins = None, dict[int, tuple[Picture, Float32[np.ndarray, " 2"]]]()
+        for frame in range(int(first.min(initial=t)), t):
+            picture = self.picture(clip, frame)
             if previous is not None:
                 uv_px[frame] = uv_px[frame - 1]
                 asked = np.flatnonzero((first < frame) & ~gone)
                 if len(asked):
-                    found, seen = self.step(previous, grey, uv_px[frame, asked])
-                    inside = ((found >= 0) & (found <= (width, height))).all(axis=-1)
+                    found, seen = self.step(previous, picture, uv_px[frame, asked])
+                    for i in np.flatnonzero(~alive[frame - 1, asked]):
+                        held = uv_px[frame, asked[i]]
+                        found[i], seen[i] = self.resume(picture, origins[asked[i]], held, (found[i], bool(seen[i])))
+                    inside = ((found >= 0) & (found <= size)).all(axis=-1)
                     gone[asked] = seen & ~inside
                     kept = seen & inside
                     uv_px[frame, asked[kept]], alive[frame, asked] = found[kept], kept
-            born = first == frame
+            born = np.flatnonzero(first == frame)
             uv_px[frame, born], alive[frame, born] = uv_first[born], True
-            previous = grey
+            origins.update((int(which), (picture, uv_first[which])) for which in born)
+            previous = picture
         return uv_px, alive
+
+
+class ChainedGrey(Chained[UInt8[np.ndarray, "H W"]]):
+    """Chains a step that looks at grey values."""
+
+    def picture(self, clip: Clip, t: int) -> UInt8[np.ndarray, "H W"]:
+        """Luminance."""
+        return grey_of(clip.rgb[t])

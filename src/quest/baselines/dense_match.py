@@ -1,33 +1,59 @@
-"""Every frame matched to the query's own by dense features; nothing is chained."""
+"""Every frame matched to the query's own by dense features; nothing is chained.
+
+Reference of the matching of tokens: Amir et al., Deep ViT features as dense visual descriptors, 2021.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
+import torch.nn.functional as F
+from jaxtyping import Float, Float32, UInt8
 from torch import Tensor
 
-from quest.baselines.point_queries import check_point_queries, depth_flags, hold_last, lift_pixels, query_names
+from quest.baselines.point_queries import check_point_queries, tracks_of
+from quest.model.encoder import Encoder
 from quest.model.xfeat import XFeat, sample
-from quest.types import Clip, Query, State, Tracks
+from quest.types import Clip, Query, Tracks
 
 LEAST_SIMILARITY = 0.6
 """Cosine above which the best match is said to be the point; set beforehand, not tuned on any recording."""
+TOKEN_BLOCK = 8
+"""Index of the block, the ninth, of the vision transformer whose tokens are matched."""
+LONGEST_PX = 640
+"""Longer side of the picture that the vision transformer sees."""
+_FINER = 4
 
 
 class DenseMatch:
-    """Answers with the most similar place of the whole picture, be it similar or not; visible is what is similar."""
+    """Answers with the most similar place of the whole picture, be it similar or not; visible is what is similar.
 
-    name = "xfeat"
+    Args:
+        name: what tables call it.
+        features: descriptors of length 1 of a picture, in cells from corner to corner of it.
+        weights_hash: SHA-256 of the weights, where they are the user's choice.
+    """
+
     protocols = ("point",)
 
-    @cached_property
-    def network(self) -> XFeat:
-        """Loaded when it is first needed."""
-        return XFeat.from_package()
+    def __init__(
+        self,
+        name: str,
+        features: Callable[[UInt8[np.ndarray, "H W 3"]], Float[Tensor, "D h w"]],
+        *,
+        weights_hash: str | None = None,
+    ) -> None:
+        self.name = name
+        self.features = features
+        self.weights_hash = weights_hash
+
+    @classmethod
+    def by_xfeat(cls) -> DenseMatch:
+        """By the packaged network of XFeat."""
+        return cls("xfeat", partial(xfeat_features, XFeat.from_package()))
 
     @torch.no_grad()
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
@@ -43,34 +69,41 @@ class DenseMatch:
 
         Raises:
             ConfigError: a query that is not a point.
-            InputError: a query outside the clip, or pictures with a side below 32 pixels.
+            InputError: a query outside the clip, or pictures with a side below 32 pixels (XFeat).
         """
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
         assert queries is not None
         t, k = len(clip), len(queries)
         size = (clip.camera.width, clip.camera.height)
         uv_px, confidence = np.full((t, k, 2), np.nan, np.float32), np.zeros((t, k), np.float32)
-        wanted = torch.zeros(k, 64)
-        for i in range(int(first.min()) if k else t, t):
-            grey = clip.rgb[i].mean(axis=-1, dtype=np.float32).astype(np.uint8)
-            features, _ = self.network.features(torch.from_numpy(grey))
+        wanted = None
+        for i in range(int(first.min(initial=t)), t):
+            features = self.features(clip.rgb[i])
+            wanted = features.new_zeros(k, len(features)) if wanted is None else wanted
             known, born = np.flatnonzero(first < i), np.flatnonzero(first == i)
             uv_px[i, known], confidence[i, known] = best_match(features, wanted[known], size)
             uv_px[i, born], confidence[i, born] = uv_first[born], 1.0
-            wanted[born] = sample(features, torch.from_numpy(uv_first[born]), size)
-        visible = confidence > LEAST_SIMILARITY
-        point_world = lift_pixels(clip, uv_px)
-        return Tracks(
-            names=query_names(queries),
-            labels=tuple(q.label for q in queries),
-            uv_px=uv_px,
-            point_world=hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first),
-            confidence=confidence,
-            visible=visible,
-            state=np.where(visible, State.TRACKING.value, State.LOST.value),
-            stamp_s=clip.stamp_s,
-            frame_flags=depth_flags(clip, queries, point_world),
-        )
+            wanted[born] = sample(features, torch.from_numpy(uv_first[born]).to(features.device), size)
+        return tracks_of(clip, queries, uv_px, confidence > LEAST_SIMILARITY, confidence)
+
+
+def xfeat_features(network: XFeat, rgb: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "D h w"]:
+    """Descriptors of XFeat."""
+    grey = rgb.mean(axis=-1, dtype=np.float32).astype(np.uint8)
+    return network.features(torch.from_numpy(grey))[0]
+
+
+def token_features(encoder: Encoder, rgb: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "D h w"]:
+    """Tokens of a vision transformer, bilinear between patches, of length 1: four cells along each side of a patch.
+
+    The picture is resized to :data:`LONGEST_PX` and whole patches.
+    """
+    patch, zoom = encoder.config.patch_size, LONGEST_PX / max(rgb.shape)
+    size = [max(1, round(zoom * side / patch)) * patch for side in rgb.shape[:2]]
+    picture = torch.from_numpy(np.ascontiguousarray(rgb)).to(encoder.mean.device).permute(2, 0, 1)[None] / 255
+    picture = F.interpolate(picture, size, mode="bilinear", align_corners=False, antialias=True)
+    tokens = encoder.depths(picture, (TOKEN_BLOCK,))
+    return F.normalize(F.interpolate(tokens, scale_factor=_FINER, mode="bilinear", align_corners=False)[0], dim=0)
 
 
 def best_match(
@@ -78,7 +111,7 @@ def best_match(
 ) -> tuple[Float32[np.ndarray, "M 2"], Float32[np.ndarray, " M"]]:
     """Pixel of the most similar cell, refined by a parabola along each axis, and its similarity from 0 to 1."""
     height, width = features.shape[1:]
-    flat = (wanted @ features.flatten(1)).numpy()
+    flat = (wanted @ features.flatten(1)).cpu().numpy()
     each, (rows, columns) = np.arange(len(flat)), np.divmod(flat.argmax(axis=1), width)
     # Mirrored, so that nothing is refined across a border.
     padded, best = np.pad(flat.reshape(-1, height, width), ((0, 0), (1, 1), (1, 1)), mode="reflect"), flat.max(axis=1)

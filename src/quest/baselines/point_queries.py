@@ -1,4 +1,4 @@
-"""What every baseline does at its door: accept point queries, and lift pixels by the clip's depth."""
+"""What baselines share: accepting point queries, lifting pixels by the clip's depth, answering."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32, Int
 
 from quest.errors import ConfigError, InputError
 from quest.geometry import invert, lift, project, transform
-from quest.types import Clip, Query
+from quest.types import Clip, Query, State, Tracks
 
 OCCLUDED_BY_M = 0.05
 """Depth that is nearer than a point by more than this is something in front of it."""
@@ -129,3 +129,36 @@ def hold_last(point: Float[np.ndarray, "T K C"], *, first: Int[np.ndarray, " K"]
     last = np.maximum.accumulate(np.where(known, frames, -1), axis=0)
     held = point[np.maximum(last, 0), np.arange(k)]
     return np.where((last >= 0)[..., None], held, np.nan).astype(point.dtype)
+
+
+def tracks_of(
+    clip: Clip,
+    queries: Sequence[Query],
+    uv_px: Float32[np.ndarray, "T K 2"],
+    visible: Bool[np.ndarray, "T K"],
+    confidence: Float32[np.ndarray, "T K"],
+) -> Tracks:
+    """Answers of pixels: lifted where they are visible, held in the world elsewhere.
+
+    What is not visible is held because its pixel shows something else. Missing depth is told in ``frame_flags``.
+
+    Args:
+        clip: frames.
+        queries: point queries of it.
+        uv_px: pixel per frame and query; NaN in front of the query's frame.
+        visible: whether the point is seen there.
+        confidence: from 0 to 1.
+    """
+    point_world = lift_pixels(clip, uv_px)
+    first = np.array([q.frame for q in queries], dtype=np.int64)
+    return Tracks(
+        names=query_names(queries),
+        labels=tuple(q.label for q in queries),
+        uv_px=uv_px,
+        point_world=hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first),
+        confidence=confidence,
+        visible=visible,
+        state=np.where(visible, State.TRACKING.value, State.LOST.value),
+        stamp_s=clip.stamp_s,
+        frame_flags=depth_flags(clip, queries, point_world),
+    )

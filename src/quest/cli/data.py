@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -40,11 +41,16 @@ class DataExport:
     format: Literal["tapvid3d", "lerobot", "mcap"] = "tapvid3d"
     """Format of the files."""
 
+    depth: bool = False
+    """Of tapvid3d: write depth too, with which quest bench tapvid also judges points in space."""
+
     def run(self) -> int:
         """Write, and print the files."""
         from quest.cli.takes import open_takes, say_corrupt, say_omitted
-        from quest.errors import TakeError
+        from quest.errors import ConfigError, TakeError
 
+        if self.depth and self.format != "tapvid3d":
+            raise ConfigError(f"data export: --depth is for tapvid3d; {self.format} has depth anyway")
         store, names = open_takes(self.takes)
         chosen = store.names() if names is None else names
         if not chosen:
@@ -53,7 +59,7 @@ class DataExport:
         if self.format == "lerobot":
             self._write_dataset(store, chosen)
             return 1 if corrupt else 0
-        write = _write_tapvid3d if self.format == "tapvid3d" else _write_mcap
+        write = partial(_write_tapvid3d, depth=self.depth) if self.format == "tapvid3d" else _write_mcap
         for name in chosen:
             try:
                 take = store.read(name)
@@ -81,10 +87,10 @@ class DataExport:
         print(f"{self.out}: {counted(episodes, 'episode')}")
 
 
-def _write_tapvid3d(take: Take, folder: Path) -> list[Path]:
+def _write_tapvid3d(take: Take, folder: Path, *, depth: bool) -> list[Path]:
     from quest.data.export_tapvid3d import export_tapvid3d
 
-    return export_tapvid3d(take, folder)
+    return export_tapvid3d(take, folder, depth=depth)
 
 
 def _write_mcap(take: Take, folder: Path) -> list[Path]:

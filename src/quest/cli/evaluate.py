@@ -35,7 +35,7 @@ _TRACKERS_HELP = "What to compare. By default all that take part in --real, or q
     f"{name}: {entry.about}" for name, entry in TRACKERS.items()
 )
 _OF_TAKES = ("protocol", "split", "level", "objects", "same_objects", "shard")
-_OF_REAL = ("quest", *(name for name, entry in TRACKERS.items() if not entry.of_weights))
+_OF_REAL = ("quest", *(name for name, entry in TRACKERS.items() if entry.plain))
 
 
 @dataclass(frozen=True)
@@ -60,6 +60,8 @@ class Eval:
     """What to compare."""
     weights: str = "quest-s16"
     """Name or file of the weights of the trackers that need some."""
+    rivals: Path | None = None
+    """Folder of code and weights of the rivals named -official; docs/metrics.md says what lies there."""
     split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation", "test", "unlisted")
     """Parts of the object split; training objects are reported only if train is named here."""
     level: tuple[int, ...] = ()
@@ -87,7 +89,7 @@ class Eval:
             ConfigError: nothing to evaluate, or settings out of range.
             InputError: a set of recordings is missing or damaged.
             TakeError: the store is missing or a take is corrupt.
-            WeightsError: the weights cannot be loaded.
+            WeightsError: weights, ours or a rival's, cannot be loaded.
         """
         from quest.errors import ConfigError
 
@@ -129,7 +131,14 @@ class Eval:
             for real in sets:
                 start_s, data_hash, kept = time.monotonic(), real.data_hash(), None
                 if self.out is not None:
-                    answers = [code_hash(), package_versions(), self.weights, self._weights_hash(trackers), data_hash]
+                    answers = [
+                        code_hash(),
+                        package_versions(),
+                        self.weights,
+                        weights_hash(trackers, self.weights),
+                        rival_hashes(trackers),
+                        data_hash,
+                    ]
                     made_by = hashlib.sha256(repr([*answers, self.seed]).encode()).hexdigest()
                     kept = KeptAnswers(self.out / f"{real.name}.parts", made_by=made_by)
                 rows, single = evaluate_set(
@@ -137,11 +146,10 @@ class Eval:
                 )
                 found[real.name] = rows
                 if self.out is not None and kept is not None:
-                    write_set(
-                        self.out / f"{real.name}.json", real, rows, single, self._run(trackers, data_hash, start_s)
-                    )
+                    run = self._run(trackers, data_hash, start_s)
+                    write_set(self.out / f"{real.name}.json", real.name, rows, single, run)
                     kept.remove()
-        output = _stdout(FULL_WIDTH)
+        output = table_console(FULL_WIDTH)
         output.print(real_table(found, width=output.width))
         if self.out is not None:
             console.print(f"wrote {', '.join(str(self.out / f'{name}.json') for name in found)}", highlight=False)
@@ -177,7 +185,7 @@ class Eval:
             return 0
         data_hash = combined_hash((name, store.data_hash(name)) for name in chosen)
         results = self._results(found, broken, self._run(trackers, data_hash, start_s))
-        output = _stdout(FULL_WIDTH)
+        output = table_console(FULL_WIDTH)
         output.print(results_table(results, width=output.width))
         if self.out is not None:
             write_results(results, self.out, records=found.records)
@@ -196,18 +204,14 @@ class Eval:
         if self.out is None:
             return None
         answers = [code_hash(), package_versions(), self.protocol, [t.name for t in trackers], self.seed]
-        digest = hashlib.sha256(repr([*answers, self.weights, self._weights_hash(trackers)]).encode())
+        answers.append(rival_hashes(trackers))
+        digest = hashlib.sha256(repr([*answers, self.weights, weights_hash(trackers, self.weights)]).encode())
         return FinishedTakes(self.out.with_suffix(".parts"), made_by=digest.hexdigest())
-
-    def _weights_hash(self, trackers: Sequence[ClipTracker]) -> str | None:
-        from quest.data.provenance import file_hash
-
-        return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(self.weights)
 
     def _load_trackers(self, names: Sequence[str]) -> list[ClipTracker]:
         from quest.baselines import line_up
 
-        return list(line_up(names, weights=self.weights))
+        return list(line_up(names, weights=self.weights, rivals=self.rivals))
 
     def _evaluate(
         self,
@@ -241,17 +245,7 @@ class Eval:
             )
 
     def _run(self, trackers: Sequence[ClipTracker], data_hash: str, start_s: float) -> Run:
-        from quest.evaluation.results import Run
-
-        of_weights = any(TRACKERS[tracker.name].of_weights for tracker in trackers)
-        return Run.ended(
-            start_s,
-            data_hash=data_hash,
-            weights=self.weights if of_weights else None,
-            weights_hash=self._weights_hash(trackers) if of_weights else None,
-            resamples=self.resamples,
-            seed=self.seed,
-        )
+        return ended_run(trackers, self.weights, start_s, data_hash=data_hash, resamples=self.resamples, seed=self.seed)
 
     def _results(self, found: Evaluated, broken: list[str], run: Run) -> Results:
         from quest.evaluation.results import Results
@@ -270,13 +264,42 @@ class Eval:
         return Results(run, rows, found.discoveries, found.unscored, tuple(notes))
 
 
+def weights_hash(trackers: Sequence[ClipTracker], weights: str) -> str | None:
+    """Hash of the weights that trackers were made of, where it is known."""
+    from quest.data.provenance import file_hash
+
+    return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(weights)
+
+
+def rival_hashes(trackers: Sequence[ClipTracker]) -> list[str]:
+    """Hashes of the official weights of rivals."""
+    return [h for t in trackers if (h := getattr(t, "rival_hash", None))]
+
+
+def ended_run(
+    trackers: Sequence[ClipTracker], weights: str, start_s: float, *, data_hash: str, resamples: int, seed: int
+) -> Run:
+    """The run of this process, which began at a reading of the monotonic clock and ends now."""
+    from quest.evaluation.results import Run
+
+    of_weights = any(TRACKERS[tracker.name].of_weights for tracker in trackers)
+    return Run.ended(
+        start_s,
+        data_hash=data_hash,
+        weights=weights if of_weights else None,
+        weights_hash=weights_hash(trackers, weights) if of_weights else None,
+        resamples=resamples,
+        seed=seed,
+    )
+
+
 def _stderr() -> Console:
     from rich.console import Console
 
     return Console(stderr=True)
 
 
-def _stdout(full_width: int) -> Console:
+def table_console(full_width: int) -> Console:
     """The terminal; a file or pipe has no width of its own and gets every column."""
     from rich.console import Console
 

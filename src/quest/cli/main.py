@@ -104,6 +104,10 @@ COMMANDS: dict[str, Entry | Group] = {
     "generate": Entry("generate", "Generate", "Render simulated takes with ground truth into a take store."),
     "train": Entry("train", "Train", "Train a network on takes."),
     "eval": Entry("evaluate", "Eval", "Score trackers."),
+    "bench": Group(
+        "Score trackers on the benchmarks of others.",
+        {"tapvid": Entry("bench", "BenchTapvid", "TAP-Vid and TAPVid-3D, in two or three dimensions.")},
+    ),
     "calibrate": Entry("calibrate", "Calibrate", "Fit the monitor to takes."),
     "eval-monitor": Entry("evaluate_monitor", "EvalMonitor", "Score the monitor beside plainer rules."),
 }

@@ -10,6 +10,7 @@ The keys and conventions are those of the benchmark's own generators and loaders
 ``fx_fy_cx_cy``        ``[4]``: pixels; their generators have centres at half-integers, as here
 ``extrinsics_w2c``     ``[T, 4, 4]``: ``cam_from_world``; there for moving cameras, written for all
 ``track_names``        ``[N]``: names of the entities; not a key of theirs
+``depth_m``            ``[T, H, W]``: metres, 0 where missing; only if asked for, and not a key of theirs
 =====================  ======================================================================================
 
 A query is the first frame that shows the entity; entities that the view never shows, and hinges, are left out.
@@ -32,13 +33,14 @@ from quest.types import Take, View
 from quest.whole_file import whole_file
 
 
-def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95) -> list[Path]:
+def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95, depth: bool = False) -> list[Path]:
     """Write one ``<take>-v<view>.npz`` per view that shows an entity.
 
     Args:
         take: with its views.
         folder: where to; made if it is not there, and files of the same names are replaced.
         jpeg_quality: of the images, 1 to 100.
+        depth: write depth too, where the view has it.
 
     Returns:
         The files that were written.
@@ -57,7 +59,10 @@ def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95) -
             continue
         path = folder / f"{take.info.name}-v{v}.npz"
         with whole_file(path) as partial, partial.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+            if depth and view.clip.depth_m is not None:
+                np.savez_compressed(file, allow_pickle=False, **arrays, depth_m=view.clip.depth_m)
+            else:
+                np.savez(file, allow_pickle=False, **arrays)
         written.append(path)
     return written
 

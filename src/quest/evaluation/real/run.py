@@ -170,9 +170,9 @@ def _ask_clip(
     recording = clip.read()
     labels, ways = clip.labels, shown(recording)
     diagonal_px = float(np.hypot(recording.camera.width, recording.camera.height))
-    for tracker, inputs in _asked(trackers, ways):
+    for tracker, inputs in asked(trackers, ways):
         progress(f"{clip.name}: {tracker.name}, {inputs}", 0)
-        answers = _kept(kept, clip.name, tracker.name, inputs, partial(_follow, tracker, ways[inputs], labels))
+        answers = kept_or_asked(kept, clip.name, tracker.name, inputs, partial(_follow, tracker, ways[inputs], labels))
         yield tracker.name, inputs, score_clip(labels, Answers(**answers), diagonal_px=diagonal_px)
     progress(clip.name, 1)
 
@@ -181,23 +181,25 @@ def _ask_picture(
     picture: Picture, trackers: Sequence[ClipTracker], kept: KeptAnswers | None, progress: Progress
 ) -> Iterator[tuple[str, Inputs, ScoredPicture]]:
     ways = shown(picture.read())
-    for tracker, inputs in _asked([t for t in trackers if isinstance(t, Tracker)], ways):
+    for tracker, inputs in asked([t for t in trackers if isinstance(t, Tracker)], ways):
         progress(f"{picture.name}: {tracker.name}, {inputs}", 0)
-        answers = _kept(kept, picture.name, tracker.name, inputs, partial(discover, tracker, ways[inputs]))
+        answers = kept_or_asked(kept, picture.name, tracker.name, inputs, partial(discover, tracker, ways[inputs]))
         yield tracker.name, inputs, score_picture(picture, answers)
     progress(picture.name, 1)
 
 
-def _asked(trackers: Sequence[T], ways: Mapping[Inputs, Clip]) -> Iterator[tuple[T, Inputs]]:
+def asked(trackers: Sequence[T], ways: Mapping[Inputs, Clip]) -> Iterator[tuple[T, Inputs]]:
+    """Every tracker with every way of showing it a clip that it has a row for."""
     for tracker in trackers:
         for inputs in TRACKERS[tracker.name].inputs:
             if inputs in ways:
                 yield tracker, inputs
 
 
-def _kept(
+def kept_or_asked(
     kept: KeptAnswers | None, of: str, tracker: str, inputs: Inputs, ask: Callable[[], dict[str, np.ndarray]]
 ) -> dict[str, Any]:
+    """What a tracker says of a clip or picture: what was kept, or what ``ask`` returns."""
     return dict(ask() if kept is None else kept.get(f"{of}.{tracker}.{inputs.replace(' ', '-')}", ask))
 
 
@@ -229,19 +231,19 @@ def discover(tracker: Tracker, clip: Clip) -> dict[str, np.ndarray]:
     }  # fmt: skip
 
 
-def write_set(path: Path, real: RealSet, rows: Sequence[RealRow], single: Sequence[RealRow], run: Run) -> None:
+def write_set(path: Path, name: str, rows: Sequence[RealRow], single: Sequence[RealRow], run: Run) -> None:
     """Write the result file of a set, whole or not at all.
 
     Args:
         path: the file.
-        real: the set.
+        name: of the set.
         rows: of the table, with intervals.
         single: of each clip and picture, of which only the numbers are kept.
         run: what made them.
     """
     raw = {
         "format": FORMAT,
-        "set": real.name,
+        "set": name,
         "run": asdict(run),
         "rows": [{**asdict(row), "measures": {k: _value(v) for k, v in row.measures.items()}} for row in rows],
         "single": [

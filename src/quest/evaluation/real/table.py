@@ -50,23 +50,31 @@ LEGEND = (
 )
 
 
-def real_table(sets: Mapping[str, Sequence[RealRow]], *, width: int = FULL_WIDTH) -> RenderableType:
+def real_table(
+    sets: Mapping[str, Sequence[RealRow]],
+    *,
+    width: int = FULL_WIDTH,
+    shown: Sequence[Column] = COLUMNS,
+    legend: str = LEGEND,
+) -> RenderableType:
     """One table per set and kind of row.
 
     Args:
         sets: rows by the name of the set.
         width: of the terminal in characters; columns that do not fit are left out whole.
+        shown: columns, of which those that have numbers are shown.
+        legend: below the tables.
     """
     parts: list[RenderableType] = []
     for name, rows in sets.items():
         for of, group in groupby(rows, key=lambda row: row.of):
-            parts.append(_table(f"{name} · {of}", list(group), width))
-    return Group(*parts, Text(LEGEND, style="dim"))
+            parts.append(_table(f"{name} · {of}", list(group), shown, width))
+    return Group(*parts, Text(legend, style="dim"))
 
 
-def _table(title: str, rows: Sequence[RealRow], width: int) -> Table:
+def _table(title: str, rows: Sequence[RealRow], shown: Sequence[Column], width: int) -> Table:
     heads = [("tracker", "shown", "n"), *(_head(row) for row in rows)]
-    columns = [c for c in COLUMNS if any(row.measures.get(c.field) is not None for row in rows)]
+    columns = [c for c in shown if any(row.measures.get(c.field) is not None for row in rows)]
     kept = fitting(columns, heads, lambda column: [row.measures.get(column.field) for row in rows], width)
     table = Table(
         title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1)
