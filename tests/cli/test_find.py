@@ -79,7 +79,8 @@ def test_a_picture_is_enough(picture: Path, tmp_path: Path, capsys: pytest.Captu
 
 def test_a_text_chooses(picture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     def find(*arguments: str) -> tuple[int, str, str]:
-        return main(["find", str(picture), *arguments]), *capsys.readouterr()
+        code, (out, err) = main(["find", str(picture), *arguments]), capsys.readouterr()
+        return code, out, err
 
     code, printed, _ = find("--text", "lever of the left cupboard door", "--out", str(tmp_path / "out"))
     assert code == 0
