@@ -100,6 +100,8 @@ class Track(Source):
 def _summary(clip: Clip, tracks: Tracks) -> Table:
     import numpy as np
 
+    from quest.types import State
+
     table = Table(
         title=escape(
             f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
@@ -119,7 +121,7 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
             table.add_row(escape(name), label or "", "", "", "", "", "not found")
             continue
         points = tracks.point_world[:, k]
-        points = points[np.isfinite(points).all(axis=-1)]
+        points = points[np.isfinite(points).all(axis=-1) & (tracks.state[:, k] != State.LOST)]
         moved = f"{np.linalg.norm(points - points[0], axis=-1).max():.3f} m" if len(points) else "unknown"
         joint = "unknown" if tracks.joints is None else tracks.joints.describe(k)
         seen, sure = tracks.visible[bound, k].mean(), tracks.confidence[bound, k].mean()
