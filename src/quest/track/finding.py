@@ -26,15 +26,14 @@ from quest.model.found import Found
 
 EVERY_S = 0.5
 """Time between looks, seconds of the stream's clock."""
-PRIOR = float(logit(0.08))
-"""That what the finder names at all is there: 8 % of its answers of any score in real pictures."""
-OVERLOOKED = float(np.log(0.09))
-"""Log-likelihood ratio of naming nothing: of what is there in real pictures 9 % is not named with any score."""
+PRIOR = float(logit(0.069))
+"""That what the finder names at all is there. This and what follows is fitted by ``benchmarks/fit_looks.py``."""
+OVERLOOKED = float(np.log(0.087))
+"""Log-likelihood ratio of naming nothing: the share of what is there that is not named with any score."""
 FORGOTTEN = PRIOR + OVERLOOKED
 """Log odds below which a candidate is forgotten: those of a place of which the finder said nothing once."""
-CHANGE = 0.08
-"""Fall of the cosine of a place's descriptors with which the correlation of looks falls to 1 / e. In real videos the
-finder's log odds at one place differ the more the cosine has fallen, and not the more time has passed."""
+CHANGE = 0.066
+"""Fall of the cosine of a place's descriptors with which the correlation of looks falls to 1 / e."""
 
 
 @dataclass(frozen=True)
