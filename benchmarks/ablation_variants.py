@@ -8,11 +8,11 @@ from typing import Literal
 
 from quest.errors import ConfigError
 from quest.paper.network import PaperConfig
-from quest.paper.objective import LOSSES
+from quest.paper.objective import LOSSES, Order
 from quest.train.settings import WindowConfig
 
-TableName = Literal["parts", "window", "slots", "losses"]
-TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses")
+TableName = Literal["parts", "window", "slots", "losses", "remedies"]
+TABLES: tuple[TableName, ...] = ("parts", "window", "slots", "losses", "remedies")
 
 LOSSES_3D = ("vel", "acc", "geo")
 """Losses that know of 3D; the others are of pixels, features, labels and confidences."""
@@ -27,12 +27,14 @@ class Variant:
         network: what it is.
         losses: weights of losses that differ from the published ones.
         windows: how windows are drawn.
+        order: how entities get their slots.
     """
 
     name: str
     network: PaperConfig = field(default_factory=PaperConfig)
     losses: dict[str, float] = field(default_factory=dict)
     windows: WindowConfig = field(default_factory=WindowConfig)
+    order: Order = "match"
 
 
 @dataclass(frozen=True)
@@ -73,6 +75,7 @@ def lines_of(table: TableName) -> tuple[Line, ...]:
         "window": _sizes("window", "T", (2, 4, 8)),
         "slots": _sizes("slots", "K", (4, 8, 16)),
         "losses": _losses(),
+        "remedies": _remedies(),
     }
     return tuple(rows[table])
 
@@ -121,4 +124,19 @@ def _sizes(field_name: str, symbol: str, sizes: Sequence[int]) -> list[Line]:
 
 def _losses() -> list[Line]:
     own = "all losses"
-    return [Line(own, FULL), *(Line(f"no {loss}", without(loss, loss), reference=own) for loss in LOSSES)]
+    published = [name for name, loss in LOSSES.items() if loss.weight > 0]
+    return [Line(own, FULL), *(Line(f"no {loss}", without(loss, loss), reference=own) for loss in published)]
+
+
+def _remedies() -> list[Line]:
+    """What is said to help the prediction of sets, one by one and together."""
+    own, from_map = "as published", PaperConfig(place_from="map")
+    variants = {
+        "loss at every layer": Variant("early", losses={"early": 1.0}),
+        "confidence: it exists": Variant("exists", losses={"conf": 0.0, "exists": 0.3}),
+        "entity i has slot i": Variant("order", order="entity"),
+        "place off the map": Variant("map", from_map, losses={"where": 0.3}),
+        "all four": Variant("remedies", from_map, {"early": 1.0, "conf": 0.0, "exists": 0.3, "where": 0.3},
+                            order="entity"),
+    }  # fmt: skip
+    return [Line(own, FULL), *(Line(label, variant, reference=own) for label, variant in variants.items())]

@@ -144,7 +144,7 @@ class Ablations:
             if done.step % 100 == 0 or done.scores is not None:
                 console.print(f"  step {done.step}: loss {done.loss:.3f} {done.scores or ''}")
 
-        objective, out = PaperStageOne(network, item.losses), folder / "stage-1"
+        objective, out = PaperStageOne(network, item.losses, order=item.order), folder / "stage-1"
         out.mkdir(parents=True, exist_ok=True)
         best = fit(objective, dataset.training, dataset.validation, config, out=out, report=report)
         load_checkpoint(best, network.cpu(), None)
@@ -161,6 +161,7 @@ class Ablations:
             "learning_rate": self.learning_rate,
             "network": json.loads(item.network.to_json()),
             "losses": item.losses,
+            "order": item.order,
             "windows": asdict(item.windows),
             "encoder": file_hash(self.encoder),
             "training_hash": self.training_hash,

@@ -90,18 +90,36 @@ def test_earlier_frames_do_change_later_answers():
 def test_slots_do_not_begin_alike():
     """Before any training: what they read from the tokens is the same, so it must not drown what they are."""
     torch.manual_seed(0)
-    x = PaperNetwork(PAPER).eval().embed(make_frames(batch=1).features)[0, -1]
+    x = PaperNetwork(PAPER).eval().embed(make_frames(batch=1).features)[-1].embedding[0, -1]
     cosine = torch.nn.functional.cosine_similarity(x[:, None], x[None], dim=-1)
     assert (cosine - torch.eye(PAPER.slots)).max() < 0.7
 
 
 def test_time_reaches_the_tokens_that_queries_look_at():
     network, features = make_paper(), make_frames().features[:, [2, 2, 2, 2]]
-    same = network.embed(features)
+    same = network.embed(features)[-1].embedding
     assert not torch.allclose(same[:, 1:], same[:, :-1], atol=1e-4)
     torch.nn.init.zeros_(network.time)
-    still = network.embed(features)
+    still = network.embed(features)[-1].embedding
     torch.testing.assert_close(still[:, 1:], still[:, :-1])
+
+
+def test_places_off_the_map_are_where_a_query_looked():
+    network, frames = make_paper(place_from="map"), make_frames()
+    for layer in (network.head[1], network.head[3]):
+        assert isinstance(layer, torch.nn.Linear)
+        torch.nn.init.zeros_(layer.weight)
+        torch.nn.init.zeros_(layer.bias)
+    got, grid = network(frames), PAPER.encoder.grid
+    torch.testing.assert_close(got.where.sum(-1), torch.ones(got.where.shape[:3]))
+    for k in range(PAPER.slots):
+        expected = sum(
+            (float(p) * torch.tensor([(n % grid + 0.5) / grid, (n // grid + 0.5) / grid])
+             for n, p in enumerate(got.where[0, 1, k])), torch.zeros(2),
+        )  # fmt: skip
+        torch.testing.assert_close(got.uv[0, 1, k], expected, atol=1e-4, rtol=0)
+    with pytest.raises(ConfigError, match="place_from"):
+        make_paper(place_from="moon")
 
 
 def test_without_any_depth_pixels_stay_finite():

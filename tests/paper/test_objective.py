@@ -17,9 +17,13 @@ from quest.paper.objective import (
     LOSSES,
     PaperStageOne,
     SlotRollout,
+    coordinate_loss,
+    early_loss,
+    exists_loss,
     roll_out,
     slot_confidence_loss,
     slot_label_loss,
+    where_loss,
 )
 from quest.train.answers import RIGHT_PX
 from quest.train.loop import StepReport, fit
@@ -132,6 +136,44 @@ def test_labels_of_matched_slots_against_a_plain_loop(batch: Batch):
         for b, t, k in (roll.truth.visible & roll.asked[:, None]).nonzero().tolist()
     ]
     assert float(slot_label_loss(roll)) == pytest.approx(float(np.mean(expected)), rel=1e-4)
+
+
+def test_entity_i_has_slot_i(batch: Batch):
+    network, frames, truth = batch
+    with torch.no_grad():
+        roll = roll_out(network, frames, truth, whole=True, order="entity")
+    assert roll.asked.any()
+    for b, k in roll.asked.nonzero().tolist():
+        assert (roll.uv[b, :, k] == roll.slots.uv[b, 1:, k]).all()
+
+
+def test_existence_is_told_however_far_the_answer_is(batch: Batch):
+    roll = answer(batch, whole=True)
+    target = torch.zeros_like(roll.slots.logit)
+    for i, t, k in (roll.truth.visible & roll.asked[:, None]).nonzero().tolist():
+        target[i, t, roll.slot[i, k]] = 1
+    expected = F.binary_cross_entropy_with_logits(roll.slots.logit, target)
+    assert float(exists_loss(roll)) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_where_slots_look_is_drawn_to_the_token_of_their_entity(batch: Batch):
+    roll = answer(batch, whole=True)
+    side = PAPER.encoder.grid
+    token = (roll.truth.uv.nan_to_num() * side).long().clamp(0, side - 1) @ torch.tensor([1, side])
+    perfect = F.one_hot(token, side**2).float()
+    where = torch.full_like(roll.slots.where, 1 / side**2)
+    for b, k in roll.asked.nonzero().tolist():
+        where[b, :, roll.slot[b, k]] = perfect[b, :, k]
+    assert float(where_loss(replace(roll, slots=replace(roll.slots, where=where)))) == pytest.approx(0, abs=1e-4)
+    blind = replace(roll.slots, where=torch.full_like(where, 1 / side**2))
+    assert float(where_loss(replace(roll, slots=blind))) == pytest.approx(np.log(side**2), rel=1e-3)
+
+
+def test_earlier_layers_are_drawn_to_the_same_places(batch: Batch):
+    roll = answer((make_paper(decoder_layers=3), *batch[1:]), whole=True)
+    assert roll.slots.earlier_uv.shape[-1] == 2 * 2
+    same = replace(roll, slots=replace(roll.slots, earlier_uv=roll.slots.uv.repeat(1, 1, 1, 2)))
+    assert float(early_loss(same)) == pytest.approx(float(coordinate_loss(roll)), rel=1e-4)
 
 
 def test_every_loss_is_finite_and_the_gradient_reaches_every_part(batch: Batch):

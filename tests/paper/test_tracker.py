@@ -14,7 +14,7 @@ import quest
 from quest.data.cut import cut_clip
 from quest.errors import InputError, WeightsError
 from quest.model.frames import FrameBatch
-from quest.paper.network import SlotAnswers
+from quest.paper.network import Decoded, SlotAnswers
 from quest.paper.tracker import PaperTracker
 from quest.track import load as load_ours
 from quest.types import LABELS, Clip, Query, State
@@ -40,8 +40,8 @@ def make(*, confidence: list[float] | None = None, found_above: float = 0.0, pro
     if confidence is not None:
         answer, logit = network.answer, torch.tensor(confidence)
 
-        def confident(x: Tensor, frames: FrameBatch) -> SlotAnswers:
-            answers = answer(x, frames)
+        def confident(decoded: list[Decoded], frames: FrameBatch) -> SlotAnswers:
+            answers = answer(decoded, frames)
             return replace(answers, logit=logit.expand_as(answers.logit))
 
         network.answer = confident  # type: ignore[method-assign]
@@ -80,7 +80,7 @@ def test_a_window_is_decoded_as_it_was_trained(clip: Clip):
     tracker, seen = make(), []
     embed = tracker.network.embed
 
-    def watched(features: Tensor) -> Tensor:
+    def watched(features: Tensor) -> list[Decoded]:
         seen.append(features.shape[1])
         return embed(features)
 

@@ -24,6 +24,7 @@ from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Renderer
 from quest.sim.settings import TakeSettings
 from quest.sim.staging import choose_joints
+from quest.sim.suites import find_suites
 from quest.types import Take, View
 from tests.sim.small_objects import CARCASS, DOOR, DRAWER, TRAY, write_cabinet, write_object
 
@@ -168,6 +169,22 @@ def test_same_seed_same_arrays_other_seed_other_arrays(cabinet: SimObject, rende
         np.testing.assert_array_equal(array, again[name], err_msg=name)
     for name in ("view0/clip/rgb", "view1/clip/depth_m", "view0/uv_px", "joint_position"):
         assert not np.array_equal(first[name], other[name]), name
+
+
+@pytest.mark.render
+def test_in_a_fixed_scene_only_the_motion_is_of_the_take(cabinet: SimObject, renderer: Renderer) -> None:
+    (suite,) = find_suites("published")
+    settings = dataclasses.replace(suite.settings, size=48, every=8, frames_per_joint=24)
+    one, other = (
+        generate_take(cabinet, level, seed, renderer=renderer, settings=settings, suite=suite)
+        for level, seed in ((1, 5), (2, 6))
+    )
+    assert len(one.views) == 3
+    for a, b in zip(one.views, other.views, strict=True):
+        assert a.clip.camera == b.clip.camera
+        np.testing.assert_array_equal(a.clip.cam_from_world[0], b.clip.cam_from_world[0])
+        np.testing.assert_array_equal(a.clip.rgb[0], b.clip.rgb[0])
+    assert not np.array_equal(one.joint_position, other.joint_position[: len(one)])
 
 
 @pytest.mark.render

@@ -58,16 +58,16 @@ def test_the_licence_says_what_taught():
 
 def test_own_objects_need_a_store_to_choose_by(tmp_path: Path):
     dataset, _ = opened(tmp_path, (UNLISTED, VALIDATION, TEST), (UNLISTED + 1, TRAIN, TEST))
-    assert objects(dataset) == (["panels-999999"], ["panels-1000000"])
+    assert objects(dataset) == (["panels-999999"], ["panels-1000000", "panels-3"])
     with pytest.raises(ConfigError, match="--validation"):
         opened(tmp_path / "alone", (UNLISTED,))
 
 
-def test_objects_never_change_sides(tmp_path: Path):
+def test_what_tests_never_teaches_or_chooses(tmp_path: Path):
     with pytest.raises(ConfigError, match="no train takes"):
-        opened(tmp_path / "test", (TEST,), (VALIDATION,))
+        opened(tmp_path / "test", (TEST, VALIDATION), (VALIDATION,))
     with pytest.raises(ConfigError, match="no validation takes"):
-        opened(tmp_path / "train", (TRAIN,), (TRAIN,))
+        opened(tmp_path / "train", (TRAIN,), (TEST,))
 
 
 def test_no_take_teaches_and_chooses(tmp_path: Path):

@@ -53,7 +53,7 @@ class Generate:
     """Folder of PartNet-Mobility folders; default: the environment variable QUEST_OBJECTS."""
     mix: Literal["usual", "broad"] = "usual"
     """Kinds of procedural objects, and materials of all: the usual furniture and appliances, or everything there is."""
-    suite: Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "long"] | None = None
+    suite: Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "long", "published"] | None = None
     """Takes that are hard in one way: a named preset of the options below. docs/simulator.md describes each."""
     variant: tuple[str, ...] = ()
     """Kinds of a suite, such as blur and bump of shift; default: all of them."""
@@ -203,7 +203,7 @@ class Generate:
             preset,
             physics=preset.physics or self.physics,
             gripper=preset.gripper or self.gripper,
-            randomize_materials=self.randomize_materials,
+            randomize_materials=preset.randomize_materials and self.randomize_materials,
             stretch=self.stretch,
             broad_materials=self.mix == "broad",
             **given,

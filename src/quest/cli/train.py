@@ -41,6 +41,8 @@ class NetworkChanges:
     """K, number of learned queries."""
     decoder_layers: int | None = None
     """Layers of the decoder."""
+    place_from: Literal["mlp", "map"] | None = None
+    """Whether coordinates come out of the MLP, as published, or off the last attention map."""
 
     def apply(self, preset: PaperConfig) -> PaperConfig:
         """The preset with the changes."""
@@ -79,6 +81,8 @@ class Train:
     """Stores to choose by, for objects that are in no split."""
     network: NetworkChanges = field(default_factory=NetworkChanges)
     """What of the published network is different."""
+    order: Literal["match", "entity"] = "match"
+    """Stage 1: whether slots are matched to entities at the least cost, as published, or entity i always has slot i."""
     cache: Path | None = None
     """Folder of the feature cache; default: OUT/cache."""
     training: TrainingConfig = field(default_factory=TrainingConfig)
@@ -226,7 +230,7 @@ class Train:
             device=device,
             report=prepared,
         )
-        first = PaperStageOne(start.network, self.losses)
+        first = PaperStageOne(start.network, self.losses, order=self.order)
         objective = first if self.stage == 1 else StageTwo(start.network, first.answered)
         about = f"{dataset.training_takes} training takes"
         return _Taught(objective, dataset.training, dataset.validation, about, dataset.training_sources)

@@ -41,8 +41,10 @@ class Look(nn.Module):
         self.v = nn.Linear(width, width)
         self.out = nn.Linear(width, width)
 
-    def forward(self, x: Float[Tensor, "B T K D"], tokens: Tokens) -> Float[Tensor, "B T K D"]:
-        """What the queries read, to be added to ``x``."""
+    def forward(
+        self, x: Float[Tensor, "B T K D"], tokens: Tokens
+    ) -> tuple[Float[Tensor, "B T K D"], Float[Tensor, "B T K N"]]:
+        """What the queries read, to be added to ``x``, and where the first head read it."""
         q, key, value = (w.unflatten(axis, (self.heads, -1)) for w, axis in
                          ((self.q(self.norm(x)), -1), (self.k.weight, 0), (self.v.weight, 0)))  # fmt: skip
         asked = (torch.einsum("btkhc,hcd->btkhd", q, key) / math.sqrt(q.shape[-1])).flatten(2, 3)
@@ -51,7 +53,7 @@ class Look(nn.Module):
         attention = score.softmax(-1)
         read = tokens.project(attention @ tokens.features) + attention @ tokens.place + tokens.time[:, None]
         by_head = torch.einsum("btkhd,hcd->btkhc", read.unflatten(2, (-1, self.heads)), value).flatten(3)
-        return self.out(by_head + self.v.bias)
+        return self.out(by_head + self.v.bias), attention[..., :: self.heads, :]
 
 
 class Attention(nn.Module):
@@ -100,13 +102,16 @@ class DecoderLayer(nn.Module):
         self.compare = Attention(width, heads)
         self.mlp = FeedForward(width)
 
-    def forward(self, x: Float[Tensor, "B T K D"], tokens: Tokens) -> Float[Tensor, "B T K D"]:
-        """One round; a frame sees only itself and earlier frames."""
+    def forward(
+        self, x: Float[Tensor, "B T K D"], tokens: Tokens
+    ) -> tuple[Float[Tensor, "B T K D"], Float[Tensor, "B T K N"]]:
+        """One round, and where queries looked; a frame sees only itself and earlier frames."""
         b, t, k = x.shape[:3]
-        flat = (x + self.look(x, tokens)).flatten(0, 1)
+        read, where = self.look(x, tokens)
+        flat = (x + read).flatten(0, 1)
         x = (flat + self.compare(flat)).unflatten(0, (b, t))
         causal = torch.ones(t, t, dtype=torch.bool, device=x.device).tril()
         per_query = x.transpose(1, 2).flatten(0, 1)
         per_query = per_query + self.remember(per_query, mask=causal)
         x = per_query.unflatten(0, (b, k)).transpose(1, 2)
-        return x + self.mlp(x)
+        return x + self.mlp(x), where

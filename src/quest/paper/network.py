@@ -29,6 +29,9 @@
                          |
                   point  B T K 3, reference frame
 
+Coordinates come out of the MLP alone, as published, or are the mean place of what a query last looked at, which the MLP
+corrects (``place_from``).
+
 The publication does not say how queries know of the rest of the window but for the codes of time; here a query also
 looks at itself in the window's earlier frames, which keeps the answer for t causal. It has no labels either; the
 protocol that gives no point asks for them, so a linear layer tells them.
@@ -38,6 +41,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Literal
 
 import torch
 import torch.nn.functional as F
@@ -72,6 +76,8 @@ class PaperConfig(NetworkConfig):
     """Layers of the decoder."""
     slots: int = 8
     """K, learned queries."""
+    place_from: Literal["mlp", "map"] = "mlp"
+    """Where coordinates come from: the MLP, as published, or the last attention map of the first head."""
     flow: bool = False
     """Whether there is a flow head, which stage 2 trains."""
 
@@ -86,6 +92,22 @@ class PaperConfig(NetworkConfig):
             raise ConfigError("network: cell_px, window, slots and decoder_layers must be at least 1")
         if self.encoder.image_size % self.cell_px:
             raise ConfigError(f"network: expected whole cells of {self.cell_px} px in {self.encoder.image_size} px")
+        if self.place_from not in ("mlp", "map"):
+            raise ConfigError(f"network: expected place_from mlp or map, got {self.place_from!r}")
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Queries after a layer of the decoder."""
+
+    embedding: Float[Tensor, "B T K D"]
+    """What they are."""
+    where: Float[Tensor, "B T K N"]
+    """Attention of the layer's first head on the tokens of each frame."""
+
+    def newest(self) -> Decoded:
+        """Of the newest frame alone."""
+        return Decoded(self.embedding[:, -1:], self.where[:, -1:])
 
 
 @dataclass(frozen=True)
@@ -102,6 +124,10 @@ class SlotAnswers:
     """What each takes its entity for, index into LABELS."""
     point: Float[Tensor, "B T K 3"]
     """Lifted position in the reference frame; NaN where there is no depth."""
+    where: Float[Tensor, "B T K N"]
+    """Where they looked last (see :class:`Decoded`)."""
+    earlier_uv: Float[Tensor, "B T K 2*(L-1)"]
+    """Coordinates after each of the earlier layers, for training."""
 
     def then(self, later: SlotAnswers) -> SlotAnswers:
         """These frames and later ones."""
@@ -145,31 +171,45 @@ class PaperNetwork(nn.Module):
         """Answers for every frame of a window; those for a frame do not depend on later ones."""
         return self.answer(self.embed(frames.features), frames)
 
-    def embed(self, features: Float[Tensor, "B T N E"]) -> Float[Tensor, "B T K D"]:
+    def embed(self, features: Float[Tensor, "B T N E"]) -> list[Decoded]:
         """The queries after they looked at every frame of the window, oldest first.
 
         Where a clip has fewer frames yet, they are taken for the first ones of a window: what a window answers for its
         i-th frame, it has learned to answer from i frames.
+
+        Returns:
+            One for every layer; the last is what answers.
         """
         b, t = features.shape[:2]
         tokens = Tokens(F.layer_norm(features, features.shape[-1:]), self.project, self.place, self.time[:t])
-        x = self.queries.expand(b, t, -1, -1)
+        x, decoded = self.queries.expand(b, t, -1, -1), []
         for layer in self.layers:
-            x = layer(x, tokens)
-        return self.norm(x)
+            x, where = layer(x, tokens)
+            decoded.append(Decoded(self.norm(x), where))
+        return decoded
 
-    def answer(self, x: Float[Tensor, "B T K D"], frames: FrameBatch) -> SlotAnswers:
+    def answer(self, decoded: list[Decoded], frames: FrameBatch) -> SlotAnswers:
         """What queries say that looked at a window, for all its frames or some.
 
         Args:
-            x: from :meth:`embed`.
+            decoded: from :meth:`embed`.
             frames: the frames that are asked for.
         """
-        out = self.head(x).float()
-        uv = out[..., :2] + 0.5
+        last, (*earlier, (uv, logit)) = decoded[-1], [self._read_off(each) for each in decoded]
         uv_px = uv * self.config.encoder.image_size
         point = frames.to_reference(uv_px, frames.depth_at(uv_px))
-        return SlotAnswers(x, uv, out[..., 2], self.label(x).float(), point)
+        earlier_uv = torch.cat([uv[..., :0], *(uv for uv, _ in earlier)], dim=-1)
+        label = self.label(last.embedding).float()
+        return SlotAnswers(last.embedding, uv, logit, label, point, last.where.float(), earlier_uv)
+
+    def _read_off(self, decoded: Decoded) -> tuple[Float[Tensor, "B T K 2"], Float[Tensor, "B T K"]]:
+        """Coordinates and confidence after a layer."""
+        out = self.head(decoded.embedding).float()
+        if self.config.place_from == "mlp":
+            return out[..., :2] + 0.5, out[..., 2]
+        step = (torch.arange(self.config.encoder.grid, device=out.device) + 0.5) / self.config.encoder.grid
+        middle = torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).flatten(0, 1)
+        return out[..., :2] + decoded.where.float() @ middle, out[..., 2]
 
     def displace(self, embedding: Float[Tensor, "B T K D"]) -> Float[Tensor, "B K 3"]:
         """Displacement of every query from the window's newest frame to the next, in units of the reference frame.

@@ -103,8 +103,8 @@ class PaperTracker:
                 reference = framer.reference(depth, pose) if reference is None else reference
                 frames = framer.frame(box.rgb(frame.rgb), depth, pose, reference)
                 ring.append(frames.features)
-                x = self.network.embed(torch.cat(list(ring), dim=1))[:, -1:]
-                answers = self.network.answer(x, frames)
+                decoded = self.network.embed(torch.cat(list(ring), dim=1))
+                answers = self.network.answer([layer.newest() for layer in decoded], frames)
                 metric = answers.point[0, 0].cpu().double() * reference.scale.cpu() + reference.center.cpu()
                 parts = (
                     box.to_source(answers.uv[0, 0].cpu().numpy() * size),

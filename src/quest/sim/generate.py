@@ -63,7 +63,10 @@ def generate_take(
     # What hides has draws of its own; all other suites show the motion of the ordinary take, to be compared with it.
     own = suite.tag.encode() if suite is not None and hiding is not None else b""
     key = [zlib.crc32(sim_object.object_id.encode()), level, seed, *own]
-    motion_rng, camera_rng, appearance_rng, props_rng, sensor_rng = (np.random.default_rng([*key, n]) for n in range(5))
+    scene = key[:1] if settings.fixed_scene else key
+    motion_rng, camera_rng, appearance_rng, props_rng, sensor_rng = (
+        np.random.default_rng([*(scene if n in (1, 2) else key), n]) for n in range(5)
+    )
     sim_object, shape = _shaped(sim_object, np.random.default_rng([*key, 5]), settings)
     if hiding is None:
         staging = stage_plain(
@@ -167,7 +170,7 @@ def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     for what in ("cameras", "motion", "sensor"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = asdict(getattr(settings, what))
-    for what in ("physics", "gripper", "disturbance", "broad_materials"):
+    for what in ("physics", "gripper", "disturbance", "broad_materials", "fixed_scene"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = getattr(settings, what)
     variant = {"variant": suite.variant} if suite is not None and suite.variant else {}

@@ -32,6 +32,9 @@ class TakeSettings:
     """Whether objects get random materials, beside random light and surroundings."""
     broad_materials: bool = False
     """Whether materials are drawn from all textures rather than the usual ones."""
+    fixed_scene: bool = False
+    """Whether all takes of an object show it in one scene from the same cameras; only its motion is then of the
+    take."""
     cameras: CameraStyle = CameraStyle()
     """Where cameras stand and how they move."""
     motion: MotionStyle = MotionStyle()

@@ -91,6 +91,8 @@ def stage_plain(
     joints = choose_joints(sim_object, level, motion_rng)
     script = _script(sim_object, joints, motion_rng, settings)
     playback = Playback.of(sim_object, script, settings.every)
+    if settings.fixed_scene:
+        playback = replace(playback, swept=_reach(sim_object))
     cameras, stage = _cameras(sim_object, playback, len(script), camera_rng, renderer, settings)
     props: list[Prop] = []
     about: dict[str, Any] = {}
@@ -177,6 +179,14 @@ def _swept(sim_object: SimObject, poses: Float[np.ndarray, "T B 4 4"]) -> Float[
     moments = poses[np.unique(np.linspace(0, len(poses) - 1, 16).astype(int))]
     hulls = sim_object.articulation.body_hulls
     return np.concatenate([apply(pose[b], hull) for b, hull in enumerate(hulls) if len(hull) for pose in moments])
+
+
+def _reach(sim_object: SimObject) -> Float[np.ndarray, "N 3"]:
+    """World points that bound the object with each of its joints open by itself."""
+    joints = sim_object.articulation.joints
+    rest = sim_object.articulation.rest
+    opened = rest + np.diag([j.opening() for j in joints])
+    return _swept(sim_object, np.stack([sim_object.articulation.poses(p) for p in (rest, *opened)]))
 
 
 def _cameras(

@@ -129,6 +129,7 @@ SUITES: dict[str, tuple[Suite, ...]] = {
     ),
     "gripper": (Suite("gripper", settings=_with(gripper=True, frames_per_joint=90)),),
     "long": (Suite("long", settings=_with(frames=10_000), level=2),),
+    "published": (Suite("published", settings=_with(views=3, randomize_materials=False, fixed_scene=True)),),
 }
 """The presets, each with its variants:
 
@@ -138,7 +139,9 @@ SUITES: dict[str, tuple[Suite, ...]] = {
 - ``shift``: light that changes, odd materials, blur, JPEG, a bumped camera, a camera high above or far to the side;
 - ``moving``: a camera that orbits, is held by hand, or sits on a robot's head;
 - ``gripper``: a gripper comes, pulls, and goes;
-- ``long``: 10,000 frames in which two joints open and close again and again.
+- ``long``: 10,000 frames in which two joints open and close again and again;
+- ``published``: as the publication seems to have filmed: three cameras that stand where they stand for all takes of an
+  object, in its own materials, under one light; only the motion is another in every take.
 
 Takes of one object, level and seed show the motion of the ordinary take of that seed in all variants of ``noise``,
 ``shift`` and ``moving``, so that they can be compared in pairs.

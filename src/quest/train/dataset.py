@@ -52,9 +52,9 @@ class Dataset:
     """Windows to learn from and windows to choose by."""
 
     training: WindowSampler
-    """Of training objects."""
+    """Of takes that teach."""
     validation: WindowSampler
-    """Of validation objects."""
+    """Of takes that choose."""
     training_takes: int
     """How many takes teach."""
     training_sources: frozenset[str]
@@ -84,8 +84,8 @@ def open_dataset(
     """Select takes by the object split and prepare their features.
 
     With ``validation_stores``, everything in ``stores`` that is not a validation or test object teaches, and
-    everything in ``validation_stores`` that is no training or test object chooses: so a user's own objects, which are
-    in no split, can be used. Without it, ``stores`` are divided by the committed split.
+    everything in ``validation_stores`` that is no test object chooses: so a user's own objects, which are in no split,
+    can be used, or new motions of the objects that teach. Without it, ``stores`` are divided by the committed split.
 
     Args:
         network: network with the encoder that the features come from.
@@ -105,12 +105,14 @@ def open_dataset(
             store = TakeStore(folder)
             for name, info in store.infos().items():
                 part = part_of(info)
-                if part == "unlisted":
-                    part = role if validation_stores else "none"
-                teaches = part == "train" == role
-                chooses = part == "validation" and (role == "validation" or not validation_stores)
-                if teaches or chooses:
-                    wanted.append(_Wanted(store, name, part, info.source))
+                if not validation_stores:
+                    allowed = part if part in ("train", "validation") else None
+                elif role == "train":
+                    allowed = role if part in ("train", "unlisted") else None
+                else:
+                    allowed = role if part != "test" else None
+                if allowed is not None:
+                    wanted.append(_Wanted(store, name, allowed, info.source))
     takes = {part: [w.name for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
         if not found:
