@@ -74,14 +74,14 @@ class FitLooks:
     def _pairs(self, tracker: Tracker, path: Path) -> Float[np.ndarray, "N 2"]:
         """Cosine of the descriptors and squared difference of the log odds, of two looks at one place."""
         clip = cut_clip(quest.read(path), slice(0, self.frames))
-        first = tracker.find(clip.camera, clip.frame(0))
+        first = tracker.find(clip.rgb[0])
         keep = np.flatnonzero(np.isin(first.labels, LABELS) & (first.p > self.least))[: self.most]
         if not len(keep):
             return np.zeros((0, 2))
         tracks = tracker.track(clip, [Query.point(0, *first.uv_px[i]) for i in keep], alpha=None)
         queries, looks = StreamQueries(tracker.config, clip.camera, ()), []
         for t in range(0, len(clip), self.every):
-            found = tracker.find(clip.camera, clip.frame(t))
+            found = tracker.find(clip.rgb[t])
             found = found.select(np.isin(found.labels, LABELS))
             at_px = tracks.uv_px[t].astype(float)
             near = queries.near(found, at_px)

@@ -326,6 +326,7 @@ REAL = (
     ("video.json", "real video, colours", "colours"),
     ("posed.json", "real RGB-D, camera poses given", "depth and poses"),
     ("posed.json", "real RGB-D, moving camera, no poses", "depth"),
+    ("posed.json", "real rooms, moving camera, colours", "colours"),
     ("images.json", "real pictures", "colours"),
 )
 """Result files of real recordings, what they are called, and what QueST is shown."""

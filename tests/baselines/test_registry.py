@@ -87,6 +87,3 @@ def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
     np.testing.assert_array_equal(tracks.point_world[known], lifted[known])
     assert np.isnan(tracks.point_world[:3, 1]).all()
     assert tracks.joints is None or set(tracks.joints.kind) <= {"unknown", "static"}
-    found, blind = (tracker.find(c.camera, c.frame(0)) for c in (clip, replace(clip, depth_m=None)))
-    np.testing.assert_array_equal(found.uv_px, blind.uv_px)
-    np.testing.assert_array_equal(found.logit, blind.logit)

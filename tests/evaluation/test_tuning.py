@@ -12,7 +12,6 @@ from quest.errors import ConfigError
 from quest.evaluation.tuning import tune
 from quest.model.found import LABELS_FOUND, Found, Panels
 from quest.track import Tracker
-from quest.types import Camera, Frame
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker
 
@@ -50,7 +49,7 @@ def test_the_threshold_lies_below_what_is_right(store: TakeStore, monkeypatch: p
     away = np.array([[1.0, 1], [63, 1], [1, 63], [63, 63]])
     found = made_up(np.concatenate((true[:1], away[:1], true[1:], away[1:])), np.array([4.0, 3, 2, -1, -2, -3]))
 
-    def find(tracker: Tracker, camera: Camera, frame: Frame) -> Found:
+    def find(tracker: Tracker, rgb: np.ndarray) -> Found:
         return replace(found, logit=tracker.config.gain * found.logit + tracker.config.bias)
 
     monkeypatch.setattr(Tracker, "find", find)

@@ -76,7 +76,7 @@ def test_the_future_is_not_used(clip: Clip):
 def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
     """Whenever they bind: evaluation takes answer k for query k."""
     tracker = make_tracker()
-    label = next(label for label in tracker.find(clip.camera, clip.frame(0)).labels if label in LABELS)
+    label = next(label for label in tracker.find(clip.rgb[0]).labels if label in LABELS)
     asked = (Query.point(3, 20, 30), POINTS[0], Query.semantic(label), Query.point(1, 30, 30), POINTS[1])
     tracks = tracker.track(clip, asked)
     bound = np.all(np.isfinite(tracks.uv_px), axis=-1)

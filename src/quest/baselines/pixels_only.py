@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from quest.baselines.point_queries import hold_last, lift_pixels
-from quest.model.found import Found
 from quest.track.tracker import DEFAULT_ALPHA, Tracker
-from quest.types import Camera, Clip, Frame, Query, Tracks
+from quest.types import Clip, Query, Tracks
 
 
 class PixelsOnly(Tracker):
@@ -31,10 +30,6 @@ class PixelsOnly(Tracker):
         )
         other.name = name
         return other
-
-    def find(self, camera: Camera, frame: Frame) -> Found:
-        """As :meth:`quest.track.Tracker.find`, by colours alone."""
-        return super().find(camera, replace(frame, depth_m=None))
 
     def track(
         self, clip: Clip, queries: Sequence[Query] | None = None, *, alpha: float | None = DEFAULT_ALPHA

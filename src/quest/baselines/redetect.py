@@ -95,7 +95,7 @@ class Redetect:
 
     def detect(self, clip: Clip, t: int) -> Detections:
         """What is found in frame ``t``."""
-        found = self.tracker.find(clip.camera, clip.frame(t))
+        found = self.tracker.find(clip.rgb[t])
         kept = np.flatnonzero((found.p > self.tracker.config.threshold) & np.isin(found.labels, LABELS))
         found, uv_px = found.select(kept), found.uv_px[kept].astype(np.float32)
         point = lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None])[0]

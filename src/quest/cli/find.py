@@ -63,7 +63,7 @@ class Find:
             clip = read_recording(self.source)
         if not 0 <= self.frame < len(clip):
             raise InputError(f"{self.source}: expected a frame from 0 to {len(clip) - 1}, got {self.frame}")
-        found = tracker.find(clip.camera, clip.frame(self.frame))
+        found = tracker.find(clip.rgb[self.frame])
         config, missing = tracker.config, ""
         least = config.threshold if self.threshold is None else self.threshold
         console = Console(highlight=False, soft_wrap=True)

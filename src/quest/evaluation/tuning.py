@@ -88,8 +88,7 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
 def _in_pictures(tracker: Tracker, pictures: Sequence[Picture]) -> Answers:
     scored = []
     for picture in pictures:
-        clip = picture.read()
-        scored.append(score_picture(picture, discover(tracker, clip)))
+        scored.append(score_picture(picture, discover(tracker, picture.read())))
     return Answers(
         np.concatenate([s.score for s in scored]),
         np.concatenate([s.first for s in scored]),
@@ -105,7 +104,7 @@ def _in_takes(tracker: Tracker, takes: Chosen) -> Answers:
         take = store.read(name, frames=slice(0, 1))
         for view in range(len(take.views)):
             clip = take.views[view].clip
-            found = tracker.find(clip.camera, clip.frame(0))
+            found = tracker.find(clip.rgb[0])
             found = found.select(np.isin(found.labels, LABELS))
             hits, seen = _match(take, view, found.uv_px)
             logits, right, present = logits + found.logit.tolist(), right + hits, present + seen

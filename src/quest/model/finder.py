@@ -19,7 +19,6 @@ from torch import Tensor, nn
 from quest.model.config import NetworkConfig
 from quest.model.efficientnet import WIDTHS, EfficientNet
 from quest.model.encoder import Encoder
-from quest.model.relief import relief
 
 PLACES = ("grip", "rim", "front", "hinge")
 """What the fine map finds; a grip is a handle or a knob."""
@@ -33,10 +32,6 @@ CONTEXT_BLOCKS = (5, 8, 11)
 """Blocks of the vision transformer whose tokens are read."""
 CONTEXT_SHARE = 0.7
 """Size of the picture that the vision transformer sees, in parts of the one that EfficientNet sees."""
-_RADII_PX = (12, 40)
-"""Of the squares whose relief is seen."""
-RELIEF = 1 + len(_RADII_PX)
-"""Channels of :func:`relief_of`."""
 _STEPS = (1, 2, 3)
 """Dilations where the branches are joined, so that a door's middle sees its edges."""
 _GROUPS = 8
@@ -72,16 +67,6 @@ class FinderMaps:
     """As ``extent``, of the panel."""
     opening: Float[Tensor, "B O H W"]
     """Logits of :data:`OPENINGS`, which exclude each other."""
-
-
-def relief_of(depth_m: Float[Tensor, "B H W"]) -> Float[Tensor, "B R H W"]:
-    """How far each pixel stands before what is around it (see :func:`quest.model.relief.relief`), and where depth is.
-
-    Args:
-        depth_m: metres along +z, 0 where missing.
-    """
-    stands = relief(depth_m, _RADII_PX)
-    return torch.cat((stands, (depth_m > 0).to(stands.dtype)[:, None]), dim=1)
 
 
 class _Mix(nn.Module):
@@ -135,13 +120,6 @@ class FinderNetwork(nn.Module):
             nn.Conv2d(channels, deep if i > 1 else width, 1) for i, channels in enumerate(WIDTHS)
         )
         self.context = nn.Conv2d(context, deep, 1)
-        self.relief = nn.Sequential(
-            nn.Conv2d(RELIEF, 24, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(24, 48, 3, 2, 1),
-            nn.ReLU(),
-            nn.Conv2d(48, width, 1),
-        )
         self.deep = nn.ModuleList(_Mix(deep, deep, step=step) for step in _STEPS)
         self.down = nn.Conv2d(deep, width, 1)
         self.mix = nn.ModuleList(_Mix(width, width) for _ in range(2))
@@ -162,18 +140,11 @@ class FinderNetwork(nn.Module):
         with torch.no_grad():
             return self.encoder.depths(small, CONTEXT_BLOCKS)
 
-    def forward(
-        self,
-        rgb: Float[Tensor, "B 3 H W"],
-        stands_out: Float[Tensor, "B R H W"] | None = None,
-        *,
-        context: Float[Tensor, "B E r c"] | None = None,
-    ) -> FinderMaps:
+    def forward(self, rgb: Float[Tensor, "B 3 H W"], *, context: Float[Tensor, "B E r c"] | None = None) -> FinderMaps:
         """The maps.
 
         Args:
             rgb: colours from 0 to 1; sides are multiples of 32.
-            stands_out: see :func:`relief_of`; None without depth.
             context: of the pictures, where it is known already.
         """
         rgb = rgb.contiguous(memory_format=torch.channels_last)
@@ -182,10 +153,6 @@ class FinderNetwork(nn.Module):
         deep = deep + _onto(deep, deepest) + _onto(deep, self.context(self.dropout(tokens)))
         for mix in self.deep:
             deep = deep + mix(deep)
-        if stands_out is not None:
-            # Multiplied, so that where there is no depth it is as without.
-            known = F.avg_pool2d(stands_out[:, -1:], FINE_PX)
-            fine = fine + known * self.relief(stands_out)
         middle = self.mix[0](middle + _onto(middle, self.down(deep)))
         fine = self.mix[1](fine + _onto(fine, middle))
         place, extent = self.fine(fine)

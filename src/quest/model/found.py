@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Float32, Int, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from scipy.special import expit
 from torch import Tensor
 
-from quest.model.finder import COARSE_PX, FINE_PX, PLACES, FinderMaps, FinderNetwork, relief_of
+from quest.model.finder import COARSE_PX, FINE_PX, PLACES, FinderMaps, FinderNetwork
 from quest.types import LABELS
 
 LABELS_FOUND = (*LABELS, "hinge")
@@ -88,7 +88,6 @@ class Found:
 def find(
     network: FinderNetwork,
     rgb: UInt8[np.ndarray, "H W 3"],
-    depth_m: Float32[np.ndarray, "H W"] | None = None,
     *,
     size_px: int,
     gain: float = 1.0,
@@ -99,7 +98,6 @@ def find(
     Args:
         network: in evaluation mode.
         rgb: the picture.
-        depth_m: metres along +z, 0 where missing; None without depth.
         size_px: longer side of what the network sees.
         gain: multiplies the network's logits of what can be taken hold of ...
         bias: ... and is added to them, so that they are log odds of being right.
@@ -108,27 +106,19 @@ def find(
     device = next(network.parameters()).device
     scale = size_px / max(height, width)
     inside = (max(1, round(height * scale)), max(1, round(width * scale)))
-    canvas = torch.from_numpy(_placed(rgb, inside, _GREY)).to(device)
-    seen = None
-    if depth_m is not None:
-        depth = torch.from_numpy(_placed(depth_m, inside, 0.0)).to(device)
-        seen = relief_of(depth[None])
+    canvas = torch.from_numpy(_placed(rgb, inside)).to(device)
     with torch.inference_mode():
-        maps = network(canvas.permute(2, 0, 1)[None] / 255, seen)
+        maps = network(canvas.permute(2, 0, 1)[None] / 255)
     found = read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
     return replace(found, logit=gain * found.logit + bias)
 
 
-def _placed(image: np.ndarray, inside: tuple[int, int], fill: float) -> np.ndarray:
-    """An image at another size, in the upper left corner of one with sides in whole steps."""
+def _placed(rgb: UInt8[np.ndarray, "H W 3"], inside: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
+    """A picture at another size, in the upper left corner of a grey one with sides in whole steps."""
     rows, columns = inside
-    if image.ndim == 2:
-        how = cv2.INTER_NEAREST_EXACT
-    else:
-        how = cv2.INTER_AREA if columns < image.shape[1] else cv2.INTER_LINEAR
-    canvas = np.full((-(-rows // _SIDE_PX) * _SIDE_PX, -(-columns // _SIDE_PX) * _SIDE_PX, *image.shape[2:]), fill,
-                     image.dtype)  # fmt: skip
-    canvas[:rows, :columns] = cv2.resize(image, (columns, rows), interpolation=how)
+    how = cv2.INTER_AREA if columns < rgb.shape[1] else cv2.INTER_LINEAR
+    canvas = np.full((-(-rows // _SIDE_PX) * _SIDE_PX, -(-columns // _SIDE_PX) * _SIDE_PX, 3), _GREY, np.uint8)
+    canvas[:rows, :columns] = cv2.resize(rgb, (columns, rows), interpolation=how)
     return canvas
 
 

@@ -221,12 +221,10 @@ class Stream:
         memory.has_depth = frame.depth_m is not None
         state = self._filter(frame)
         at_px = filtering.read_off(state, self._noise).uv_px
-        new_px = self._queries.bind(
-            memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb, frame.depth_m)
-        )
+        new_px = self._queries.bind(memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb))
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
         if memory.finding is not None:
-            memory.filter = self._find(memory.finding, memory.filter, rgb, frame.depth_m)
+            memory.filter = self._find(memory.finding, memory.filter, rgb)
         if self._monitor is not None:
             for following in self._queries.state.following:
                 if following.number not in self._monitor.state.name:
@@ -253,22 +251,16 @@ class Stream:
             memory.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
         return state
 
-    def _look(self, rgb: UInt8[np.ndarray, "H W 3"], depth_m: Float32[np.ndarray, "H W"] | None) -> Found:
-        return find(self._network, rgb, depth_m, **self._config.looking)
+    def _look(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Found:
+        return find(self._network, rgb, **self._config.looking)
 
-    def _find(
-        self,
-        finding: Finding,
-        state: FilterState,
-        rgb: UInt8[np.ndarray, "H W 3"],
-        depth_m: Float32[np.ndarray, "H W"] | None,
-    ) -> FilterState:
+    def _find(self, finding: Finding, state: FilterState, rgb: UInt8[np.ndarray, "H W 3"]) -> FilterState:
         """Begin a look if it is time, and take in the last one if it is there: what is likely enough is followed."""
         config, queries = self._config, self._queries
         finding.warp = state.warp @ finding.warp
         if self._looker.idle and finding.due(state.stamp_s):
             finding.begin(state)
-            self._looker.begin(partial(self._look, rgb.copy(), depth_m))
+            self._looker.begin(partial(self._look, rgb.copy()))
         found, look = self._looker.take(), finding.frame
         if found is None or look is None:
             return state

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, UInt8
 
 from quest.data.recording import read_recording
 from quest.errors import ConfigError, InputError, WeightsError
@@ -22,13 +22,13 @@ from quest.model.weights import load_network
 from quest.model.xfeat import XFeat
 from quest.monitor import Budget, Calibration, Inputs, read_calibrations
 from quest.track.finding import Finding
-from quest.track.preprocess import NO_DEPTH_FLAG, Preprocessor
+from quest.track.preprocess import NO_DEPTH_FLAG
 from quest.track.saving import load as restored
 from quest.track.saving import save
 from quest.track.settings import REVISION, TrackerConfig
 from quest.track.state import StreamState
 from quest.track.stream import WITHHELD_FLAG, Memory, Stream
-from quest.types import Camera, Clip, Frame, Joints, Query, State, Tracks
+from quest.types import Camera, Clip, Joints, Query, State, Tracks
 
 DEFAULT_WEIGHTS = "quest-s16"
 DEFAULT_ALPHA = 0.05
@@ -138,23 +138,21 @@ class Tracker:
             finding=finding,
         )
 
-    def find(self, camera: Camera, frame: Frame) -> Found:
-        """What can be taken hold of in a frame, however unlikely; nothing is followed.
+    def find(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Found:
+        """What can be taken hold of in a picture, however unlikely; nothing is followed.
 
         Args:
-            camera: intrinsics of the frame.
-            frame: the frame.
+            rgb: the picture, sRGB.
 
         Returns:
             Best first; its ``logit`` is calibrated: the log odds of being right.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, or its pose or stamp is not finite.
+            InputError: the picture has another shape or type.
         """
-        preprocessor = Preprocessor(camera)
-        preprocessor.check(0, frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-        depth_m = preprocessor.prepare(frame.rgb, frame.depth_m, frame.cam_from_world).depth_m
-        return find(self.network, frame.rgb, depth_m, **self.config.looking)
+        if rgb.ndim != 3 or rgb.shape[-1] != 3 or rgb.dtype != np.uint8 or not rgb.size:
+            raise InputError(f"find: expected colours [H, W, 3] of uint8, got {list(rgb.shape)} of {rgb.dtype}")
+        return find(self.network, rgb, **self.config.looking)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
+from jaxtyping import UInt8
 from scipy.special import logit
 
 from quest.baselines import TRACKERS, ClipTracker, Inputs
@@ -136,19 +137,19 @@ def evaluate_set(
     for (of, tracker, inputs), clips in tracked.items():
         rows.append(track_row(of, tracker, inputs, list(clips.values()), resamples))
         single += [track_row(name, tracker, inputs, [clip], 1) for name, clip in clips.items()]
-    found: dict[tuple[str, Inputs], dict[str, ScoredPicture]] = {}
+    found: dict[str, dict[str, ScoredPicture]] = {}
     for picture in real.pictures:
-        for tracker, inputs, one in _ask_picture(picture, trackers, kept, progress):
-            found.setdefault((tracker, inputs), {})[picture.name] = one
+        for tracker, one in _ask_picture(picture, trackers, kept, progress):
+            found.setdefault(tracker, {})[picture.name] = one
 
-    def found_row(of: str, tracker: str, inputs: Inputs, pictures: Sequence[ScoredPicture], resamples: int) -> RealRow:
+    def found_row(of: str, tracker: str, pictures: Sequence[ScoredPicture], resamples: int) -> RealRow:
         measures = discovery_measures(pictures, resamples=resamples, seed=seed)
         handles, answers = (sum(len(getattr(p, name)) for p in pictures) for name in ("found", "right"))
-        return RealRow(of, tracker, inputs, len(pictures), handles, answers, measures)
+        return RealRow(of, tracker, "colours", len(pictures), handles, answers, measures)
 
-    for (tracker, inputs), pictures in found.items():
-        rows.append(found_row("pictures", tracker, inputs, list(pictures.values()), resamples))
-        single += [found_row(name, tracker, inputs, [p], 1) for name, p in pictures.items()]
+    for tracker, pictures in found.items():
+        rows.append(found_row("pictures", tracker, list(pictures.values()), resamples))
+        single += [found_row(name, tracker, [p], 1) for name, p in pictures.items()]
     rows.sort(key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of))
     return rows, single
 
@@ -179,12 +180,13 @@ def _ask_clip(
 
 def _ask_picture(
     picture: Picture, trackers: Sequence[ClipTracker], kept: KeptAnswers | None, progress: Progress
-) -> Iterator[tuple[str, Inputs, ScoredPicture]]:
-    ways = shown(picture.read())
-    for tracker, inputs in asked([t for t in trackers if isinstance(t, Tracker)], ways):
-        progress(f"{picture.name}: {tracker.name}, {inputs}", 0)
-        answers = kept_or_asked(kept, picture.name, tracker.name, inputs, partial(discover, tracker, ways[inputs]))
-        yield tracker.name, inputs, score_picture(picture, answers)
+) -> Iterator[tuple[str, ScoredPicture]]:
+    rgb = picture.read()
+    for tracker in trackers:
+        if isinstance(tracker, Tracker) and "colours" in TRACKERS[tracker.name].inputs:
+            progress(f"{picture.name}: {tracker.name}", 0)
+            answers = kept_or_asked(kept, picture.name, tracker.name, "colours", partial(discover, tracker, rgb))
+            yield tracker.name, score_picture(picture, answers)
     progress(picture.name, 1)
 
 
@@ -216,14 +218,14 @@ def grips_of(found: Found) -> Found:
     return found.select(~np.isnan(found.box_px[:, 0]))
 
 
-def discover(tracker: Tracker, clip: Clip) -> dict[str, np.ndarray]:
-    """Handles, knobs, doors and drawers that a tracker finds in a clip of one frame.
+def discover(tracker: Tracker, rgb: UInt8[np.ndarray, "H W 3"]) -> dict[str, np.ndarray]:
+    """Handles, knobs, doors and drawers that a tracker finds in a picture.
 
     Returns:
         Best first, however unlikely: ``uv_px``, ``box_px`` and ``score`` (log odds of being right) of grips,
         ``panel_px``, ``panel_kind`` and ``panel_score`` of panels; and the ``least`` score that discovery follows.
     """
-    found = tracker.find(clip.camera, clip.frame(0))
+    found = tracker.find(rgb)
     grips, panels, least = grips_of(found), found.panels, tracker.config.threshold
     return {
         "uv_px": grips.uv_px, "box_px": grips.box_px, "score": grips.logit, "panel_px": panels.box_px,

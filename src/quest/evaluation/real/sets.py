@@ -12,19 +12,17 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
-from PIL import Image, UnidentifiedImageError
+from jaxtyping import Bool, Float, Int, UInt8
+from PIL import Image
 
 from quest.data.boxed_pictures import in_boxes, kind_of, may_choose, read_boxed_pictures
-from quest.data.camera_file import read_camera
 from quest.data.columns import read_columns
 from quest.data.pictures import read_picture
 from quest.data.provenance import combined_hash, file_hash
 from quest.data.recording import read_recording
-from quest.depth import clean_depth
 from quest.errors import InputError
 from quest.model.finder import PANELS
-from quest.types import Camera, Clip, Query
+from quest.types import Clip, Query
 
 STATES = ("visible", "occluded", "out")
 EXPECTED = (
@@ -134,29 +132,19 @@ class Picture:
     """Boxes of doors and drawers by their kind; none where they are not labelled."""
     bars: bool = False
     """Whether handles are bars."""
-    depth: Path | None = None
-    """Its depth image, aligned."""
-    camera: Path | None = None
-    """Its camera file; without one the camera is guessed."""
 
     @property
     def name(self) -> str:
         """Name of the file."""
         return self.path.name
 
-    def read(self) -> Clip:
-        """The picture as a clip of one frame.
+    def read(self) -> UInt8[np.ndarray, "H W 3"]:
+        """The picture, sRGB.
 
         Raises:
-            InputError: a file is damaged.
+            InputError: the file is damaged.
         """
-        rgb = read_picture(self.path)
-        setup = None if self.camera is None else read_camera(self.camera)
-        camera = Camera.from_fov(rgb.shape[1], rgb.shape[0]) if setup is None else setup.camera
-        depth_m = None
-        if self.depth is not None and setup is not None:
-            depth_m = clean_depth(np.asarray(_open(self.depth)) * np.float32(setup.depth_scale_m))[None]
-        return Clip(self.name, camera, rgb[None], depth_m, np.zeros(1), np.eye(4)[None])
+        return read_picture(self.path)
 
     def closeness(self, uv_px: Float[np.ndarray, "A 2"]) -> Float[np.ndarray, "A H"]:
         """How far answers are from handles, in parts of the handle; infinite where they are not right.
@@ -199,7 +187,7 @@ class RealSet:
     def data_hash(self) -> str:
         """Over all files that answers and scores depend on."""
         files = [path for clip in self.clips for path in clip.folder.rglob("*") if path.is_file()]
-        files += [path for p in self.pictures for path in (p.path, p.depth, p.camera) if path is not None]
+        files += [picture.path for picture in self.pictures]
         files += [
             path for path in (self.folder / "labels.csv", self.folder / "handles" / "handles.csv") if path.exists()
         ]
@@ -274,26 +262,14 @@ def _boxed_pictures(folder: Path, part: Part) -> Iterator[Picture]:
 
 
 def _stills(folder: Path) -> Iterator[Picture]:
-    """Pictures whose handles are bars, pixel centres at integers, with depth images of the same name."""
+    """Pictures whose handles are bars, pixel centres at integers."""
     ends = ("x1", "y1", "x2", "y2")
     rows = read_columns(folder / "handles.csv", {"frame": int, "use": int, **dict.fromkeys(ends, float)})
     for frame in np.unique(rows["frame"]):
         own = rows["frame"] == frame
-        depth, camera = folder / f"{frame:04d}.png", folder / "camera.json"
         yield Picture(
             folder / f"{frame:04d}.jpg",
             np.stack([rows[key][own] for key in ends], axis=-1) + 0.5,
             rows["use"][own] > 0,
             bars=True,
-            depth=depth if depth.is_file() else None,
-            camera=camera if camera.is_file() else None,
         )
-
-
-def _open(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except (OSError, UnidentifiedImageError) as error:
-        raise InputError(f"picture {path}: cannot be read ({error}); copy it again") from error

@@ -71,7 +71,7 @@ class StageFind:
 
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
         """Every loss, unweighted."""
-        maps = self.network(frames.rgb, frames.relief, context=frames.context)
+        maps = self.network(frames.rgb, context=frames.context)
         places = len(PLACES)
         return {
             "place": _focal(maps.place, truth.place, truth.place_share, truth.known[:, :places]),
@@ -95,7 +95,7 @@ class StageFind:
             for i in np.linspace(0, len(paths) - 1, count).astype(int):
                 view = read_view(paths[i])
                 seen = whole_view(view).to(device)
-                maps = self.network(seen.rgb, seen.relief, context=seen.context)
+                maps = self.network(seen.rgb, context=seen.context)
                 found = read_off(maps, scale=np.ones(2), size=(VIEW_PX, VIEW_PX))
                 found = found.select(~np.isnan(found.box_px[:, 0]))
                 box = view.marks.box_px[view.marks.kind == PLACES.index("grip")]

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from quest.errors import ConfigError
-from quest.model.finder import COARSE_PX, FINE_PX, PANELS, PLACES, RELIEF, relief_of
+from quest.model.finder import COARSE_PX, FINE_PX, PANELS, PLACES
 from quest.train.finding.marks import UNKNOWN, Marks
 from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
 from quest.train.finding.views import View, read_view
@@ -39,8 +39,6 @@ class FinderInputs:
     """Colours from 0 to 1."""
     context: Float[Tensor, "B E r c"]
     """What the transformer sees."""
-    relief: Float[Tensor, "B R S S"]
-    """Zero where there is no depth."""
 
     def to(self, device: torch.device) -> FinderInputs:
         """The same on a device."""
@@ -90,7 +88,6 @@ class _Cut:
     """Of what is random about it."""
     aimed: bool
     """Whether a labelled thing is in it."""
-    no_depth: bool
 
 
 @dataclass(frozen=True)
@@ -130,55 +127,45 @@ class FinderSampler:
         for _ in range(config.batch):
             views = self.takes if rng.random() < share else self.pictures
             path = views[int(rng.integers(len(views)))]
-            aimed, no_depth = rng.random(2) < (config.aimed_share, config.depth_drop_share)
-            cuts.append(_Cut(path, int(rng.integers(2**31)), bool(aimed), bool(no_depth)))
+            cuts.append(_Cut(path, int(rng.integers(2**31)), bool(rng.random() < config.aimed_share)))
         return FinderPlan(tuple(cuts), config.cut_px)
 
     def load(self, plan: FinderPlan) -> tuple[FinderInputs, FinderTruth]:
         """Read what a plan, or a part of one, names."""
         size = plan.size_px
         seen = [_see(read_view(cut.path), cut, size) for cut in plan.cuts]
-        rgb, context, relief, marks = zip(*seen, strict=True)
+        rgb, context, marks = zip(*seen, strict=True)
         maps = [targets(each, size) for each in marks]
         truth = {name: torch.from_numpy(np.stack([m[name] for m in maps])) for name in maps[0]}
-        return FinderInputs(torch.stack(rgb), torch.stack(context), torch.stack(relief)), FinderTruth(**truth)
+        return FinderInputs(torch.stack(rgb), torch.stack(context)), FinderTruth(**truth)
 
 
 def whole_view(view: View) -> FinderInputs:
     """A view as the network sees it, uncut (B = 1)."""
     rgb = torch.from_numpy(view.rgb).permute(2, 0, 1).float() / 255
-    stands_out = torch.zeros(1, RELIEF, VIEW_PX, VIEW_PX)
-    if view.depth_m is not None:
-        stands_out = relief_of(torch.from_numpy(view.depth_m)[None])
-    return FinderInputs(rgb[None], torch.from_numpy(view.context).float()[None], stands_out)
+    return FinderInputs(rgb[None], torch.from_numpy(view.context).float()[None])
 
 
-def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor, Tensor, Marks]:
+def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor, Marks]:
     """A part of a view at another scale, perhaps mirrored, in other colours."""
     rng = np.random.default_rng(cut.seed)
     side = min(round(size / np.exp(rng.uniform(*np.log(_ZOOM)))), VIEW_PX)
     corner, mirrored = _corner(view.marks, rng, side, aimed=cut.aimed), bool(rng.random() < 0.5)
-
-    def part(image: np.ndarray, how: int) -> np.ndarray:
-        own = image[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
-        return cv2.resize(own[:, ::-1] if mirrored else own, (size, size), interpolation=how)
-
-    rgb = part(view.rgb, cv2.INTER_AREA if side > size else cv2.INTER_LINEAR).astype(np.float32) / 255
+    own = view.rgb[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
+    how = cv2.INTER_AREA if side > size else cv2.INTER_LINEAR
+    rgb = cv2.resize(own[:, ::-1] if mirrored else own, (size, size), interpolation=how).astype(np.float32) / 255
     rgb = rgb * np.exp(rng.normal(0, 0.1, 3) + rng.normal(0, 0.1)).astype(np.float32)
     if rng.random() < 0.3:
         rgb = rgb + rng.normal(0, rng.uniform(0.01, 0.05), rgb.shape).astype(np.float32)
     if rng.random() < 0.1:
         rgb = np.repeat(rgb.mean(axis=-1, keepdims=True), 3, axis=-1)
-    stands_out = torch.zeros(RELIEF, size, size)
-    if view.depth_m is not None and not cut.no_depth:
-        stands_out = relief_of(torch.from_numpy(part(view.depth_m, cv2.INTER_NEAREST_EXACT))[None])[0]
     scale = np.full(2, size / side)
     shift = -corner * scale
     if mirrored:
         scale[0], shift[0] = -scale[0], size - shift[0]
     marks = view.marks.warped(scale, shift, (size, size))
     image = torch.from_numpy(np.ascontiguousarray(rgb.clip(0, 1))).permute(2, 0, 1)
-    return image, _context(view, corner, side, size, mirrored=mirrored), stands_out, marks
+    return image, _context(view, corner, side, size, mirrored=mirrored), marks
 
 
 def _corner(marks: Marks, rng: np.random.Generator, side: int, *, aimed: bool) -> Int[np.ndarray, "2"]:

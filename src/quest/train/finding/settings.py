@@ -22,11 +22,9 @@ class FinderSamplerConfig:
     """Share of simulated frames in a batch, where there are both."""
     aimed_share: float = 0.8
     """How often a cut is one with something labelled in it, where there is any."""
-    depth_drop_share: float = 0.4
-    """How often a simulated frame is shown without its depth."""
 
     def __post_init__(self) -> None:
-        shares = (self.take_share, self.aimed_share, self.depth_drop_share)
+        shares = (self.take_share, self.aimed_share)
         if self.batch < 1 or not all(0 <= share <= 1 for share in shares):
             raise ConfigError(f"finding: expected a batch of at least 1 and shares from 0 to 1, got {self}")
         if self.cut_px % 32 or not 32 <= self.cut_px <= VIEW_PX:

@@ -16,7 +16,7 @@ from zipfile import BadZipFile
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float32, UInt8
+from jaxtyping import UInt8
 
 from quest.data.boxed_pictures import CLASSES, BoxedPicture, kind_of
 from quest.data.pictures import read_picture
@@ -44,8 +44,8 @@ class Source:
 
     name: str
     """Digest of its picture and marks: what changed has other views."""
-    read: Callable[[], tuple[UInt8[np.ndarray, "H W 3"], Float32[np.ndarray, "H W"] | None, Marks]]
-    """Colours, depth in metres (0 where missing) or None, and marks."""
+    read: Callable[[], tuple[UInt8[np.ndarray, "H W 3"], Marks]]
+    """Colours and marks."""
 
 
 def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> list[Source]:
@@ -71,8 +71,8 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
     labelled = np.isin(KINDS, [kind for kind, _ in known.values()])
     tells_knobs = any(knob for _, knob in known.values())
 
-    def reader(picture: BoxedPicture) -> Callable[[], tuple[np.ndarray, None, Marks]]:
-        def read() -> tuple[np.ndarray, None, Marks]:
+    def reader(picture: BoxedPicture) -> Callable[[], tuple[np.ndarray, Marks]]:
+        def read() -> tuple[np.ndarray, Marks]:
             rows = [i for i, name in enumerate(picture.names) if name in known]
             kind = np.array([KINDS.index(known[picture.names[i]][0]) for i in rows], np.int64)
             told = [known[picture.names[i]][1] if tells_knobs else None for i in rows]
@@ -82,7 +82,7 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
             lift = np.where(kind < len(PLACES), 0, UNKNOWN)
             box = picture.box_px[rows]
             middle = (box[:, :2] + box[:, 2:]) / 2
-            return read_picture(picture.path), None, Marks(kind, box, middle, knob, lift, unknown, known=labelled)
+            return read_picture(picture.path), Marks(kind, box, middle, knob, lift, unknown, known=labelled)
 
         return read
 
@@ -116,11 +116,9 @@ def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Sou
 
                 def read(
                     name: str = name, until: int = picked[-1] + 1, v: int = v, t: int = t
-                ) -> tuple[np.ndarray, np.ndarray | None, Marks]:
+                ) -> tuple[np.ndarray, Marks]:
                     take = taken(name, until)
-                    clip = take.views[v].clip
-                    depth_m = None if clip.depth_m is None else clip.depth_m[t]
-                    return clip.rgb[t], depth_m, marks_of(take, take.views[v], t)
+                    return take.views[v].clip.rgb[t], marks_of(take, take.views[v], t)
 
                 sources.append(Source(_digest(header.data_hash, v, t), read))
     return sources
@@ -132,8 +130,6 @@ class View:
 
     rgb: UInt8[np.ndarray, "S S 3"]
     """Colours."""
-    depth_m: Float32[np.ndarray, "S S"] | None
-    """Metres, 0 where missing."""
     context: np.ndarray
     """What the transformer sees in it, float16 [E, r, c]."""
     marks: Marks
@@ -168,10 +164,10 @@ class ViewCache:
                     _write(path, self._look(*draw_view(*picture, rng)))
                 yield path
 
-    def _look(self, rgb: np.ndarray, depth_m: np.ndarray | None, marks: Marks) -> View:
+    def _look(self, rgb: np.ndarray, marks: Marks) -> View:
         image = torch.from_numpy(rgb).permute(2, 0, 1)[None].to(next(self._network.parameters()).device) / 255
         context = self._network.context_of(image)[0].half().cpu().numpy()
-        return View(rgb, depth_m, context, marks)
+        return View(rgb, context, marks)
 
 
 def _digest(*parts: object) -> str:
@@ -187,23 +183,20 @@ def read_view(path: Path) -> View:
     try:
         with np.load(path, allow_pickle=False) as file:
             marks = Marks(**{f.name: file[f.name] for f in fields(Marks)})
-            depth_m = file.get("depth_m")
-            return View(file["rgb"], depth_m, file["context"], marks)
+            return View(file["rgb"], file["context"], marks)
     except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise ConfigError(f"{path}: a torn view ({error}); delete it, it is made again") from error
 
 
 def _write(path: Path, view: View) -> None:
     arrays = {"rgb": view.rgb, "context": view.context, **{f.name: getattr(view.marks, f.name) for f in fields(Marks)}}
-    if view.depth_m is not None:
-        arrays["depth_m"] = view.depth_m.astype(np.float32)
     with whole_file(path) as unfinished:
         np.savez(unfinished, **arrays)
 
 
 def draw_view(
-    rgb: UInt8[np.ndarray, "H W 3"], depth_m: np.ndarray | None, marks: Marks, rng: np.random.Generator
-) -> tuple[UInt8[np.ndarray, "S S 3"], np.ndarray | None, Marks]:
+    rgb: UInt8[np.ndarray, "H W 3"], marks: Marks, rng: np.random.Generator
+) -> tuple[UInt8[np.ndarray, "S S 3"], Marks]:
     """A picture scaled, mirrored, cut to a square, and degraded."""
     size = np.array([rgb.shape[1], rgb.shape[0]], float)
     longer = np.exp(rng.uniform(*np.log(_LONGER_PX)))
@@ -219,21 +212,19 @@ def draw_view(
     whole = np.maximum(1, np.round(size * scale)).astype(int)
     # Scaled first, so that what shrinks is averaged; then moved by whole pixels.
     view = _cut(cv2.resize(rgb, tuple(whole.tolist()), interpolation=how), mirrored, shift, fill)
-    deep = None
-    if depth_m is not None:
-        nearest = cv2.resize(depth_m, tuple(whole.tolist()), interpolation=cv2.INTER_NEAREST_EXACT)
-        deep = _cut(nearest, mirrored, shift, np.zeros(1))
-    return _degraded(view, rng), deep, marks.warped(signed, shift, (VIEW_PX, VIEW_PX))
+    return _degraded(view, rng), marks.warped(signed, shift, (VIEW_PX, VIEW_PX))
 
 
-def _cut(image: np.ndarray, mirrored: bool, shift: np.ndarray, fill: np.ndarray) -> np.ndarray:
+def _cut(
+    image: UInt8[np.ndarray, "H W 3"], mirrored: bool, shift: np.ndarray, fill: np.ndarray
+) -> UInt8[np.ndarray, "S S 3"]:
     """A square out of an image, whose left upper corner (mirrored: right upper) lies at a shift."""
     rows, columns = image.shape[:2]
     image = image[:, ::-1] if mirrored else image
     x, y = np.round(shift).astype(int).tolist()
     x -= columns if mirrored else 0
-    out = np.empty((VIEW_PX, VIEW_PX, *image.shape[2:]), image.dtype)
-    out[:] = fill if image.ndim == 3 else fill[0]
+    out = np.empty((VIEW_PX, VIEW_PX, 3), np.uint8)
+    out[:] = fill
     left, top, right, bottom = max(x, 0), max(y, 0), min(x + columns, VIEW_PX), min(y + rows, VIEW_PX)
     out[top:bottom, left:right] = image[top - y : bottom - y, left - x : right - x]
     return out
