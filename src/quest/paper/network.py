@@ -126,7 +126,7 @@ class SlotAnswers:
     """Lifted position in the reference frame; NaN where there is no depth."""
     where: Float[Tensor, "B T K N"]
     """Where they looked last (see :class:`Decoded`)."""
-    earlier_uv: Float[Tensor, "B T K 2*(L-1)"]
+    earlier_uv: Float[Tensor, "B T K C"]
     """Coordinates after each of the earlier layers, for training."""
 
     def then(self, later: SlotAnswers) -> SlotAnswers:
