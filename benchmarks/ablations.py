@@ -31,6 +31,7 @@ from rich.console import Console
 
 from quest.baselines import TRACKERS
 from quest.data.provenance import code_commit, combined_hash, file_hash
+from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.protocols import ClipTracker, ProtocolName
@@ -38,7 +39,7 @@ from quest.evaluation.records import read_records
 from quest.evaluation.report import provenance, write_report
 from quest.evaluation.results import Results, Run, read_results, records_path, write_results
 from quest.evaluation.runner import evaluate, has_protocol
-from quest.evaluation.selection import SplitPart, select_takes
+from quest.evaluation.selection import select_takes
 from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne
 from quest.paper.tracker import PaperTracker

@@ -37,10 +37,10 @@ class Scripted(Redetect):
 
 def test_detections_lie_in_the_image_and_above_the_threshold(take: Take) -> None:
     clip = take.views[0].clip
-    found = Redetect(make_tracker(config=dataclasses.replace(EAGER, threshold=0.6))).detect(clip, 0)
-    everything = Redetect(make_tracker()).detect(clip, 0)
+    found = Redetect(make_tracker(config=dataclasses.replace(EAGER, threshold=0.6), seed=1)).detect(clip, 0)
+    everything = Redetect(make_tracker(seed=1)).detect(clip, 0)
     assert 0 < len(found.label) < len(everything.label)
-    assert 1 < len(set(everything.label)) <= len(set(LABELS) & set(everything.label))  # hinges are none
+    assert set(everything.label) == set(LABELS)
     assert (found.confidence > 0.6).all()
     assert (everything.confidence.min() < 0.6) & (everything.confidence.max() == found.confidence.max())
     assert ((everything.uv_px >= 0) & (everything.uv_px <= (64, 48))).all()

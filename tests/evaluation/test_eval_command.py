@@ -13,13 +13,13 @@ import pytest
 import quest
 from quest.baselines.hold_still import HoldStill
 from quest.cli.evaluate import Eval
-from quest.data.split import object_split, split_of
+from quest.data.split import SplitPart, object_split, part_of, split_of
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError, ObjectError, TakeError
 from quest.evaluation import evaluate, read_records, read_results
 from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.results import records_path
-from quest.evaluation.selection import Shard, SplitPart, part_of, select_takes
+from quest.evaluation.selection import Shard, select_takes
 from quest.types import Clip, Query, Take, TakeInfo, Tracks
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take

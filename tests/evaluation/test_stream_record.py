@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError
 from quest.evaluation import stream_record
-from quest.evaluation.selection import Shard, SplitPart
+from quest.evaluation.selection import Shard
 from quest.evaluation.stream_record import (
     LOST,
     RIGHT,

@@ -171,8 +171,8 @@ def test_where_slots_look_is_drawn_to_the_token_of_their_entity(batch: Batch):
 
 def test_earlier_layers_are_drawn_to_the_same_places(batch: Batch):
     roll = answer((make_paper(decoder_layers=3), *batch[1:]), whole=True)
-    assert roll.slots.earlier_uv.shape[-1] == 2 * 2
-    same = replace(roll, slots=replace(roll.slots, earlier_uv=roll.slots.uv.repeat(1, 1, 1, 2)))
+    assert roll.slots.earlier_uv.shape[3:] == (2, 2)
+    same = replace(roll, slots=replace(roll.slots, earlier_uv=roll.slots.uv.unsqueeze(-2).repeat(1, 1, 1, 2, 1)))
     assert float(early_loss(same)) == pytest.approx(float(coordinate_loss(roll)), rel=1e-4)
 
 

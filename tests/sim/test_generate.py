@@ -217,7 +217,10 @@ def test_what_is_behind_a_door_moves_after_it(tmp_path: Path) -> None:
     assert all(0 not in choose_joints(thing, 2, np.random.default_rng(seed)) for seed in range(10))
 
 
-@pytest.mark.parametrize("wrong", [{"views": 0}, {"size": 8}, {"size": (64, 8)}, {"every": 0}, {"every": 9}])
+@pytest.mark.parametrize(
+    "wrong",
+    [{"views": 0}, {"size": 8}, {"size": (64, 8)}, {"every": 0}, {"every": 9}, {"fixed_scene": True, "stretch": 1.2}],
+)
 def test_settings_out_of_range(wrong: dict) -> None:
     with pytest.raises(ConfigError):
         TakeSettings(**wrong)

@@ -73,6 +73,12 @@ def test_the_future_is_not_used(clip: Clip):
     np.testing.assert_allclose(whole.point_world[:3], start.point_world, **POINT)
 
 
+@pytest.mark.parametrize("wrong", [np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)])
+def test_what_is_no_picture_is_refused(wrong: np.ndarray):
+    with pytest.raises(InputError, match="uint8"):
+        make_tracker().find(wrong)
+
+
 def test_tracks_come_in_the_order_of_the_queries(clip: Clip):
     """Whenever they bind: evaluation takes answer k for query k."""
     tracker = make_tracker()

@@ -125,8 +125,10 @@ def test_views_are_squares_whose_boxes_stay_on_what_they_marked() -> None:
         assert view.shape == (VIEW_PX, VIEW_PX, 3)
         for box in moved.box_px.clip(0, VIEW_PX):
             x0, y0, x1, y1 = box.round().astype(int)
-            around = view[max(y0 - 12, 0) : y1 + 12, max(x0 - 12, 0) : x1 + 12].max()
-            assert view[y0 + 6 : y1 - 6, x0 + 6 : x1 - 6].min() > 0.6 * around
+            white = view.max(axis=-1) > view[(y0 + y1) // 2, (x0 + x1) // 2].max() / 2
+            assert white[y0 + 3 : y1 - 3, x0 + 3 : x1 - 3].all()
+            edge = white[max(y0 - 8, 0) : y1 + 8, max(x0 - 8, 0) : x1 + 8]
+            assert edge.sum() < 1.15 * max((x1 - x0) * (y1 - y0), 1) + 100
 
 
 def test_marks_of_a_take_say_what_is_seen() -> None:

@@ -20,11 +20,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
     from quest.baselines import ClipTracker
+    from quest.data.split import SplitPart
     from quest.data.store import TakeStore
     from quest.evaluation.finished import FinishedTakes
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
-    from quest.evaluation.selection import Shard, SplitPart
+    from quest.evaluation.selection import Shard
 
 if TYPE_CHECKING:
     TrackerName = str

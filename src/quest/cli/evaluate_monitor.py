@@ -13,10 +13,10 @@ from quest.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from quest.data.split import SplitPart
     from quest.data.store import TakeStore
     from quest.evaluation.detectors import Detector
     from quest.evaluation.results import Run
-    from quest.evaluation.selection import SplitPart
     from quest.evaluation.stream_record import StreamRecord
     from quest.monitor import Calibration
     from quest.track import Tracker

@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     import numpy as np
     from rich.console import Console
 
+    from quest.data.split import SplitPart
     from quest.data.store import TakeStore
-    from quest.evaluation.selection import SplitPart
 
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")

@@ -78,7 +78,7 @@ class Train:
     weights: str | None = None
     """Start from these trained weights (a name or a file) instead, to fit your own objects."""
     validation: tuple[str, ...] = ()
-    """Stores to choose by, for objects that are in no split."""
+    """Stores to choose by: for objects that are in no split, or with new motions of those that teach."""
     network: NetworkChanges = field(default_factory=NetworkChanges)
     """What of the published network is different."""
     order: Literal["match", "entity"] = "match"

@@ -38,6 +38,10 @@ def object_split() -> ObjectSplit:
     )
 
 
+SplitPart = Literal["train", "validation", "test", "unlisted"]
+"""A part of the object split; ``unlisted`` objects are in none."""
+
+
 def split_of(info: TakeInfo) -> Part:
     """Which part of the split the object of a take belongs to.
 
@@ -64,3 +68,11 @@ def split_of(info: TakeInfo) -> Part:
         f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's objects "
         f"or a procedural seed in its ranges"
     )
+
+
+def part_of(info: TakeInfo) -> SplitPart:
+    """The part that a take's object is in, or ``unlisted``."""
+    try:
+        return split_of(info)
+    except ObjectError:
+        return "unlisted"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.finished import FinishedTakes, TakeOutcome
@@ -18,7 +19,7 @@ from quest.evaluation.protocols import (
     unscored_entities,
 )
 from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
-from quest.evaluation.selection import WHOLE, Shard, SplitPart
+from quest.evaluation.selection import WHOLE, Shard
 from quest.types import Take
 
 

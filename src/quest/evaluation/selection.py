@@ -4,23 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
 
-from quest.data.split import PARTS, split_of
+from quest.data.split import PARTS, SplitPart, part_of
 from quest.data.store import TakeStore
-from quest.errors import ConfigError, ObjectError
+from quest.errors import ConfigError
 from quest.types import TakeInfo
-
-SplitPart = Literal["train", "validation", "test", "unlisted"]
-"""A part of the object split; ``unlisted`` objects are in none."""
-
-
-def part_of(info: TakeInfo) -> SplitPart:
-    """Part of the split of a take's object."""
-    try:
-        return split_of(info)
-    except ObjectError:
-        return "unlisted"
 
 
 @dataclass(frozen=True)

@@ -126,8 +126,8 @@ class SlotAnswers:
     """Lifted position in the reference frame; NaN where there is no depth."""
     where: Float[Tensor, "B T K N"]
     """Where they looked last (see :class:`Decoded`)."""
-    earlier_uv: Float[Tensor, "B T K C"]
-    """Coordinates after each of the earlier layers, for training."""
+    earlier_uv: Float[Tensor, "B T K M 2"]
+    """Coordinates after each of M earlier layers, for training."""
 
     def then(self, later: SlotAnswers) -> SlotAnswers:
         """These frames and later ones."""
@@ -192,13 +192,13 @@ class PaperNetwork(nn.Module):
         """What queries say that looked at a window, for all its frames or some.
 
         Args:
-            decoded: from :meth:`embed`.
+            decoded: from :meth:`embed`; the last layer is enough where nothing is learned.
             frames: the frames that are asked for.
         """
         last, (*earlier, (uv, logit)) = decoded[-1], [self._read_off(each) for each in decoded]
         uv_px = uv * self.config.encoder.image_size
         point = frames.to_reference(uv_px, frames.depth_at(uv_px))
-        earlier_uv = torch.cat([uv[..., :0], *(uv for uv, _ in earlier)], dim=-1)
+        earlier_uv = torch.stack([uv, *(uv for uv, _ in earlier)], dim=-2)[..., 1:, :]
         label = self.label(last.embedding).float()
         return SlotAnswers(last.embedding, uv, logit, label, point, last.where.float(), earlier_uv)
 
@@ -282,6 +282,4 @@ def read_paper(path: Path) -> LoadedPaper:
 
 def _gather(value: Tensor, slot: Int[Tensor, "B E"]) -> Tensor:
     index = slot[:, None].expand(-1, value.shape[1], -1)
-    if value.ndim == 4:
-        index = index.unsqueeze(-1).expand(-1, -1, -1, value.shape[-1])
-    return value.gather(2, index)
+    return value.gather(2, index.reshape(*index.shape, *[1] * (value.ndim - 3)).expand(-1, -1, -1, *value.shape[3:]))

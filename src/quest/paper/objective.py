@@ -106,7 +106,7 @@ def coordinate_loss(r: SlotRollout) -> Float[Tensor, ""]:
 
 def early_loss(r: SlotRollout) -> Float[Tensor, ""]:
     """L_aff of what all but the last layer would answer."""
-    uv = r.of_entities.earlier_uv.unflatten(-1, (-1, 2)).movedim(-2, 0)
+    uv = r.of_entities.earlier_uv.movedim(-2, 0)
     return losses.coordinate_loss(uv, r.truth.uv.expand_as(uv), _weight(r).expand(uv.shape[:-1]))
 
 

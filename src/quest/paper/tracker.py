@@ -104,7 +104,7 @@ class PaperTracker:
                 frames = framer.frame(box.rgb(frame.rgb), depth, pose, reference)
                 ring.append(frames.features)
                 decoded = self.network.embed(torch.cat(list(ring), dim=1))
-                answers = self.network.answer([layer.newest() for layer in decoded], frames)
+                answers = self.network.answer([decoded[-1].newest()], frames)
                 metric = answers.point[0, 0].cpu().double() * reference.scale.cpu() + reference.center.cpu()
                 parts = (
                     box.to_source(answers.uv[0, 0].cpu().numpy() * size),

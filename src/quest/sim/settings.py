@@ -66,6 +66,8 @@ class TakeSettings:
             raise ConfigError(
                 "take: a gripper pulls one joint after the other, each once; leave overlap, cycles and frames away"
             )
+        if self.fixed_scene and self.stretch != 1:
+            raise ConfigError("take: in a fixed scene only the motion is of the take; leave stretch away")
         if not 1 <= self.stretch <= 4:
             raise ConfigError(f"take: expected to stretch by a factor from 1 to 4, got {self.stretch}")
         if self.disturbance not in DISTURBANCES:

@@ -150,6 +150,7 @@ class Tracker:
         Raises:
             InputError: the picture has another shape or type.
         """
+        rgb = np.asarray(rgb)
         if rgb.ndim != 3 or rgb.shape[-1] != 3 or rgb.dtype != np.uint8 or not rgb.size:
             raise InputError(f"find: expected colours [H, W, 3] of uint8, got {list(rgb.shape)} of {rgb.dtype}")
         return find(self.network, rgb, **self.config.looking)

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import torch
 
-from quest.data.split import split_of
+from quest.data.split import part_of
 from quest.data.store import TakeStore
-from quest.errors import ConfigError, ObjectError, WeightsError
+from quest.errors import ConfigError, WeightsError
 from quest.model.encoder import Encoder
 from quest.train.feature_cache import FeatureCache
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler, WindowShape
 from quest.types import TakeInfo
+
+Role = Literal["train", "validation"]
+"""What a take does in training: it teaches, or it chooses."""
 
 UNSTATED = "pictures of unstated licence"
 """Source of weights that learned from such."""
@@ -83,9 +86,7 @@ def open_dataset(
 ) -> Dataset:
     """Select takes by the object split and prepare their features.
 
-    With ``validation_stores``, everything in ``stores`` that is not a validation or test object teaches, and
-    everything in ``validation_stores`` that is no test object chooses: so a user's own objects, which are in no split,
-    can be used, or new motions of the objects that teach. Without it, ``stores`` are divided by the committed split.
+    Which takes teach and which choose, :func:`has_role` says.
 
     Args:
         network: network with the encoder that the features come from.
@@ -100,19 +101,13 @@ def open_dataset(
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
     """
     wanted: list[_Wanted] = []
-    for folders, role in ((stores, "train"), (validation_stores, "validation")):
-        for folder in folders:
-            store = TakeStore(folder)
-            for name, info in store.infos().items():
-                part = part_of(info)
-                if not validation_stores:
-                    allowed = part if part in ("train", "validation") else None
-                elif role == "train":
-                    allowed = role if part in ("train", "unlisted") else None
-                else:
-                    allowed = role if part != "test" else None
-                if allowed is not None:
-                    wanted.append(_Wanted(store, name, allowed, info.source))
+    for role, folder in roles_of(stores, validation_stores):
+        store = TakeStore(folder)
+        wanted += [
+            _Wanted(store, name, role, info.source)
+            for name, info in store.infos().items()
+            if has_role(info, role, apart=bool(validation_stores))
+        ]
     takes = {part: [w.name for w in wanted if w.part == part] for part in ("train", "validation")}
     for part, found in takes.items():
         if not found:
@@ -136,6 +131,32 @@ def open_dataset(
         len(takes["train"]),
         frozenset(w.source for w in wanted if w.part == "train"),
     )
+
+
+def roles_of(
+    stores: Sequence[str | Path], validation_stores: Sequence[str | Path]
+) -> Iterator[tuple[Role, str | Path]]:
+    """What each store is opened for: one for both, where none is apart for choosing."""
+    for store in stores:
+        yield "train", store
+    for store in validation_stores or stores:
+        yield "validation", store
+
+
+def has_role(info: TakeInfo, role: Role, *, apart: bool) -> bool:
+    """Whether a take may teach or choose.
+
+    Where stores are apart, everything to teach with that is not a validation or test object teaches, and everything to
+    choose by that is no test object chooses: so a user's own objects, which are in no split, can be used, or new
+    motions of the objects that teach. Where they are not, the committed split divides them.
+
+    Args:
+        info: of the take.
+        role: what it is asked for.
+        apart: whether there are stores to choose by.
+    """
+    part = part_of(info)
+    return part == role or (apart and part in {"train": ("unlisted",), "validation": ("unlisted", "train")}[role])
 
 
 def licence_after(licence: str, sources: Collection[str]) -> str:
@@ -164,11 +185,3 @@ def load_initial_encoder(network: EncodingNetwork, path: Path) -> None:
     except SafetensorError as error:
         raise WeightsError(f"{path}: not a whole safetensors file ({error})") from error
     network.encoder.load_initial(state)
-
-
-def part_of(info: TakeInfo) -> str:
-    """The part of the split that an object is in; ``unlisted`` if it is in none."""
-    try:
-        return split_of(info)
-    except ObjectError:
-        return "unlisted"

@@ -10,7 +10,7 @@ from quest.data.boxed_pictures import may_choose, read_boxed_pictures
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.model.finder import FinderNetwork
-from quest.train.dataset import UNSTATED, part_of
+from quest.train.dataset import UNSTATED, has_role, roles_of
 from quest.train.finding.sampler import FinderSampler
 from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.finding.views import Source, ViewCache, of_pictures, of_takes
@@ -74,16 +74,12 @@ def open_finder_data(
             unstated |= part == "train" and any(w and not s for w, s in zip(wanted, stated, strict=True))
     simulated: dict[str, list[Source]] = {"train": [], "validation": []}
     takes, taught_by = 0, set[str]()
-    for folders, role in ((stores, "train"), (validation_stores or stores, "validation")):
-        for folder in folders:
-            store, names = TakeStore(folder), []
-            for name, info in store.infos().items():
-                part = part_of(info)
-                if part == role or (part == "unlisted" and validation_stores):
-                    names.append(name)
-                    if role == "train":
-                        takes, taught_by = takes + 1, taught_by | {info.source}
-            simulated[role] += of_takes(store, names, frames=frames)
+    for role, folder in roles_of(stores, validation_stores):
+        store = TakeStore(folder)
+        chosen = {n: i for n, i in store.infos().items() if has_role(i, role, apart=bool(validation_stores))}
+        if role == "train":
+            takes, taught_by = takes + len(chosen), taught_by | {info.source for info in chosen.values()}
+        simulated[role] += of_takes(store, list(chosen), frames=frames)
     for part, verb in (("train", "teach"), ("validation", "choose")):
         if not labelled[part] and not simulated[part]:
             raise ConfigError(f"training: no pictures and no takes are left to {verb}; give more of them")
