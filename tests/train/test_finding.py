@@ -21,7 +21,7 @@ from quest.train.finding.objective import StageFind, _focal, _giou
 from quest.train.finding.sampler import FinderSampler, FinderTruth, targets
 from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
 from quest.train.finding.takes import marks_of
-from quest.train.finding.views import ViewCache, draw_view, of_pictures, read_view
+from quest.train.finding.views import PictureCache, ViewCache, draw_view, of_pictures, read_view, read_whole
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
@@ -54,11 +54,12 @@ def test_marks_whose_point_is_cut_off_are_left_out() -> None:
     np.testing.assert_allclose(marks.box_px[0], [-95, 10, 105, 210])
 
 
-def test_edges_that_are_cut_off_are_not_learned() -> None:
-    whole, cut = (targets(make_marks().warped(np.ones(2), np.array([x, 0.0]), (256, 256)), 256) for x in (0.0, -30.0))
-    assert (whole["panel_weight"] > 0).any()
-    assert not (cut["panel_weight"] > 0).any()
-    assert cut["panel"].max() == 1
+def test_what_is_cut_off_ends_at_the_cut() -> None:
+    whole, cut = (targets(make_marks().warped(np.ones(2), np.array([x, 0.0]), (256, 256)), 256) for x in (0.0, -60.0))
+    for maps, left in ((whole, 20.0), (cut, 0.0)):
+        row, column = np.argwhere(maps["panel_weight"] > 0)[0]
+        assert (column + 0.5) * 16 - maps["panel_extent"][0, row, column] == pytest.approx(left)
+    assert cut["panel"][0, 110 // 16, 80 // 16] == 1  # the middle of what is seen of it, 0 to 160 pixels
 
 
 def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
@@ -183,7 +184,24 @@ def test_sets_of_pictures_keep_apart(tmp_path: Path) -> None:
     assert before not in opened().training.pictures  # other labels, other views
 
 
-def test_a_finder_learns_a_white_handle(tmp_path: Path) -> None:
+def test_pictures_are_kept_no_larger_than_a_view_shows_them(tmp_path: Path) -> None:
+    large, small = tmp_path / "large.png", tmp_path / "small.png"
+    Image.fromarray(np.zeros((1200, 2400, 3), np.uint8)).save(large)
+    Image.fromarray(np.zeros((60, 80, 3), np.uint8)).save(small)
+    pictures = [BoxedPicture(path, ("handle",), np.array([[20.0, 10, 40, 30]])) for path in (large, small)]
+    kept = [read_whole(PictureCache(tmp_path).build(s)) for s in of_pictures(pictures, only=[True, True])]
+    assert [rgb.shape for rgb, _ in kept] == [(600, 1200, 3), (60, 80, 3)]
+    np.testing.assert_allclose(kept[0][1].box_px, [[10, 5, 20, 15]])
+    np.testing.assert_allclose(kept[1][1].box_px, [[20, 10, 40, 30]])
+
+
+def test_a_network_has_only_so_many_blocks_to_learn() -> None:
+    with pytest.raises(ConfigError, match="blocks"):
+        StageFind(make_finder(), learned_blocks=13)
+
+
+@pytest.mark.parametrize("learned_blocks", [0, 2])
+def test_a_finder_learns_a_white_handle(tmp_path: Path, learned_blocks: int) -> None:
     torch.manual_seed(0)
     rng = np.random.default_rng(0)
     pictures = []
@@ -196,13 +214,23 @@ def test_a_finder_learns_a_white_handle(tmp_path: Path) -> None:
         Image.fromarray(rgb).save(path)
         pictures.append(BoxedPicture(path, ("handle",), np.array([[x, y, x + 90, y + 30]], float)))
     network = make_finder()
-    paths = list(ViewCache(tmp_path / "cache", network).build(of_pictures(pictures, only=[True, True]), views=2))
-    assert paths == list(
-        ViewCache(tmp_path / "cache", network).build(of_pictures(pictures, only=[True, True]), views=2)
+    sources = of_pictures(pictures, only=[True, True])
+    if learned_blocks:
+        paths = [PictureCache(tmp_path / "cache").build(source) for source in sources]
+    else:
+        views = ViewCache(tmp_path / "cache", network)
+        paths = [path for source in sources for path in views.build(source, views=2)]
+        assert paths == [path for source in sources for path in views.build(source, views=2)]
+    sampler = FinderSampler(paths, [], FinderSamplerConfig(batch=2, cut_px=320, learned_blocks=learned_blocks))
+    assert sampler.view(paths[0], seed=0).rgb.shape == (VIEW_PX, VIEW_PX, 3)
+    stage = StageFind(network, learned_blocks=learned_blocks)
+    transformer = [p for name, p in network.named_parameters() if name.startswith("encoder.")]
+    assert sum(p.numel() for p in stage.refined()) == learned_blocks * sum(
+        p.numel() for p in network.encoder.blocks[0].parameters()
     )
-    assert read_view(paths[0]).rgb.shape == (VIEW_PX, VIEW_PX, 3)
-    sampler = FinderSampler(paths, [], FinderSamplerConfig(batch=2, cut_px=320))
-    stage = StageFind(network)
+    before = [p.detach().clone() for p in transformer]
+    for p in network.parameters():
+        p.requires_grad_(any(p is other for other in stage.trained()))
     optimizer = torch.optim.AdamW(stage.trained(), lr=2e-3)
     first = last = 0.0
     network.train()
@@ -218,7 +246,9 @@ def test_a_finder_learns_a_white_handle(tmp_path: Path) -> None:
         value = float(total.detach())
         first, last = first or value, value
     assert last < 0.8 * first
+    moved = [not torch.equal(old, new) for old, new in zip(before, transformer, strict=True)]
+    assert sum(moved) == len(stage.refined())
     scores = stage.validate(sampler, batches=1, device=torch.device("cpu"))
-    assert scores.present == 2
+    assert scores.present == len(paths[:2]) if not learned_blocks else scores.present <= 2
     assert 0 <= scores.precision <= 1
     assert all(name in PANELS or name in PLACES for name in KINDS)

@@ -215,7 +215,7 @@ def test_what_is_set_anew_counts_when_a_run_goes_on(run: Run, monkeypatch: pytes
     run(replace(SHORT, steps=2))
     seen = []
     make = loop.make_optimizer
-    monkeypatch.setattr(loop, "make_optimizer", lambda *given: seen.append(make(*given)) or seen[-1])
+    monkeypatch.setattr(loop, "make_optimizer", lambda *given, **named: seen.append(make(*given, **named)) or seen[-1])
     run(replace(SHORT, steps=4, weight_decay=0.3))
     assert {group["weight_decay"] for group in seen[0].param_groups} == {0.3}
 

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from quest.errors import ConfigError
-from quest.train.optimizer import Muon, make_optimizer
+from quest.train.optimizer import SHARE, Muon, make_optimizer
 from quest.train.settings import TrainingConfig
 
 CONFIG = TrainingConfig(learning_rate=1e-2)
@@ -94,3 +94,12 @@ def test_a_state_that_is_loaded_goes_on() -> None:
 def test_another_optimizer_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"sgd|Literal"):
         replace(CONFIG, optimizer="sgd")
+
+
+def test_what_is_refined_learns_at_its_share_of_the_rate_by_adamw() -> None:
+    network = Small()
+    rest, slow = make_optimizer(
+        network, network.trained(), CONFIG, refined=list(network.inner.parameters())[:1]
+    ).param_groups
+    assert [id(p) for p in slow["params"]] == [id(network.inner.weight)]
+    assert (rest[SHARE], slow[SHARE]) == (1, CONFIG.refined_rate)

@@ -48,16 +48,16 @@ def test_a_batch_is_divided_evenly_or_not_at_all():
         divide(8, rank=0, processes=3, accumulate=2)
 
 
-def test_reading_ahead_changes_nothing(sampler: WindowSampler):
+@pytest.mark.parametrize("readers", [0, 2])
+def test_reading_ahead_changes_nothing(sampler: WindowSampler, readers: int):
     """Batches come in the generator's order, each with the state from which the next one is drawn."""
     rng, plain = np.random.default_rng(1), np.random.default_rng(1)
-    batches = stream_batches(sampler, rng, [slice(0, 6)])
+    batches = stream_batches(sampler, rng, [slice(0, 6)], readers=readers)
     for batch in islice(batches, 3):
         frames, truth = sampler.draw(plain)
         assert_same([batch.parts[0].frames], frames)
         assert_same([batch.parts[0].truth], truth)
         assert json.loads(batch.rng) == plain.bit_generator.state
-    batches.close()
 
 
 def test_what_goes_wrong_while_reading_ahead_comes_out(sampler: WindowSampler, monkeypatch: pytest.MonkeyPatch):
@@ -66,7 +66,7 @@ def test_what_goes_wrong_while_reading_ahead_comes_out(sampler: WindowSampler, m
 
     monkeypatch.setattr(sampler, "load", broken)
     with pytest.raises(FileNotFoundError):
-        next(stream_batches(sampler, np.random.default_rng(0), [slice(0, 6)]))
+        next(stream_batches(sampler, np.random.default_rng(0), [slice(0, 6)], readers=1))
 
 
 def test_the_truth_of_flow(sampler: WindowSampler):

@@ -92,7 +92,7 @@ class Train:
     finding: FinderSamplerConfig = field(default_factory=FinderSamplerConfig)
     """How cuts of stage find are drawn."""
     views: int = 4
-    """Stage find: views that are made of every picture."""
+    """Stage find: views that are made of every picture, where the transformer does not learn."""
     frames: int = 2
     """Stage find: frames that are taken of every view of a take."""
     losses: dict[str, float] = field(default_factory=dict)
@@ -212,7 +212,7 @@ class Train:
                 config=self.finding,
                 report=viewed,
             )
-            objective = StageFind(start.network, self.losses)
+            objective = StageFind(start.network, self.losses, learned_blocks=self.finding.learned_blocks)
             return _Taught(objective, found.training, found.validation, found.about, found.sources)
         from quest.paper.flow import StageTwo
         from quest.paper.objective import PaperStageOne

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -35,11 +36,24 @@ def read_picture(path: Path) -> UInt8[np.ndarray, "H W 3"]:
     Raises:
         InputError: it cannot be read.
     """
+    return decode_picture(path, f"picture {path}")
+
+
+def decode_picture(file: Path | BytesIO, where: str) -> UInt8[np.ndarray, "H W 3"]:
+    """Colours of an image file, upright.
+
+    Args:
+        file: its path, or the file itself.
+        where: its name in errors.
+
+    Raises:
+        InputError: it cannot be read.
+    """
     try:
-        with Image.open(path) as image:
-            return colours_of(upright(image), f"picture {path}")
+        with Image.open(file) as image:
+            return colours_of(upright(image), where)
     except OSError as error:  # what is no picture, too
-        raise InputError(f"picture {path}: cannot be read ({error}); copy it again") from error
+        raise InputError(f"{where}: cannot be read ({error}); copy it again") from error
 
 
 def colours_of(image: Image.Image, where: str) -> UInt8[np.ndarray, "H W 3"]:

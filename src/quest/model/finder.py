@@ -137,8 +137,7 @@ class FinderNetwork(nn.Module):
         patch = self.config.encoder.patch_size
         size = [max(1, round(CONTEXT_SHARE * side / patch)) * patch for side in rgb.shape[-2:]]
         small = F.interpolate(rgb, size, mode="bilinear", align_corners=False, antialias=True)
-        with torch.no_grad():
-            return self.encoder.depths(small, CONTEXT_BLOCKS)
+        return self.encoder.depths(small, CONTEXT_BLOCKS)
 
     def forward(self, rgb: Float[Tensor, "B 3 H W"], *, context: Float[Tensor, "B E r c"] | None = None) -> FinderMaps:
         """The maps.

@@ -76,6 +76,10 @@ class StageTwo:
         assert self.network.flow is not None
         return list(self.network.flow.parameters())
 
+    def refined(self) -> list[nn.Parameter]:
+        """None: the encoder stays as it is."""
+        return []
+
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
         """L1 of the displacement; what rests counts like what moves, or it would be said to move a little."""
         answers, flow = self._answer(frames, truth)

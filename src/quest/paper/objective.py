@@ -194,6 +194,10 @@ class PaperStageOne:
         """All parameters outside the encoder and the flow head."""
         return self.network.trainable()
 
+    def refined(self) -> list[nn.Parameter]:
+        """None: the encoder stays as it is."""
+        return []
+
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
         """Every loss, unweighted."""
         answered = roll_out(self.network, frames, truth, whole=True, order=self._order)

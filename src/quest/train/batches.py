@@ -1,15 +1,15 @@
-"""Batches in the order of a generator, the next one read while the present one is learned from."""
+"""Batches in the order of a generator, the next ones read by other processes while the present one is learned from."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from torch.utils.data import DataLoader, Dataset
 
 
 @runtime_checkable
@@ -82,22 +82,47 @@ class Batch:
     """State of the generator after this batch was drawn and before the next one was, as JSON."""
 
 
-def stream_batches(sampler: Sampler, rng: np.random.Generator, parts: Sequence[slice]) -> Generator[Batch, None, None]:
-    """Batches without end; close it to end the reading.
+class _Reading(Dataset[Batch | Exception]):
+    """What becomes of the plans of batches in the process that reads."""
+
+    def __init__(self, sampler: Sampler, parts: Sequence[slice]) -> None:
+        self._sampler = sampler
+        self._parts = parts
+
+    def __getitem__(self, planned: tuple[Plan, str]) -> Batch | Exception:  # type: ignore[override]
+        plan, state = planned
+        try:
+            return Batch(tuple(MicroBatch(*self._sampler.load(plan.part(rows))) for rows in self._parts), state)
+        except Exception as error:
+            return error
+
+
+def stream_batches(
+    sampler: Sampler, rng: np.random.Generator, parts: Sequence[slice], *, readers: int
+) -> Iterator[Batch]:
+    """Batches without end.
 
     Args:
         sampler: where they come from.
         rng: generator that decides what is in them; every process has the same.
         parts: examples of a batch that each micro-batch of this process takes.
+        readers: processes that read ahead; 0: none, a batch is read when it is asked for.
     """
 
-    def read(plan: Plan) -> tuple[MicroBatch, ...]:
-        return tuple(MicroBatch(*sampler.load(plan.part(rows))) for rows in parts)
-
-    # One thread: the order of reading does not matter for what is read, but memory does.
-    with ThreadPoolExecutor(1, thread_name_prefix="batches") as reader:
-        ahead = reader.submit(read, sampler.plan(rng))
+    def plans() -> Iterator[tuple[Plan, str]]:
         while True:
-            state = json.dumps(rng.bit_generator.state)
-            present, ahead = ahead, reader.submit(read, sampler.plan(rng))
-            yield Batch(present.result(), state)
+            plan = sampler.plan(rng)
+            yield plan, json.dumps(rng.bit_generator.state)
+
+    loader = DataLoader(
+        _Reading(sampler, parts),
+        batch_size=None,
+        sampler=plans(),
+        num_workers=readers,
+        collate_fn=lambda batch: batch,
+        generator=torch.Generator(),  # of its own: the one that all share is the network's
+    )
+    for batch in loader:
+        if isinstance(batch, Exception):
+            raise batch
+        yield batch

@@ -37,6 +37,8 @@ def launch(config: TrainingConfig) -> Fabric:
     if config.deterministic:
         # cuBLAS reads it when a process first uses it: https://docs.nvidia.com/cuda/cublas/#results-reproducibility
         os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    else:
+        torch.backends.cudnn.benchmark = True  # batches of one size: it pays to look for the quickest way once
     nodes, devices = _processes(config)
     strategy = "auto"
     if nodes * devices > 1:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ from quest.train.devices import (
     restore_generators,
 )
 from quest.train.losses import weighted_sum
-from quest.train.optimizer import RunningMean, make_optimizer
+from quest.train.optimizer import SHARE, RunningMean, make_optimizer
 from quest.train.pooling import Tally, pooling
 from quest.train.settings import TrainingConfig
 from quest.train.stage import Objective, Scores
@@ -96,7 +96,8 @@ def fit(
         rng = np.random.default_rng(config.seed)
         progress = learner.resume(rng, out)
         writer = _writer(fabric, out, progress)
-        with writer or nullcontext(), closing(stream_batches(training, rng, parts)) as batches:
+        batches = stream_batches(training, rng, parts, readers=config.readers)
+        with writer or nullcontext():
             while progress.step < config.steps and progress.stale < config.patience:
                 step = progress.step + 1
                 batch = next(batches)
@@ -145,7 +146,7 @@ class _Learner:
         chosen = {id(p) for p in self.trained}
         for parameter in objective.network.parameters():
             parameter.requires_grad_(id(parameter) in chosen)
-        self.optimizer = make_optimizer(objective.network, self.trained, config)
+        self.optimizer = make_optimizer(objective.network, self.trained, config, refined=objective.refined())
         self.mean = RunningMean(self.trained, self.optimizer, config.average_decay)
 
     def resume(self, rng: np.random.Generator, out: Path) -> Progress:
@@ -181,7 +182,7 @@ class _Learner:
             The loss of the whole batch, then its terms, on the CPU.
         """
         for group in self.optimizer.param_groups:
-            group["lr"] = self.config.learning_rate * _schedule(step, self.config)
+            group["lr"] = self.config.learning_rate * group[SHARE] * _schedule(step, self.config)
             group["weight_decay"] = self.config.weight_decay
         self.optimizer.zero_grad(set_to_none=True)
         fabric, parts = self.fabric, [part.to(self.fabric.device) for part in batch.parts]

@@ -26,23 +26,34 @@ _INNER = 64
 """A matrix whose smaller side is below this maps to or from a handful of numbers, and is no inner one."""
 
 
+SHARE = "share"
+"""Key of a group's learning rate as a share of the whole one."""
+
+
 def make_optimizer(
-    network: nn.Module, trained: Sequence[nn.Parameter], config: TrainingConfig
+    network: nn.Module, trained: Sequence[nn.Parameter], config: TrainingConfig, *, refined: Sequence[nn.Parameter] = ()
 ) -> torch.optim.Optimizer:
     """The optimiser of a run.
 
     Args:
         network: what the parameters are of.
         trained: its parameters that are trained.
-        config: which optimiser, learning rate and weight decay.
+        config: which optimiser, learning rates and weight decay.
+        refined: those of the trained ones that learn at the smaller rate, by AdamW.
     """
     lr, decay = config.learning_rate, config.weight_decay
-    inner = _inner(network, trained) if config.optimizer == "muon" else []
-    chosen = {id(p) for p in inner}
-    adamw = torch.optim.AdamW([p for p in trained if id(p) not in chosen], lr=lr, weight_decay=decay)
+    slow = {id(p) for p in refined}
+    inner = [p for p in _inner(network, trained) if id(p) not in slow] if config.optimizer == "muon" else []
+    chosen = slow | {id(p) for p in inner}
+    groups: list[dict[str, Any]] = [{"params": [p for p in trained if id(p) not in chosen], SHARE: 1.0}]
+    if refined:
+        groups.append({"params": list(refined), SHARE: config.refined_rate})
+    adamw = torch.optim.AdamW(groups, lr=lr, weight_decay=decay)
     if not inner:
         return adamw
-    return _Both(adamw, Muon(inner, lr=lr, weight_decay=decay))
+    muon = Muon(inner, lr=lr, weight_decay=decay)
+    muon.param_groups[0][SHARE] = 1.0
+    return _Both(adamw, muon)
 
 
 def _inner(network: nn.Module, trained: Sequence[nn.Parameter]) -> list[nn.Parameter]:
@@ -96,7 +107,7 @@ class _Both(torch.optim.Optimizer):
 
     def __init__(self, first: torch.optim.Optimizer, second: torch.optim.Optimizer) -> None:
         super().__init__([*first.param_groups, *second.param_groups], {})
-        self._parts = (first, second)
+        self._parts = [part for part in (first, second) for _ in part.param_groups]
 
     def step(self, closure: None = None) -> None:  # type: ignore[override]
         """One step of both."""

@@ -37,6 +37,10 @@ class Objective(Protocol):
         """What is trained; every batch must give each of them a gradient."""
         ...
 
+    def refined(self) -> list[nn.Parameter]:
+        """Which of them were trained before on much more than is learned here, and learn at a smaller rate."""
+        ...
+
     def losses(self, frames: Any, truth: Any, /) -> dict[str, Float[Tensor, ""]]:
         """Every loss of ``weights`` on a batch, unweighted.
 

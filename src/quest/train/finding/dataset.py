@@ -13,7 +13,7 @@ from quest.model.finder import FinderNetwork
 from quest.train.dataset import UNSTATED, has_role, roles_of
 from quest.train.finding.sampler import FinderSampler
 from quest.train.finding.settings import FinderSamplerConfig
-from quest.train.finding.views import Source, ViewCache, of_pictures, of_takes
+from quest.train.finding.views import PictureCache, Source, ViewCache, of_pictures, of_takes
 
 _UNKNOWN = ("", "unknown")
 
@@ -45,7 +45,7 @@ def open_finder_data(
     config: FinderSamplerConfig,
     report: Callable[[int, int], None],
 ) -> FinderData:
-    """Divide pictures and takes, and make their views.
+    """Divide pictures and takes, and make their views or, where the transformer learns, copy them.
 
     Args:
         network: whose transformer looks.
@@ -83,7 +83,7 @@ def open_finder_data(
     for part, verb in (("train", "teach"), ("validation", "choose")):
         if not labelled[part] and not simulated[part]:
             raise ConfigError(f"training: no pictures and no takes are left to {verb}; give more of them")
-    known = ViewCache(cache, network)
+    known, whole = ViewCache(cache, network), PictureCache(cache)
     total, done = sum(len(s) for sources in (labelled, simulated) for s in sources.values()), 0
     paths: dict[tuple[str, str], list[Path]] = {}
     for kind, sources in (("pictures", labelled), ("takes", simulated)):
@@ -91,7 +91,9 @@ def open_finder_data(
             count = views if (kind, part) == ("pictures", "train") else 1
             paths[kind, part] = []
             for source in own:
-                paths[kind, part] += known.build([source], views=count)
+                paths[kind, part] += (
+                    [whole.build(source)] if config.learned_blocks else known.build(source, views=count)
+                )
                 done += 1
                 report(done, total)
     return FinderData(

@@ -16,19 +16,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from quest.data.boxed_pictures import in_boxes
-from quest.model.finder import PLACES, FinderNetwork
+from quest.errors import ConfigError
+from quest.model.finder import CONTEXT_BLOCKS, PLACES, FinderNetwork
 from quest.model.found import read_off
 from quest.train.finding.marks import UNKNOWN
 from quest.train.finding.sampler import FinderInputs, FinderSampler, FinderTruth, whole_view
 from quest.train.finding.settings import VIEW_PX
-from quest.train.finding.views import read_view
 from quest.train.losses import changed, masked_mean
 from quest.train.pooling import pooled
 
 WEIGHTS = {"place": 1.0, "panel": 0.5, "extent": 1.0, "panel_extent": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1}
 """How much every loss counts."""
-_FROZEN = ("encoder.", "detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
-"""What stays as it was: edges and textures, which ImageNet has taught, and which cost most of a step."""
+_FIRST = ("detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
+"""What stays as it was if the transformer does: edges and textures, which ImageNet has taught, and which cost most of a
+step."""
 
 
 @dataclass(frozen=True)
@@ -52,26 +53,42 @@ class FinderScores:
 
 
 class StageFind:
-    """The finder without its transformer.
+    """The finder, with or without its transformer.
 
     Args:
         network: the finder.
         changes: weights of losses that are to differ; 0 turns one off.
+        learned_blocks: last blocks of the transformer that learn too.
+
+    Raises:
+        ConfigError: the transformer has fewer blocks.
     """
 
     name = "stage-find"
 
-    def __init__(self, network: FinderNetwork, changes: Mapping[str, float] | None = None) -> None:
+    def __init__(
+        self, network: FinderNetwork, changes: Mapping[str, float] | None = None, *, learned_blocks: int = 0
+    ) -> None:
         self.network = network
         self.weights = changed(WEIGHTS, changes or {})
+        read = network.encoder.blocks[: CONTEXT_BLOCKS[-1] + 1]
+        if learned_blocks > len(read):
+            raise ConfigError(f"finding: the transformer has {len(read)} blocks, fewer than {learned_blocks}")
+        self._blocks = read[len(read) - learned_blocks :]
 
     def trained(self) -> list[nn.Parameter]:
-        """All parameters but those of the transformer and of the first stages of EfficientNet."""
-        return [p for name, p in self.network.named_parameters() if not name.startswith(_FROZEN)]
+        """The transformer's last blocks and all outside of it, or all but the first stages of EfficientNet."""
+        frozen = ("encoder.", *(() if len(self._blocks) else _FIRST))
+        outside = [p for name, p in self.network.named_parameters() if not name.startswith(frozen)]
+        return outside + self.refined()
+
+    def refined(self) -> list[nn.Parameter]:
+        """The transformer's last blocks."""
+        return list(self._blocks.parameters())
 
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
         """Every loss, unweighted."""
-        maps = self.network(frames.rgb, context=frames.context)
+        maps = self.network(frames.rgb.float() / 255, context=frames.context)
         places = len(PLACES)
         return {
             "place": _focal(maps.place, truth.place, truth.place_share, truth.known[:, :places]),
@@ -93,9 +110,9 @@ class StageFind:
         present = 0
         with torch.inference_mode():
             for i in np.linspace(0, len(paths) - 1, count).astype(int):
-                view = read_view(paths[i])
+                view = sampler.view(paths[i], seed=int(i))
                 seen = whole_view(view).to(device)
-                maps = self.network(seen.rgb, context=seen.context)
+                maps = self.network(seen.rgb.float() / 255, context=seen.context)
                 found = read_off(maps, scale=np.ones(2), size=(VIEW_PX, VIEW_PX))
                 found = found.select(~np.isnan(found.box_px[:, 0]))
                 box = view.marks.box_px[view.marks.kind == PLACES.index("grip")]

@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Int8, UInt8
 from torch import Tensor
 
 from quest.errors import ConfigError
 from quest.model.finder import COARSE_PX, FINE_PX, PANELS, PLACES
 from quest.train.finding.marks import UNKNOWN, Marks
 from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
-from quest.train.finding.views import View, read_view
+from quest.train.finding.views import View, draw_view, read_view, read_whole
 
 _CONTEXT_PX = 16
 """Side of what one token of a cut stands for, pixels."""
@@ -35,14 +35,14 @@ _ZOOM = (0.67, 1.5)
 class FinderInputs:
     """What the network sees."""
 
-    rgb: Float[Tensor, "B 3 S S"]
-    """Colours from 0 to 1."""
-    context: Float[Tensor, "B E r c"]
-    """What the transformer sees."""
+    rgb: UInt8[Tensor, "B 3 S S"]
+    """Colours."""
+    context: Float[Tensor, "B E r c"] | None
+    """What the transformer sees; None where it learns."""
 
     def to(self, device: torch.device) -> FinderInputs:
         """The same on a device."""
-        return FinderInputs(**{f.name: getattr(self, f.name).to(device) for f in fields(self)})
+        return FinderInputs(self.rgb.to(device), None if self.context is None else self.context.to(device))
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class FinderTruth:
     extent: Float[Tensor, "B 4 h w"]
     """Pixels to the edges of the grip that a cell belongs to."""
     weight: Float[Tensor, "B h w"]
-    """What each cell counts of a grip whose edges are all seen."""
+    """What each cell counts of a grip."""
     panel_extent: Float[Tensor, "B 4 H W"]
     """The same of panels."""
     panel_weight: Float[Tensor, "B H W"]
     """The same of panels."""
-    knob: Int[Tensor, "B h w"]
+    knob: Int8[Tensor, "B h w"]
     """Of cells in which a grip is, -1 where not known."""
-    lift: Int[Tensor, "B h w"]
+    lift: Int8[Tensor, "B h w"]
     """Of cells in which a place is, -1 where not known."""
     opening: Int[Tensor, "B H W"]
     """Of cells that belong to a panel, -1 where not known."""
@@ -106,8 +106,8 @@ class FinderSampler:
     """Draws batches of cuts.
 
     Args:
-        pictures: views of labelled pictures.
-        takes: views of simulated frames.
+        pictures: files of labelled pictures: their views or, where the transformer learns, they themselves.
+        takes: the same of simulated frames.
         config: how they are drawn.
 
     Raises:
@@ -130,25 +130,32 @@ class FinderSampler:
             cuts.append(_Cut(path, int(rng.integers(2**31)), bool(rng.random() < config.aimed_share)))
         return FinderPlan(tuple(cuts), config.cut_px)
 
+    def view(self, path: Path, *, seed: int) -> View:
+        """The view that is kept in a file, or another one for every seed of the picture that is kept there."""
+        if not self.config.learned_blocks:
+            return read_view(path)
+        return View(*draw_view(*read_whole(path), np.random.default_rng(seed)))
+
     def load(self, plan: FinderPlan) -> tuple[FinderInputs, FinderTruth]:
         """Read what a plan, or a part of one, names."""
         size = plan.size_px
-        seen = [_see(read_view(cut.path), cut, size) for cut in plan.cuts]
+        seen = [_see(self.view(cut.path, seed=cut.seed), cut, size) for cut in plan.cuts]
         rgb, context, marks = zip(*seen, strict=True)
         maps = [targets(each, size) for each in marks]
         truth = {name: torch.from_numpy(np.stack([m[name] for m in maps])) for name in maps[0]}
-        return FinderInputs(torch.stack(rgb), torch.stack(context)), FinderTruth(**truth)
+        inputs = FinderInputs(torch.stack(rgb), None if context[0] is None else torch.stack(context))
+        return inputs, FinderTruth(**truth)
 
 
 def whole_view(view: View) -> FinderInputs:
     """A view as the network sees it, uncut (B = 1)."""
-    rgb = torch.from_numpy(view.rgb).permute(2, 0, 1).float() / 255
-    return FinderInputs(rgb[None], torch.from_numpy(view.context).float()[None])
+    rgb = torch.from_numpy(view.rgb).permute(2, 0, 1)
+    return FinderInputs(rgb[None], None if view.context is None else torch.from_numpy(view.context).float()[None])
 
 
-def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor, Marks]:
+def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor | None, Marks]:
     """A part of a view at another scale, perhaps mirrored, in other colours."""
-    rng = np.random.default_rng(cut.seed)
+    rng = np.random.default_rng((cut.seed, 1))
     side = min(round(size / np.exp(rng.uniform(*np.log(_ZOOM)))), VIEW_PX)
     corner, mirrored = _corner(view.marks, rng, side, aimed=cut.aimed), bool(rng.random() < 0.5)
     own = view.rgb[corner[1] : corner[1] + side, corner[0] : corner[0] + side]
@@ -164,8 +171,9 @@ def _see(view: View, cut: _Cut, size: int) -> tuple[Tensor, Tensor, Marks]:
     if mirrored:
         scale[0], shift[0] = -scale[0], size - shift[0]
     marks = view.marks.warped(scale, shift, (size, size))
-    image = torch.from_numpy(np.ascontiguousarray(rgb.clip(0, 1))).permute(2, 0, 1)
-    return image, _context(view, corner, side, size, mirrored=mirrored), marks
+    image = torch.from_numpy((255 * rgb.clip(0, 1)).round().astype(np.uint8)).permute(2, 0, 1)
+    tokens = None if view.context is None else _context(view.context, corner, side, size, mirrored=mirrored)
+    return image, tokens, marks
 
 
 def _corner(marks: Marks, rng: np.random.Generator, side: int, *, aimed: bool) -> Int[np.ndarray, "2"]:
@@ -179,16 +187,16 @@ def _corner(marks: Marks, rng: np.random.Generator, side: int, *, aimed: bool) -
 
 
 def _context(
-    view: View, corner: Int[np.ndarray, "2"], side: int, size: int, *, mirrored: bool
+    context: np.ndarray, corner: Int[np.ndarray, "2"], side: int, size: int, *, mirrored: bool
 ) -> Float[Tensor, "E r c"]:
     """What the transformer sees in a cut: tokens of the view, interpolated."""
-    tokens = view.context.shape[-1]
+    tokens = context.shape[-1]
     # In tokens, as an index of the first one and a place after it.
     step = (np.arange(size // _CONTEXT_PX) + 0.5) * _CONTEXT_PX / size
     place = (corner[:, None] + step * side) * tokens / VIEW_PX - 0.5
     low = np.clip(np.floor(place[:, 0]).astype(int), 0, tokens - 1)
     high = np.clip(np.ceil(place[:, -1]).astype(int), 0, tokens - 1) + 1
-    seen = torch.from_numpy(view.context[:, low[1] : high[1], low[0] : high[0]]).float()
+    seen = torch.from_numpy(context[:, low[1] : high[1], low[0] : high[0]]).float()
     x, y = ((2 * (place[i] - low[i]) + 1) / (high[i] - low[i]) - 1 for i in (0, 1))
     axes = [torch.from_numpy(axis.copy()).float() for axis in (x[::-1] if mirrored else x, y)]
     grid = torch.stack(torch.meshgrid(*axes, indexing="xy"), dim=-1)
@@ -202,17 +210,18 @@ def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
     panel, panel_share = np.zeros((2, len(PANELS), coarse, coarse), np.float32)
     extents = {FINE_PX: np.ones((4, fine, fine), np.float32), COARSE_PX: np.ones((4, coarse, coarse), np.float32)}
     weights = {FINE_PX: np.zeros((fine, fine), np.float32), COARSE_PX: np.zeros((coarse, coarse), np.float32)}
-    knob, lift = (np.full((fine, fine), UNKNOWN) for _ in range(2))
+    knob, lift = (np.full((fine, fine), UNKNOWN, np.int8) for _ in range(2))
     opening = np.full((coarse, coarse), UNKNOWN)
     # Larger panels first, so that of two that overlap the smaller one is learned.
     area = (marks.box_px[:, 2:] - marks.box_px[:, :2]).prod(axis=1)
     for i in np.argsort(-area, kind="stable"):
-        kind, box = int(marks.kind[i]), marks.box_px[i]
+        kind, box = int(marks.kind[i]), marks.box_px[i].clip(0, size)  # as people draw what is cut off
         on_panel = kind >= len(PLACES)
         stride = COARSE_PX if on_panel else FINE_PX
         maps, shares = (panel, panel_share) if on_panel else (place, place_share)
         index, cells = kind - len(PLACES) if on_panel else kind, maps.shape[-1]
-        middle = np.clip(np.round(marks.point_px[i] / stride - 0.5), 0, cells - 1)
+        point = (box[:2] + box[2:]) / 2 if on_panel else marks.point_px[i]
+        middle = np.clip(np.round(point / stride - 0.5), 0, cells - 1)
         spread = np.maximum((box[2:] - box[:2]) / stride / _SPREAD, _LEAST_CELLS)
         step = np.arange(cells)
         across, down = (np.exp(-np.square(step - middle[k]) / (2 * spread[k] ** 2)) for k in (0, 1))
@@ -228,8 +237,7 @@ def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
             centre = (step + 0.5) * stride
             edges = np.stack(np.broadcast_arrays(centre - box[0], (centre - box[1])[:, None], box[2] - centre,
                                                  (box[3] - centre)[:, None]))  # fmt: skip
-            whole = (box[:2] > 0).all() and (box[2:] < size).all()  # edges out of sight cannot be learned
-            own = own & (edges > 0).all(axis=0) & whole
+            own = own & (edges > 0).all(axis=0)
             extents[stride][:, own], weights[stride][own] = edges[:, own], shares[index][own]
             if not on_panel:
                 knob[own] = marks.knob[i]

@@ -1,7 +1,9 @@
-"""Views: what the finder learns from, a square each, with what the frozen transformer sees in it, kept in a folder.
+"""Views: what the finder learns from, a square each.
 
-A view is a picture scaled, mirrored, cut and degraded at random. Views are made once, because the transformer takes
-most of the time; what else is random comes when a view is drawn (:mod:`quest.train.finding.sampler`).
+A view is a picture scaled, mirrored, cut and degraded at random. Where the transformer stays as it is, some views of
+every picture are kept in a folder with what it sees in them, because that takes most of the time. Where it learns,
+pictures are kept, and a view is drawn whenever one is learned from. What else is random comes after that
+(:mod:`quest.train.finding.sampler`).
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import hashlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields
 from functools import lru_cache
+from io import BytesIO
 from pathlib import Path
 from zipfile import BadZipFile
 
@@ -19,7 +22,7 @@ import torch
 from jaxtyping import UInt8
 
 from quest.data.boxed_pictures import CLASSES, BoxedPicture, kind_of
-from quest.data.pictures import read_picture
+from quest.data.pictures import decode_picture
 from quest.data.provenance import file_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
@@ -34,7 +37,7 @@ from quest.whole_file import whole_file
 _LONGER_PX = (450.0, 1200.0)
 """Longer side of the scaled picture."""
 _ASPECT = 1.1
-_VERSION = 2
+_VERSION = 3
 """Of how views are made; another one makes all of them again."""
 
 
@@ -44,8 +47,10 @@ class Source:
 
     name: str
     """Digest of its picture and marks: what changed has other views."""
-    read: Callable[[], tuple[UInt8[np.ndarray, "H W 3"], Marks]]
-    """Colours and marks."""
+    where: str
+    """What people call it."""
+    read: Callable[[], tuple[bytes, Marks]]
+    """Contents of an image file, and marks."""
 
 
 def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> list[Source]:
@@ -71,8 +76,8 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
     labelled = np.isin(KINDS, [kind for kind, _ in known.values()])
     tells_knobs = any(knob for _, knob in known.values())
 
-    def reader(picture: BoxedPicture) -> Callable[[], tuple[np.ndarray, Marks]]:
-        def read() -> tuple[np.ndarray, Marks]:
+    def reader(picture: BoxedPicture) -> Callable[[], tuple[bytes, Marks]]:
+        def read() -> tuple[bytes, Marks]:
             rows = [i for i, name in enumerate(picture.names) if name in known]
             kind = np.array([KINDS.index(known[picture.names[i]][0]) for i in rows], np.int64)
             told = [known[picture.names[i]][1] if tells_knobs else None for i in rows]
@@ -82,13 +87,17 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
             lift = np.where(kind < len(PLACES), 0, UNKNOWN)
             box = picture.box_px[rows]
             middle = (box[:, :2] + box[:, 2:]) / 2
-            return read_picture(picture.path), Marks(kind, box, middle, knob, lift, unknown, known=labelled)
+            return picture.path.read_bytes(), Marks(kind, box, middle, knob, lift, unknown, known=labelled)
 
         return read
 
     told = repr(sorted(known.items()))
     return [
-        Source(_digest(file_hash(picture.path), picture.names, picture.box_px.tolist(), told), reader(picture))
+        Source(
+            _digest(file_hash(picture.path), picture.names, picture.box_px.tolist(), told),
+            str(picture.path),
+            reader(picture),
+        )
         for picture, wanted in zip(pictures, only, strict=True)
         if wanted
     ]
@@ -114,13 +123,11 @@ def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Sou
         for v in range(len(header.cameras)):
             for t in picked:
 
-                def read(
-                    name: str = name, until: int = picked[-1] + 1, v: int = v, t: int = t
-                ) -> tuple[np.ndarray, Marks]:
+                def read(name: str = name, until: int = picked[-1] + 1, v: int = v, t: int = t) -> tuple[bytes, Marks]:
                     take = taken(name, until)
-                    return take.views[v].clip.rgb[t], marks_of(take, take.views[v], t)
+                    return _encoded(take.views[v].clip.rgb[t]), marks_of(take, take.views[v], t)
 
-                sources.append(Source(_digest(header.data_hash, v, t), read))
+                sources.append(Source(_digest(header.data_hash, v, t), f"{t} of {name}", read))
     return sources
 
 
@@ -130,10 +137,10 @@ class View:
 
     rgb: UInt8[np.ndarray, "S S 3"]
     """Colours."""
-    context: np.ndarray
-    """What the transformer sees in it, float16 [E, r, c]."""
     marks: Marks
     """What is labelled in it."""
+    context: np.ndarray | None = None
+    """What the transformer sees in it, float16 [E, r, c]; None where it learns."""
 
 
 class ViewCache:
@@ -148,30 +155,60 @@ class ViewCache:
         self._network = network
         self._folder = folder / weights_digest(network.encoder)[:16]
 
-    def path(self, source: Source, number: int) -> Path:
-        """Where a view of a source is kept."""
-        return self._folder / f"{source.name}-{number}.npz"
+    def build(self, source: Source, *, views: int) -> Iterator[Path]:
+        """Files of the views of a source, one after the other as they are there."""
+        paths = [self._folder / f"{source.name}-{number}.npz" for number in range(views)]
+        picture = None
+        for number, path in enumerate(paths):
+            if not path.is_file():
+                if picture is None:
+                    contents, marks = source.read()
+                    picture = _decoded(contents, source), marks
+                rgb, moved = draw_view(*picture, np.random.default_rng([int(source.name, 16), number]))
+                _write(path, moved, rgb=rgb, context=self._look(rgb))
+            yield path
 
-    def build(self, sources: Sequence[Source], *, views: int) -> Iterator[Path]:
-        """Files of the views of sources, one after the other as they are there."""
-        for source in sources:
-            missing = [n for n in range(views) if not self.path(source, n).is_file()]
-            picture = source.read() if missing else None
-            for number in range(views):
-                path = self.path(source, number)
-                if picture is not None and number in missing:
-                    rng = np.random.default_rng([int(source.name, 16), number])
-                    _write(path, self._look(*draw_view(*picture, rng)))
-                yield path
-
-    def _look(self, rgb: np.ndarray, marks: Marks) -> View:
+    def _look(self, rgb: UInt8[np.ndarray, "S S 3"]) -> np.ndarray:
         image = torch.from_numpy(rgb).permute(2, 0, 1)[None].to(next(self._network.parameters()).device) / 255
-        context = self._network.context_of(image)[0].half().cpu().numpy()
-        return View(rgb, context, marks)
+        return self._network.context_of(image)[0].half().cpu().numpy()
+
+
+class PictureCache:
+    """A folder of pictures and their marks, no larger than a view can show them; what is there is not made again.
+
+    Args:
+        folder: where; one below it.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "pictures"
+
+    def build(self, source: Source) -> Path:
+        """The file of a source."""
+        path = self._folder / f"{source.name}.npz"
+        if not path.is_file():
+            contents, marks = source.read()
+            rgb = _decoded(contents, source)
+            size = np.array([rgb.shape[1], rgb.shape[0]])
+            smaller = np.maximum(1, np.round(size * _LONGER_PX[1] / size.max()).astype(int))
+            if (smaller < size).any():
+                contents = _encoded(cv2.resize(rgb, tuple(smaller.tolist()), interpolation=cv2.INTER_AREA))
+                marks = marks.warped(smaller / size, np.zeros(2), (int(smaller[0]), int(smaller[1])))
+            _write(path, marks, image=np.frombuffer(contents, np.uint8))
+        return path
 
 
 def _digest(*parts: object) -> str:
     return hashlib.sha256(repr((_VERSION, *parts)).encode()).hexdigest()[:20]
+
+
+def _decoded(contents: bytes, source: Source) -> UInt8[np.ndarray, "H W 3"]:
+    return decode_picture(BytesIO(contents), f"picture {source.where}")
+
+
+def _encoded(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
+    """A JPEG file, by eye the same; views are compressed anew, and more, half of the time."""
+    return cv2.imencode(".jpg", rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
 
 
 def read_view(path: Path) -> View:
@@ -180,18 +217,31 @@ def read_view(path: Path) -> View:
     Raises:
         ConfigError: the file is torn.
     """
+    arrays, marks = _read(path, "rgb", "context")
+    return View(arrays["rgb"], marks, arrays["context"])
+
+
+def read_whole(path: Path) -> tuple[UInt8[np.ndarray, "H W 3"], Marks]:
+    """A picture of a cache.
+
+    Raises:
+        ConfigError: the file is torn.
+    """
+    arrays, marks = _read(path, "image")
+    return decode_picture(BytesIO(arrays["image"].tobytes()), str(path)), marks
+
+
+def _read(path: Path, *names: str) -> tuple[dict[str, np.ndarray], Marks]:
     try:
         with np.load(path, allow_pickle=False) as file:
-            marks = Marks(**{f.name: file[f.name] for f in fields(Marks)})
-            return View(file["rgb"], file["context"], marks)
+            return {name: file[name] for name in names}, Marks(**{f.name: file[f.name] for f in fields(Marks)})
     except (OSError, ValueError, KeyError, BadZipFile) as error:
-        raise ConfigError(f"{path}: a torn view ({error}); delete it, it is made again") from error
+        raise ConfigError(f"{path}: torn ({error}); delete it, it is made again") from error
 
 
-def _write(path: Path, view: View) -> None:
-    arrays = {"rgb": view.rgb, "context": view.context, **{f.name: getattr(view.marks, f.name) for f in fields(Marks)}}
+def _write(path: Path, marks: Marks, **arrays: np.ndarray) -> None:
     with whole_file(path) as unfinished:
-        np.savez(unfinished, **arrays)
+        np.savez(unfinished, **arrays, **{f.name: getattr(marks, f.name) for f in fields(Marks)})
 
 
 def draw_view(
