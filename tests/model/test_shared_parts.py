@@ -56,7 +56,7 @@ def test_the_other_file_is_looked_for_beside_it_then_among_what_ships(
     whole, shares = pair
     (tmp_path / "elsewhere").mkdir()
     moved = Path(shutil.move(shares, tmp_path / "elsewhere"))
-    with pytest.raises(WeightsError, match=r"shares encoder with whole\.safetensors"):
+    with pytest.raises(WeightsError, match=r"shares encoder, .* with whole\.safetensors"):
         load_network(moved)
     monkeypatch.setattr(weights, "shipped_weights", lambda: {"whole": whole})
     assert load_network(moved).about == "shares"
@@ -105,3 +105,18 @@ def test_what_was_written_before_stays_when_nothing_can_be_shared(pair: tuple[Pa
     assert shares.read_bytes() == before
     read, made = (network.state_dict() for network in (load_network(whole).network, make_finder()))
     assert torch.equal(read["lateral.0.weight"], made["lateral.0.weight"].half().float())
+
+
+def test_blocks_are_shared_one_by_one(pair: tuple[Path, Path], tmp_path: Path):
+    """Of an encoder whose last blocks were trained further the first ones are left out."""
+    whole, _ = pair
+    refined = another()
+    with torch.no_grad():
+        next(refined.encoder.blocks[-1].parameters()).add_(1)
+    save_network(tmp_path / "refined.safetensors", refined, settings="{}", about="", beside=whole)
+    last = f"encoder.blocks.{len(refined.encoder.blocks) - 1}."
+    kept = [name for name in load_file(tmp_path / "refined.safetensors") if name.startswith("encoder.")]
+    assert kept
+    assert all(name.startswith(last) for name in kept)
+    state = load_network(tmp_path / "refined.safetensors").network.state_dict()
+    assert all((state[name] == tensor.half().float()).all() for name, tensor in refined.state_dict().items())

@@ -147,3 +147,17 @@ def test_a_file_of_its_own(tmp_path: Path):
         assert torch.equal(loaded.network.state_dict()[name], tensor.half().float()), name
     with pytest.raises(WeightsError, match="preset paper"):
         load_network(path)
+
+
+def test_a_file_that_shares_its_encoder(tmp_path: Path):
+    network, whole, shares = make_paper(), tmp_path / "whole.safetensors", tmp_path / "shares.safetensors"
+    network.save(whole, about="whole")
+    other = make_paper()
+    with torch.no_grad():
+        other.queries.add_(1)
+    other.save(shares, about="shares", beside=whole)
+    assert shares.stat().st_size < whole.stat().st_size
+    assert torch.equal(read_paper(shares).network.queries, other.queries.half().float())
+    whole.unlink()
+    with pytest.raises(WeightsError, match="not beside it"):
+        read_paper(shares)

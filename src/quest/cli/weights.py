@@ -56,10 +56,13 @@ class ShowWeights:
 
     def run(self) -> int:
         """Read the file and print a table."""
-        from quest.model.weights import load_network
+        from quest.model.weights import find_weights, load_network
+        from quest.paper.network import is_paper
 
+        file = find_weights(self.weights)
+        facts = _paper_facts(self.weights, file) if is_paper(file) else _facts(load_network(self.weights))
         table = Table(box=None, show_header=False, pad_edge=False)
-        for name, value in _facts(load_network(self.weights)).items():
+        for name, value in facts.items():
             table.add_row(name, escape(value))
         Console(highlight=False).print(table)
         return 0
@@ -218,6 +221,23 @@ def _facts(loaded: LoadedNetwork) -> dict[str, str]:
         "network": f"finder: {_pairs(config)}",
         "encoder": _pairs(encoder),
         "discovery": _pairs(asdict(TrackerConfig.from_json(loaded.settings))),
+    }
+
+
+def _paper_facts(name: str, file: Path) -> dict[str, str]:
+    """The content of a file of the published network, for people."""
+    from quest.paper.network import read_paper
+
+    paper = read_paper(file)
+    config = asdict(paper.network.config)
+    encoder = config.pop("encoder")
+    return {
+        "name": name,
+        "file": f"{file} ({file.stat().st_size / 1e6:.1f} MB)",
+        "licence": paper.licence or "not stated",
+        "about": paper.about,
+        "network": f"as published: {_pairs(config)}",
+        "encoder": _pairs(encoder),
     }
 
 

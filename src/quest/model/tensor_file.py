@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -21,8 +22,12 @@ from quest.whole_file import whole_file
 
 
 def part_of(name: str) -> str:
-    """The part of a network that a tensor belongs to: the first word of its name."""
-    return name.partition(".")[0]
+    """The part of a network that a tensor belongs to: its name up to the first number, or the first word.
+
+    So blocks of an encoder are shared one by one: the first ones of a network whose last ones were trained further.
+    """
+    numbered = re.match(r"[^\d]*\.\d+(?=\.)", name)
+    return numbered[0] if numbered else name.partition(".")[0]
 
 
 def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict[str, str], dict[str, Tensor]]:
@@ -30,7 +35,7 @@ def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict
 
     Args:
         path: the file.
-        parts: first words of the names of the tensors to read; all by default.
+        parts: parts of the network to read; all by default.
 
     Raises:
         WeightsError: it is torn, or no such file.
@@ -110,12 +115,12 @@ def fetch_shared(path: Path, metadata: Mapping[str, str], shipped: Mapping[str, 
     other = beside if beside.is_file() else shipped.get(name)
     if other is None:
         raise WeightsError(
-            f"{path}: it shares {' and '.join(parts)} with {beside.name}, which is not beside it; put that file into "
+            f"{path}: it shares {', '.join(parts)} with {beside.name}, which is not beside it; put that file into "
             "the same folder, or make a whole one with `quest weights save`"
         )
     _, tensors = read_tensors(other, tuple(parts))
     if wrong := [part for part, digest in parts.items() if _digest(tensors, part) != digest]:
-        raise WeightsError(f"{path}: {other} has another {' and '.join(wrong)} than it shares; fetch both again")
+        raise WeightsError(f"{path}: {other} has another {', '.join(wrong)} than it shares; fetch both again")
     return tensors
 
 

@@ -52,7 +52,8 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder, load_exactly
 from quest.model.frames import FrameBatch
-from quest.model.tensor_file import read_tensors, save_tensors
+from quest.model.tensor_file import fetch_shared, leave_out, read_tensors, save_tensors
+from quest.model.weights import shipped_weights
 from quest.paper.decoder import DecoderLayer, Tokens
 from quest.paper.flow_head import FlowHead
 from quest.types import LABELS
@@ -232,19 +233,24 @@ class PaperNetwork(nn.Module):
         """The decoder's layers."""
         return list(self.layers)
 
-    def save(self, path: Path, *, about: str, licence: str = "") -> None:
+    def save(self, path: Path, *, about: str, licence: str = "", beside: Path | None = None) -> None:
         """Write the network in half precision, atomically.
 
         Args:
             path: safetensors file to write.
             about: where the weights come from, a line for people.
             licence: under which the weights may be used; empty to say nothing.
+            beside: file of another network that will lie in the same folder or ships; parts that both have, such as
+                blocks of the encoder, are left out and read from there.
 
         Raises:
-            WeightsError: the file cannot be written.
+            WeightsError: the other network has no part in common, or the file cannot be written.
         """
         tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in self.state_dict().items()}
         words = {"format": FORMAT, "config": self.config.to_json(), "about": about, "licence": licence}
+        if beside is not None:
+            tensors, shared = leave_out(tensors, beside)
+            words |= shared
         save_tensors(tensors, path, metadata=words)
 
 
@@ -270,12 +276,13 @@ def read_paper(path: Path) -> LoadedPaper:
     """Read what :meth:`PaperNetwork.save` wrote.
 
     Raises:
-        WeightsError: the file is corrupt, of another format, or of another shape.
+        WeightsError: the file is corrupt, of another format or shape, or shares parts with one that is not there.
     """
     metadata, state = read_tensors(path)
     if metadata.get("format") != FORMAT:
         raise WeightsError(f"{path}: expected weights of format {FORMAT!r}, got {metadata.get('format')!r}")
     network = PaperNetwork(PaperConfig.from_json(metadata["config"]))
+    state |= fetch_shared(path, metadata, shipped_weights())
     load_exactly(network, {name: tensor.float() for name, tensor in state.items()}, what=f"weights {path}")
     return LoadedPaper(network.eval(), metadata["about"], metadata["licence"])
 
