@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
+from quest.errors import QuestError
+
 
 @runtime_checkable
 class Part(Protocol):
@@ -82,19 +84,23 @@ class Batch:
     """State of the generator after this batch was drawn and before the next one was, as JSON."""
 
 
-class _Reading(Dataset[Batch | Exception]):
+class _Reading(Dataset[Batch | QuestError | OSError]):
     """What becomes of the plans of batches in the process that reads."""
 
     def __init__(self, sampler: Sampler, parts: Sequence[slice]) -> None:
         self._sampler = sampler
         self._parts = parts
 
-    def __getitem__(self, planned: tuple[Plan, str]) -> Batch | Exception:  # type: ignore[override]
+    def __getitem__(self, planned: tuple[Plan, str]) -> Batch | QuestError | OSError:  # type: ignore[override]
         plan, state = planned
         try:
             return Batch(tuple(MicroBatch(*self._sampler.load(plan.part(rows))) for rows in self._parts), state)
-        except Exception as error:
+        except (QuestError, OSError) as error:  # raised by the process that asked, as it is
             return error
+
+
+def _as_it_is(batch: Batch | QuestError | OSError) -> Batch | QuestError | OSError:
+    return batch
 
 
 def stream_batches(
@@ -119,10 +125,10 @@ def stream_batches(
         batch_size=None,
         sampler=plans(),
         num_workers=readers,
-        collate_fn=lambda batch: batch,
+        collate_fn=_as_it_is,
         generator=torch.Generator(),  # of its own: the one that all share is the network's
     )
     for batch in loader:
-        if isinstance(batch, Exception):
+        if not isinstance(batch, Batch):
             raise batch
         yield batch

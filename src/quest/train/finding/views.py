@@ -95,7 +95,7 @@ def of_pictures(pictures: Sequence[BoxedPicture], *, only: Sequence[bool]) -> li
     return [
         Source(
             _digest(file_hash(picture.path), picture.names, picture.box_px.tolist(), told),
-            str(picture.path),
+            f"picture {picture.path}",
             reader(picture),
         )
         for picture, wanted in zip(pictures, only, strict=True)
@@ -127,7 +127,7 @@ def of_takes(store: TakeStore, names: Sequence[str], *, frames: int) -> list[Sou
                     take = taken(name, until)
                     return _encoded(take.views[v].clip.rgb[t]), marks_of(take, take.views[v], t)
 
-                sources.append(Source(_digest(header.data_hash, v, t), f"{t} of {name}", read))
+                sources.append(Source(_digest(header.data_hash, v, t), f"frame {t} of {name}", read))
     return sources
 
 
@@ -203,7 +203,7 @@ def _digest(*parts: object) -> str:
 
 
 def _decoded(contents: bytes, source: Source) -> UInt8[np.ndarray, "H W 3"]:
-    return decode_picture(BytesIO(contents), f"picture {source.where}")
+    return decode_picture(BytesIO(contents), source.where)
 
 
 def _encoded(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:
