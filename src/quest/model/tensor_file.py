@@ -15,7 +15,7 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from quest.errors import WeightsError
 from quest.whole_file import whole_file
@@ -66,6 +66,24 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping
             partial.chmod(0o644)  # safetensors makes files that only their owner can read
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path}: cannot be written ({error}); free space there, or name another place") from error
+
+
+def save_half(module: nn.Module, path: Path, *, metadata: Mapping[str, str], beside: Path | None = None) -> None:
+    """Write a network in half precision, whole or not at all.
+
+    Args:
+        module: the network.
+        path: of the file.
+        metadata: words to keep beside the tensors.
+        beside: file of another network that will lie in the same folder or ships; parts that both have, such as blocks
+            of an encoder, are left out and read from there.
+
+    Raises:
+        WeightsError: the other network has no part in common or cannot be read, or the file cannot be written.
+    """
+    tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in module.state_dict().items()}
+    tensors, shared = (tensors, {}) if beside is None else leave_out(tensors, beside)
+    save_tensors(tensors, path, metadata={**metadata, **shared})
 
 
 SHARED = "shared"

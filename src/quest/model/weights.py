@@ -17,7 +17,7 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.encoder import load_exactly
 from quest.model.finder import FinderConfig, FinderNetwork
 from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
-from quest.model.tensor_file import fetch_shared, leave_out, read_tensors, save_tensors
+from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 
 FORMAT = "quest-finder-1"
 
@@ -180,13 +180,9 @@ def save_network(
     Raises:
         WeightsError: the other network has no part in common or cannot be read, or the file cannot be written.
     """
-    tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in network.state_dict().items()}
     metadata = {"format": FORMAT, "config": network.config.to_json(), "settings": settings, "about": about}
     metadata |= {key: value for key, value in (("licence", licence), ("version", version)) if value}
-    if beside is not None:
-        tensors, shared = leave_out(tensors, beside)
-        metadata |= shared
-    save_tensors(tensors, path, metadata=metadata)
+    save_half(network, path, metadata=metadata, beside=beside)
 
 
 def weights_digest(module: nn.Module, *, beside: str = "") -> str:

@@ -52,7 +52,7 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
 from quest.model.encoder import Encoder, load_exactly
 from quest.model.frames import FrameBatch
-from quest.model.tensor_file import fetch_shared, leave_out, read_tensors, save_tensors
+from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 from quest.model.weights import shipped_weights
 from quest.paper.decoder import DecoderLayer, Tokens
 from quest.paper.flow_head import FlowHead
@@ -246,12 +246,8 @@ class PaperNetwork(nn.Module):
         Raises:
             WeightsError: the other network has no part in common, or the file cannot be written.
         """
-        tensors = {name: tensor.detach().cpu().half().contiguous() for name, tensor in self.state_dict().items()}
         words = {"format": FORMAT, "config": self.config.to_json(), "about": about, "licence": licence}
-        if beside is not None:
-            tensors, shared = leave_out(tensors, beside)
-            words |= shared
-        save_tensors(tensors, path, metadata=words)
+        save_half(self, path, metadata=words, beside=beside)
 
 
 @dataclass(frozen=True)
