@@ -17,11 +17,11 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgro
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: demo test lint format types pytest render-deps clean help
+.PHONY: demo test lint format types pytest fuzz render-deps clean help
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | render-deps | clean"
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | render-deps | clean"
 
 demo: $(BASE)
 	$(BIN)/quest track sample --out $(DEMO_OUT)
@@ -44,6 +44,10 @@ types: $(ALL)
 # With every annotated shape checked, but in the tests that tests/conftest.py names.
 pytest: $(ALL) render-deps
 	$(PYTEST) --jaxtyping-packages=quest,beartype.beartype
+
+# Thousands of damaged files of every kind; QUEST_FUZZ says how many of each.
+fuzz: $(ALL)
+	QUEST_FUZZ=$${QUEST_FUZZ:-2000} $(PYTEST) --timeout 0 tests/test_fuzz.py
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \

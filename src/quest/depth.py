@@ -22,6 +22,12 @@ def clean_depth(depth_m: Shaped[np.ndarray, "*S"]) -> Float32[np.ndarray, "*S"]:
         return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, 0).astype(np.float32)
 
 
+def metres(units: Shaped[np.ndarray, "*S"], unit_m: float) -> Float32[np.ndarray, "*S"]:
+    """Depth of an image in some unit; the largest of 16 bits says, as 0 does, that there is none."""
+    missing = units == np.iinfo(np.uint16).max if np.issubdtype(units.dtype, np.integer) else False
+    return clean_depth(np.where(missing, 0, units.astype(np.float32) * np.float32(unit_m)))
+
+
 def check_units(depth_m: Float32[np.ndarray, "T H W"], where: Path | str, scale_m: float) -> None:
     """Raise RecordingError if the median depth is not one that a camera sees."""
     step = max(1, len(depth_m) // 16)

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Float32
 
 from quest.errors import InputError
 from quest.extras import require
+from quest.untrusted import build, parse_json, reading, require_table
 from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -274,7 +275,7 @@ def write_tracks(tracks: Tracks, path: str | Path) -> None:
     import pyarrow.parquet as pq
 
     with whole_file(Path(path)) as partial, partial.open("wb") as file:  # not by its path, which may be no UTF-8
-        pq.write_table(tracks_table(tracks), file, compression="zstd")
+        pq.write_table(tracks_table(tracks), file, compression="zstd", write_page_checksum=True)
 
 
 def tracks_table(tracks: Tracks) -> pa.Table:
@@ -325,53 +326,64 @@ def read_tracks(path: str | Path) -> Tracks:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        with Path(path).open("rb") as file:
-            table = pq.read_table(file)
-    except FileNotFoundError:
-        raise InputError(f"tracks {path}: no such file; check the path, or run quest track") from None
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"tracks {path}: cannot be read as Parquet ({reason}); the file is torn, track again"
-        ) from error
+    if not Path(path).exists():
+        raise InputError(f"tracks {path}: no such file; check the path, or run quest track")
+    require_table(Path(path), InputError)
+    with reading(f"tracks {path}", InputError, "the file is torn, track again"):
+        table = pq.read_table(Path(path), page_checksum_verification=True)
     raw = (table.schema.metadata or {}).get(_METADATA_KEY)
     if raw is None or table.schema.names != list(COLUMNS):
         raise InputError(
             f"tracks {path}: a Parquet file, but not of tracks (columns {', '.join(table.schema.names)}); "
             "give a file that quest track wrote"
         )
-    metadata = json.loads(raw)
-    if metadata.get("version") != VERSION:
+    metadata = parse_json(raw, f"tracks {path}", InputError)
+    if not isinstance(metadata, dict) or metadata.get("version") != VERSION:
+        version = metadata.get("version") if isinstance(metadata, dict) else None
         raise InputError(
-            f"tracks {path}: format version {metadata.get('version')}, expected {VERSION}; track again, or use the "
-            "version of quest that wrote it"
+            f"tracks {path}: format version {version}, expected {VERSION}; track again, or use the version of quest "
+            "that wrote it"
         )
-    frames, queries = len(metadata["stamp_s"]), len(metadata["names"])
+    with reading(f"tracks {path}", InputError, "track again"):
+        return _tracks_of(table.cast(pa.schema(list(COLUMNS.items()))), metadata)
+
+
+def _tracks_of(table: pa.Table, metadata: dict[str, Any]) -> Tracks:
+    """Tracks from their table and what is written beside it."""
+    stamp_s = np.array(build(list[float], metadata["stamp_s"], "stamp_s"), dtype=np.float64)
+    names = build(tuple[str, ...], metadata["names"], "names")
+    labels = build(tuple[str | None, ...], metadata["labels"], "labels")
+    watched = build(bool, metadata["watched"], "watched")
+    joints = build(list[dict] | None, metadata["joints"], "joints")
+    frames, queries = len(stamp_s), len(names)
     if table.num_rows != frames * queries:
-        raise InputError(f"tracks {path}: {table.num_rows} rows for {frames} frames of {queries} queries; track again")
+        raise ValueError(f"{table.num_rows} rows for {frames} frames of {queries} queries")
 
     def column(name: str) -> np.ndarray:
         return table[name].to_numpy().reshape(frames, queries)
 
+    def flags(name: str) -> np.ndarray:
+        if table[name].null_count:
+            raise ValueError(f"{name} is missing in {table[name].null_count} rows")
+        return column(name).astype(bool)
+
     def stacked(*names: str) -> np.ndarray:
         return np.stack([column(name) for name in names], axis=-1).astype(np.float32)
 
+    states = [State(state).value for state in table["state"].to_pylist()]
     return Tracks(
-        names=tuple(metadata["names"]),
-        labels=tuple(metadata["labels"]),
+        names=names,
+        labels=labels,
         uv_px=stacked("x_px", "y_px"),
         point_world=stacked("x_m", "y_m", "z_m"),
         confidence=column("confidence").astype(np.float32),
-        visible=column("visible").astype(bool),
-        state=np.array([State(state).value for state in table["state"].to_pylist()], dtype="<U8").reshape(
-            frames, queries
-        ),
-        stamp_s=np.array(metadata["stamp_s"], dtype=np.float64),
-        frame_flags=tuple(metadata["frame_flags"]),
-        lost_p=column("lost_p").astype(np.float32) if metadata["watched"] else None,
-        alarm=column("alarm").astype(bool) if metadata["watched"] else None,
-        joints=None if metadata["joints"] is None else _joints_from_json(metadata["joints"], column("q")),
+        visible=flags("visible"),
+        state=np.array(states, dtype="<U8").reshape(frames, queries),
+        stamp_s=stamp_s,
+        frame_flags=build(tuple[str, ...], metadata["frame_flags"], "frame_flags"),
+        lost_p=column("lost_p").astype(np.float32) if watched else None,
+        alarm=flags("alarm") if watched else None,
+        joints=None if joints is None else _joints_from_json(joints, column("q")),
     )
 
 

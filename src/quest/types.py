@@ -29,6 +29,10 @@ GUESSED_CAMERA = "camera guessed: a focal length as long as the longer side (53 
 _FRAMES_PER_S = 30.0
 
 
+MOST_SIDE_PX = 2**15
+"""Longest side of a picture, pixels."""
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera without distortion."""
@@ -48,10 +52,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         values = (self.fx, self.fy, self.cx, self.cy)
-        if not np.isfinite(values).all() or self.fx < 0.01 * self.width or self.fy < 0.01 * self.height:  # 179 degrees
-            raise InputError(f"camera: expected intrinsics in pixels, fx, fy > 0.01 of the size, got {values}")
-        if min(self.width, self.height) <= 0 or self.width % 1 or self.height % 1:
-            raise InputError(f"camera: expected a size of > 0 whole pixels, got {self.width} x {self.height}")
+        size = np.array([self.width, self.height])
+        if not np.isfinite(size).all() or (size <= 0).any() or (size % 1).any() or (size > MOST_SIDE_PX).any():
+            raise InputError(
+                f"camera: expected sides of 1 to {MOST_SIDE_PX} whole pixels, got {self.width} x {self.height}"
+            )
+        share = np.array([self.fx, self.fy]) / size
+        if not np.isfinite(values).all() or (share < 0.01).any() or (share > 1e3).any():  # 179 to 0.06 degrees
+            raise InputError(
+                f"camera: expected intrinsics in pixels, fx, fy of 0.01 to 1,000 times the size, got {values}"
+            )
         if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
             raise InputError(
                 f"camera: principal point ({self.cx:.1f}, {self.cy:.1f}) lies far outside the "
@@ -77,15 +87,15 @@ class Camera:
                 focal length as long as the longer side, which is 53 degrees.
 
         Raises:
-            InputError: the field of view is not between 1 and 178 degrees.
+            InputError: the field of view is not between 1 and 175 degrees.
         """
         longer = float(max(width, height))
         if fov_deg is None:
             focal = longer
-        elif 1 <= fov_deg <= 178:
+        elif 1 <= fov_deg <= 175:
             focal = longer / 2 / float(np.tan(np.radians(fov_deg) / 2))
         else:
-            raise InputError(f"camera: expected a field of view of 1 to 178 degrees, got {fov_deg}")
+            raise InputError(f"camera: expected a field of view of 1 to 175 degrees, got {fov_deg}")
         return cls(focal, focal, width / 2, height / 2, width, height)
 
     def __repr__(self) -> str:
@@ -291,6 +301,8 @@ class Query:
     """What a text query says."""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise InputError(f"query: expected a name as text, got {self.name!r}")
         for what, said, known in (("label", self.label, LABELS), ("intent", self.intent, INTENTS)):
             if said is not None and said not in known:
                 raise InputError(f"query: {what} {said!r} is unknown; expected one of {', '.join(known)}")

@@ -352,7 +352,7 @@ def tear(folder: Path, pattern: str) -> None:
 
 BAD: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "older format": (lambda f: edit_info(f, codebase_version="v2.1"), {}, "format v2.1, expected v3.0; convert it"),
-    "no JSON": (lambda f: (f / "meta/info.json").write_text("{"), {}, "info.json cannot be read"),
+    "no JSON": (lambda f: (f / "meta/info.json").write_text("{"), {}, "info.json: cannot be read"),
     "another JSON": (lambda f: (f / "meta/info.json").write_text("{}"), {}, "lacks codebase_version, features"),
     "no such episode": (lambda f: None, {"episode": 7}, "no episode 7; it has 2, counted from 0"),
     "no such camera": (lambda f: None, {"camera_key": "wrist"}, "no camera 'wrist'; its cameras are .*images.top"),

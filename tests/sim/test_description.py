@@ -152,7 +152,7 @@ def test_link_alone_takes_the_rim_or_front_that_is_found(tmp_path: Path) -> None
     ("description", "named"),
     [
         ("[]", "expected an object in braces, got list"),
-        ("{", "not readable as JSON"),
+        ("{", "cannot be read"),
         ('{"colour": "red"}', "unknown field 'colour'"),
         ('{"size_m": 0}', "size_m is 0, expected metres > 0"),
         ('{"size_m": 1, "height_m": 1}', "leave one out"),

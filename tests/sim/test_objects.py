@@ -214,7 +214,7 @@ def bad_folder(folder: Path, what: str) -> Path:
         ("torn urdf", "not a readable URDF"),
         ("not xml", "not a readable URDF"),
         ("no geometry", "no geometry"),
-        ("limits", "limits"),
+        ("limits", "got 'nan'"),
         ("axis", "axis of length zero"),
         ("unknown parent", "nobody"),
         ("cycle", "cycle"),

@@ -224,20 +224,22 @@ def test_an_open_alarm_goes_by_the_new_name(clip: Clip):
     assert events.step(4, state) == ()
 
 
-def test_a_callback_may_save_the_stream_or_fail(clip: Clip):
+def test_a_callback_may_save_the_stream_or_fail(clip: Clip, caplog: pytest.LogCaptureFixture):
     tracker = watched(alarming=True)
-    stream, saved = tracker.stream(clip.camera, POINTS, alpha=0.1), []
+    stream, saved, heard = tracker.stream(clip.camera, POINTS, alpha=0.1), [], []
 
     def keep(alarm: Alarm) -> None:
-        saved.append(tracker.save(stream))
-        raise RuntimeError(alarm.name)
+        saved.append((stream.frame, tracker.save(stream)))
+        raise RuntimeError(f"about {alarm.name}")
 
     stream.on_alarm(keep)
-    with pytest.raises(RuntimeError):
-        feed(stream, clip, range(4))
-    assert len(saved) == 1
-    begun = stream.frame
-    after, again = (feed(s, clip, range(begun, 8)) for s in (stream, tracker.restore(saved[0])))
+    stream.on_alarm(heard.append)
+    before = feed(stream, clip, range(8))
+    assert len(before) == 8
+    assert len(heard) == len(saved) > 0
+    assert f"about {heard[0].name}" in caplog.text
+    begun, data = saved[0]
+    after, again = before[begun:], feed(tracker.restore(data), clip, range(begun, 8))
     for a, b in zip(after, again, strict=True):
         assert_equal(a, b)
 

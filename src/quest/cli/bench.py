@@ -52,9 +52,8 @@ class BenchTapvid:
         """
         import hashlib
 
-        from rich.console import Console
-
         from quest.baselines import line_up
+        from quest.cli.console import Console
         from quest.cli.progress import counting
         from quest.data.provenance import code_hash, combined_hash, file_hash, package_versions
         from quest.errors import ConfigError, InputError

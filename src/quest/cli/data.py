@@ -46,7 +46,7 @@ class DataExport:
 
     def run(self) -> int:
         """Write, and print the files."""
-        from quest.cli.takes import open_takes, say_corrupt, say_omitted
+        from quest.cli.takes import no_takes, open_takes, say_corrupt, say_omitted
         from quest.errors import ConfigError, TakeError
 
         if self.depth and self.format != "tapvid3d":
@@ -54,7 +54,7 @@ class DataExport:
         store, names = open_takes(self.takes)
         chosen = store.names() if names is None else names
         if not chosen:
-            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+            raise no_takes(store, self.takes)
         corrupt = 0 if names is not None else say_corrupt([store])
         if self.format == "lerobot":
             self._write_dataset(store, chosen)
@@ -117,16 +117,17 @@ class DataStats:
 
     def run(self) -> int:
         """Print a table; returns 0."""
-        from rich.console import Console
         from rich.table import Table
 
-        from quest.cli.takes import open_store, wide_console
+        from quest.cli.console import Console
+        from quest.cli.takes import open_store, say_corrupt, wide_console
         from quest.data.stats import store_stats
         from quest.evaluation.report import write_report
 
         store = open_store(self.store)
         with counting(Console(stderr=True), "reading", None, "takes") as report:
             found = store_stats(store, report=report)
+        say_corrupt([store])
         if self.json is not None:
             write_report(finite(asdict(found)), self.json)
         table = Table(box=None, show_header=False)
@@ -204,16 +205,14 @@ class DataVerify:
 
     def run(self) -> int:
         """Print a table of the worst of each check; returns 1 if a take fails."""
-        from rich.console import Console
-
-        from quest.cli.takes import open_takes
+        from quest.cli.console import Console
+        from quest.cli.takes import no_takes, open_takes
         from quest.data.verify import TakeReport, verify_store
-        from quest.errors import TakeError
 
         store, names = open_takes(self.takes)
         chosen = names if names is not None else sorted({*store.names(), *store.problems()})
         if not chosen:
-            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+            raise no_takes(store, self.takes)
         errors = Console(stderr=True, highlight=False, markup=False)
         with counting(errors, "verifying", len(chosen), "takes") as report:
             done = itertools.count(1)
@@ -349,12 +348,12 @@ class DataShow:
         return 0
 
     def _show_store(self, store: TakeStore) -> int:
-        from quest.errors import TakeError
+        from quest.cli.takes import no_takes
         from quest.viz.contact_sheet import takes_sheet
 
         headers = store.headers()
         if not headers:
-            raise TakeError(f"store {self.takes}: no takes; check the path, or generate takes into it")
+            raise no_takes(store, self.takes)
         names = list(headers)
         picked = sorted({round(i * (len(names) - 1) / max(self.rows - 1, 1)) for i in range(self.rows)})
         takes = []
@@ -385,9 +384,9 @@ class DataLs:
 
     def run(self) -> int:
         """Print a table; returns 1 if a take is corrupt."""
-        from rich.console import Console
         from rich.table import Table
 
+        from quest.cli.console import Console
         from quest.cli.takes import open_takes, wide_console
 
         store, names = open_takes(self.store)

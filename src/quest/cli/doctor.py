@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quest.cli.console import Console
 from quest.errors import QuestError
 from quest.extras import EXTRA_OF, explain_missing, install_command, is_installed
 from quest.wording import counted

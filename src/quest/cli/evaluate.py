@@ -16,10 +16,10 @@ from quest.wording import counted
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from rich.console import Console
     from rich.progress import Progress
 
     from quest.baselines import ClipTracker
+    from quest.cli.console import Console
     from quest.data.split import SplitPart
     from quest.data.store import TakeStore
     from quest.evaluation.finished import FinishedTakes
@@ -295,14 +295,14 @@ def ended_run(
 
 
 def _stderr() -> Console:
-    from rich.console import Console
+    from quest.cli.console import Console
 
     return Console(stderr=True)
 
 
 def table_console(full_width: int) -> Console:
     """The terminal; a file or pipe has no width of its own and gets every column."""
-    from rich.console import Console
+    from quest.cli.console import Console
 
     output = Console()
     return output if output.is_terminal else Console(width=full_width)

@@ -69,8 +69,7 @@ class EvalMonitor:
             InputError: the calibration streams are missing, of another tracker, or not those of the calibration.
             TakeError: a take cannot be read; those whose description is corrupt are named and omitted.
         """
-        from rich.console import Console
-
+        from quest.cli.console import Console
         from quest.cli.takes import open_store, say_corrupt
         from quest.errors import ConfigError
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
+
+from quest.cli.console import Console
 
 if TYPE_CHECKING:
     import numpy as np

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.console import Console
 from quest.cli.progress import Report, counting
 from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CAMERA_MOTIONS, MIXED

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.console import Console
 from quest.errors import QuestError
 from quest.extras import explain_missing
 
@@ -25,7 +25,7 @@ EXIT_BROKEN_PIPE = 141
 
 _PLACES = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT),
-    *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR),
+    *(errno.EEXIST, errno.EISDIR, errno.ENOTDIR, errno.ENAMETOOLONG),
 )
 """Errors of a place for files, and not of the program."""
 

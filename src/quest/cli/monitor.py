@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.console import Console
 from quest.cli.source import Source
 from quest.wording import counted
 

@@ -33,8 +33,7 @@ class ObjectsList:
 
     def run(self) -> int:
         """Print a line for each object as it is read; returns 1 if an object cannot be used."""
-        from rich.console import Console
-
+        from quest.cli.console import Console
         from quest.viz.object_sheet import entity_words, size_words
 
         out, errors = (Console(stderr=e, highlight=False, markup=False, soft_wrap=True) for e in (False, True))

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 
+from quest.cli.console import Console
 from quest.cli.progress import counting
 from quest.data.frame_source import Parts
 from quest.wording import counted

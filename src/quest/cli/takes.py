@@ -9,10 +9,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     import numpy as np
-    from rich.console import Console
 
+    from quest.cli.console import Console
     from quest.data.split import SplitPart
     from quest.data.store import TakeStore
+    from quest.errors import TakeError
 
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
@@ -61,9 +62,17 @@ def say_corrupt(stores: Iterable[TakeStore]) -> int:
     return sum(say_omitted(problem) for store in stores for problem in store.problems().values())
 
 
+def no_takes(store: TakeStore, where: str) -> TakeError:
+    """The error of a store without a whole take."""
+    from quest.errors import TakeError
+
+    torn = "".join(f"; omitted: {problem}" for problem in store.problems().values())
+    return TakeError(f"store {where}: no takes; check the path, or generate takes into it{torn}")
+
+
 def say_omitted(problem: str) -> int:
     """Print on standard error why one take is omitted; returns 1, the number of takes."""
-    from rich.console import Console
+    from quest.cli.console import Console
 
     Console(stderr=True, highlight=False, markup=False, soft_wrap=True).print(f"omitted: {problem}")
     return 1
@@ -139,7 +148,7 @@ def wide_console() -> Console:
 
     Brackets are no markup: they may be in the name of a take or an object.
     """
-    from rich.console import Console
+    from quest.cli.console import Console
 
     console = Console(highlight=False, markup=False)
     return console if console.is_terminal else Console(highlight=False, markup=False, width=180)

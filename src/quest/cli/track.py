@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from quest.cli.console import Console
 from quest.cli.progress import counting
 from quest.cli.source import Source
 from quest.wording import counted

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from quest.cli.console import Console
 
 if TYPE_CHECKING:
     from quest.model.weights import LoadedNetwork

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from PIL import Image
 from quest.data.columns import read_columns
 from quest.data.pictures import PICTURES, is_turned, upright
 from quest.errors import InputError
+from quest.untrusted import is_inside, read_json, reading
 
 EXPECTED = (
     "expected a COCO file (.json), a YOLO data set (its data.yaml or the folder of that), or a folder with pictures/ "
@@ -101,14 +101,21 @@ def _table(folder: Path) -> Iterator[BoxedPicture]:
     file, name, licence = (rows[key] for key in ("file", "class", "licence"))
     box = np.stack([rows[key] for key in edges], axis=-1)
     for picture in np.unique(file[file != ""]).tolist():
+        _check_inside(picture, folder / "labels.csv")
         own = file == picture
         boxed = own & (name != "")
         yield BoxedPicture(folder / "pictures" / picture, tuple(name[boxed]), box[boxed], str(licence[own][0]))
 
 
+def _check_inside(file: str, where: Path) -> None:
+    if not is_inside(file):
+        raise InputError(f"{where}: {file!r} is no picture of its folder; name pictures below it")
+
+
 def _coco(path: Path) -> Iterator[BoxedPicture]:
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
+    remedy = "expected a COCO file with images, annotations and categories"
+    raw = read_json(path, InputError, remedy)
+    with reading(path, InputError, remedy):
         names = {category["id"]: str(category["name"]) for category in raw["categories"]}
         licences = {licence["id"]: str(licence.get("name", "")) for licence in raw.get("licenses", ())}
         boxes: dict[int, list[tuple[str, list[float]]]] = {}
@@ -117,9 +124,8 @@ def _coco(path: Path) -> Iterator[BoxedPicture]:
             boxes.setdefault(mark["image_id"], []).append((names[mark["category_id"]], [x, y, x + width, y + height]))
         pictures = [(image["id"], str(image["file_name"]), licences.get(image.get("license"), "")) for image in
                     raw["images"]]  # fmt: skip
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputError(f"{path}: expected a COCO file with images, annotations and categories ({error!r})") from error
     for number, file, licence in pictures:
+        _check_inside(file, path)
         beside = [folder / file for folder in (path.parent, path.parent / "images", path.parent.parent / "images")]
         place = next((p for p in beside if p.is_file()), beside[0])
         own = boxes.get(number, [])

@@ -16,6 +16,7 @@ from quest.data.registration import Rig
 from quest.errors import InputError, RecordingError
 from quest.geometry.poses import is_rigid
 from quest.types import Camera
+from quest.untrusted import read_json, reading
 
 DEFAULT_DEPTH_SCALE_M = 1e-3
 EXAMPLE = '{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 480, "depth_scale_m": 0.001, "fps": 30}'
@@ -91,16 +92,9 @@ def read_camera(path: Path) -> CameraFile:
     Raises:
         RecordingError: the file is missing, is not JSON, lacks or misspells a field, or a value makes no sense.
     """
-    try:
-        fields = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise RecordingError(
-            f"camera file {path}: no such file; write one such as {EXAMPLE}, or name another one"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise RecordingError(
-            f"camera file {path}: cannot be read as JSON ({error}); expected such as {EXAMPLE}"
-        ) from error
+    if not path.exists():
+        raise RecordingError(f"camera file {path}: no such file; write one such as {EXAMPLE}, or name another one")
+    fields = read_json(path, RecordingError)
     if not isinstance(fields, dict):
         raise RecordingError(f"camera file {path}: expected an object such as {EXAMPLE}, got {type(fields).__name__}")
     missing = [name for name in _INTRINSICS if name not in fields]
@@ -111,10 +105,10 @@ def read_camera(path: Path) -> CameraFile:
             f"camera file {path}: {' and '.join(said)}; known are {', '.join((*_INTRINSICS, *_OPTIONAL))}, "
             f"for example {EXAMPLE}"
         )
-    try:
-        return _parse(fields)
-    except (InputError, TypeError, ValueError, OverflowError) as error:
-        raise RecordingError(f"camera file {path}: {error}; expected such as {EXAMPLE}") from error
+    with reading(f"camera file {path}", RecordingError, f"expected such as {EXAMPLE}"):
+        setup = _parse(fields)
+        assert setup.rig  # which checks how both cameras go together
+        return setup
 
 
 def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None = None) -> CameraFile:

@@ -21,6 +21,8 @@ from quest.types import Camera
 _COEFFICIENTS = {"plumb_bob": (4, 5), "rational_polynomial": (8, 12, 14), "equidistant": (4,)}
 _ALIASES = {"fisheye": "equidistant", "kannala_brandt4": "equidistant"}
 _NEAR_ZERO = 1e-12
+_LEAST_SEEN = 0.05
+"""Share of a rectified picture that the lens saw, below which the lens is told wrongly."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,15 @@ class Rectifier:
     def __init__(self, camera: Camera, distortion: Distortion) -> None:
         self.camera = camera
         self._maps = None if distortion.none else distortion.maps(camera)
+        if self._maps is not None:
+            column, row = self._maps
+            with np.errstate(invalid="ignore"):
+                inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+            if inside.mean() < _LEAST_SEEN:
+                raise InputError(
+                    f"distortion {distortion.model!r} {distortion.coefficients}: rectified pictures would be black; "
+                    "check the coefficients, their order and the model"
+                )
 
     def rgb(self, image: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
         """Colours, interpolated; black where the lens saw nothing."""

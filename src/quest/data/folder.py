@@ -8,15 +8,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from quest.data.camera_file import CameraFile, find_setup
 from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.registration import Rig
 from quest.data.video import SUFFIXES, play_video, probe_video
+from quest.depth import metres
 from quest.errors import RecordingError
 from quest.types import Frame
+from quest.untrusted import reading, require_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
@@ -199,7 +201,7 @@ def _read_depth(path: Path, rig: Rig, scale_m: float) -> np.ndarray:
             f"depth image {path}: {image.width} x {image.height}, but {whose} {size.width} x {size.height}; align "
             "the depth to the colour camera first, or give depth_camera and colour_from_depth in the camera file"
         )
-    return np.asarray(image).astype(np.float32) * np.float32(scale_m)
+    return metres(np.asarray(image), scale_m)
 
 
 def _list_images(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
@@ -218,13 +220,8 @@ def _natural(path: Path) -> list[tuple[float, float, str]]:
 
 
 def _open_image(path: Path) -> Image.Image:
-    try:
-        with Image.open(path) as image:
-            image.load()
-            return image
-    except UnidentifiedImageError:
-        raise RecordingError(f"image {path}: not an image; the file is corrupt, copy or record it again") from None
-    except (OSError, SyntaxError, ValueError) as error:
-        raise RecordingError(
-            f"image {path}: cannot be decoded ({error}); the file is corrupt, copy or record it again"
-        ) from error
+    require_file(path, RecordingError)
+    remedy = "the file is torn, copy or record it again"
+    with reading(f"image {path}", RecordingError, remedy), Image.open(path) as image:
+        image.load()
+        return image

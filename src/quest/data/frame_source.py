@@ -148,6 +148,8 @@ class FrameSource:
                     f"recording {self.name}: time goes back by {before - frame.stamp_s:.3f} s at frame {t}; cut the "
                     "recording there"
                 )
+            if frame.stamp_s == before:
+                self.notes.count("time stands still", t)
             before = frame.stamp_s
             if unchecked and frame.depth_m is not None and (frame.depth_m > 0).mean() > _ENOUGH_DEPTH:
                 check_units(frame.depth_m[None], *self.units)

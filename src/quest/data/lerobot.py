@@ -10,7 +10,7 @@ Reference: lerobot 0.6.2, ``lerobot/datasets`` (``dataset_metadata.py``, ``datas
 from __future__ import annotations
 
 import io
-import json
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,15 +20,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from jaxtyping import Float32, UInt16
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from quest.data.camera_file import CameraFile, find_setup
 from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.video import play_video, probe_video
-from quest.depth import clean_depth
+from quest.depth import metres
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Frame
+from quest.untrusted import build, is_inside, read_json, reading, require_file, require_table
 
 VERSION = "v3.0"
 CAMERA_KEY = "quest.camera"
@@ -40,6 +41,8 @@ DEPTH_CODES = 4095
 """Depth videos have twelve bits."""
 
 _VISUAL = ("video", "image")
+_FIELD = re.compile(r"\{(?P<name>\w+)(:0?(?P<width>\d)d)?\}")
+"""A field of a path's template, such as ``{chunk_index:03d}``."""
 
 
 @dataclass(frozen=True)
@@ -102,13 +105,30 @@ class _Episode:
 
     @property
     def data_path(self) -> Path:
-        return self.root / self.info["data_path"].format(
-            chunk_index=self.row["data/chunk_index"], file_index=self.row["data/file_index"]
-        )
+        return self._path("data_path", "data")
 
     def video_path(self, key: str) -> Path:
-        chunk, file = (self.row[f"videos/{key}/{part}_index"] for part in ("chunk", "file"))
-        return self.root / self.info["video_path"].format(video_key=key, chunk_index=chunk, file_index=file)
+        return self._path("video_path", f"videos/{key}", video_key=key)
+
+    def _path(self, template: str, of: str, **names: str) -> Path:
+        """Where files of the episode are: the template's fields filled in, below the dataset."""
+        where = f"dataset {self.root}: {template} {self.info.get(template)!r:.120} of meta/info.json"
+        values: dict[str, Any] = dict(names)
+        for part in ("chunk_index", "file_index"):
+            values[part] = self.row.get(f"{of}/{part}")
+            if type(values[part]) is not int or not 0 <= values[part] < 10**6:
+                raise RecordingError(f"dataset {self.root}: episode {self.index}: {of}/{part} is {values[part]!r}")
+
+        def filled(found: re.Match[str]) -> str:
+            value = values.get(found["name"])
+            if value is None or (found["width"] and not isinstance(value, int)):
+                raise RecordingError(f"{where}: expected fields {', '.join(values)}, got {found[0]}")
+            return f"{value:0{int(found['width'] or 0)}d}" if isinstance(value, int) else value
+
+        path = _FIELD.sub(filled, str(self.info.get(template)))
+        if re.search(r"[{}]", path) or not is_inside(path):
+            raise RecordingError(f"{where}: expected a path below the dataset, with fields {', '.join(values)}")
+        return self.root / path
 
 
 def _accepts(where: str) -> bool:
@@ -152,7 +172,8 @@ def _read_episode(root: Path, episode: int) -> _Episode:
     seen = 0
     for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         table = _read_table(file, [name for name in _columns(file) if not name.startswith("stats/")])
-        index = table["episode_index"].to_numpy()
+        with reading(file, RecordingError):
+            index = table["episode_index"].to_numpy()
         seen += len(index)
         if episode in index:
             row = table.slice(int(np.flatnonzero(index == episode)[0]), 1).to_pylist()[0]
@@ -162,11 +183,10 @@ def _read_episode(root: Path, episode: int) -> _Episode:
 
 def _read_info(root: Path) -> dict[str, Any]:
     path = root / "meta" / "info.json"
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-        missing = [name for name in ("codebase_version", "features", "data_path", "fps") if name not in info]
-    except (OSError, ValueError, TypeError) as error:
-        raise RecordingError(f"dataset {root}: {path.name} cannot be read ({error}); expected JSON") from error
+    info = read_json(path, RecordingError)
+    if not isinstance(info, dict):
+        raise RecordingError(f"dataset {root}: {path.name} is no object; expected a LeRobot v3 dataset")
+    missing = [name for name in ("codebase_version", "features", "data_path", "fps") if name not in info]
     if missing:
         raise RecordingError(f"dataset {root}: {path.name} lacks {', '.join(missing)}; expected a LeRobot v3 dataset")
     if not str(info["codebase_version"]).startswith("v3."):
@@ -174,7 +194,25 @@ def _read_info(root: Path) -> dict[str, Any]:
             f"dataset {root}: format {info['codebase_version']}, expected {VERSION}; convert it with lerobot's "
             "convert_dataset_v21_to_v30"
         )
+    with reading(f"dataset {root}: {path.name}", RecordingError, "restore it"):
+        build(_Info, {name: info[name] for name in ("features", "data_path", "fps")}, "it")
+        for name, feature in info["features"].items():
+            for part in ("info", "video_info"):
+                build(dict[str, Any] | None, feature.get(part), f"features.{name}.{part}")
     return info
+
+
+@dataclass(frozen=True)
+class _Info:
+    """What of ``meta/info.json`` is relied on."""
+
+    features: dict[str, dict]
+    data_path: str
+    fps: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.fps < 1e6:
+            raise ValueError(f"fps: expected frames per second, got {self.fps}")
 
 
 def _colour_key(episode: _Episode, camera_key: str | None, notes: Notes) -> str:
@@ -215,8 +253,8 @@ def _own_setup(episode: _Episode, key: str) -> CameraFile | None:
     if kept is None:
         return None
     try:
-        return CameraFile(Camera(**kept))
-    except (TypeError, InputError) as error:
+        return CameraFile(build(Camera, kept, CAMERA_KEY))
+    except (ValueError, TypeError) as error:
         raise RecordingError(f"dataset {episode.root}: {CAMERA_KEY} of {key} makes no sense ({error})") from error
 
 
@@ -332,46 +370,33 @@ def _stored_images(episode: _Episode, key: str, units_m: _Units, *, paired: bool
     for row in _read_rows(path, ["episode_index", key]):
         if row["episode_index"] != episode.index:
             continue
-        try:
-            with Image.open(io.BytesIO(row[key]["bytes"])) as image:
-                if paired and is_turned(image):
-                    raise RecordingError(f"{where}: {TURNED}")
-                pixels = np.asarray(image) if depth else colours_of(upright(image), where)
-        except (UnidentifiedImageError, OSError, TypeError, KeyError) as error:
-            raise RecordingError(f"{where} cannot be decoded ({error})") from error
+        with reading(where, RecordingError), Image.open(io.BytesIO(row[key]["bytes"])) as image:
+            if paired and is_turned(image):
+                raise RecordingError(f"{where}: {TURNED}")
+            pixels = np.asarray(image) if depth else colours_of(upright(image), where)
         if depth:
             unit_m = units_m.floats if np.issubdtype(pixels.dtype, np.floating) else units_m.integers
-            yield clean_depth(pixels.astype(np.float32) * np.float32(unit_m))
-        else:
-            yield pixels
+            pixels = metres(pixels, unit_m)
+        yield pixels
 
 
 def _read_rows(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
     """Rows one by one, a few in memory at a time."""
-    try:
-        with pq.ParquetFile(path) as file:
-            for batch in file.iter_batches(batch_size=8, columns=columns):
-                yield from batch.to_pylist()
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
+    with reading(f"dataset file {path}", RecordingError), pq.ParquetFile(path) as file:
+        for batch in file.iter_batches(batch_size=8, columns=columns):
+            yield from batch.to_pylist()
 
 
 def _columns(path: Path) -> list[str]:
-    try:
+    require_file(path, RecordingError)
+    with reading(f"dataset file {path}", RecordingError):
         return list(pq.read_schema(path).names)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
 
 
 def _read_table(path: Path, columns: list[str], *, filters: list[tuple[str, str, int]] | None = None) -> pa.Table:
-    try:
+    require_table(path, RecordingError)
+    with reading(f"dataset file {path}", RecordingError):
         return pq.read_table(path, columns=columns, filters=filters)
-    except (OSError, pa.ArrowException) as error:
-        raise _unreadable(path, error) from error
-
-
-def _unreadable(path: Path, error: Exception) -> RecordingError:
-    return RecordingError(f"dataset file {path}: cannot be read ({error}); copy it again")
 
 
 READER = Reader(

@@ -5,7 +5,6 @@ Reference: the MCAP specification, mcap.dev/spec.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from functools import cached_property
@@ -17,6 +16,7 @@ from quest.data.ros_frames import BAG_OPTIONS, open_messages
 from quest.data.ros_topics import Topic
 from quest.errors import RecordingError
 from quest.extras import require
+from quest.untrusted import reading
 
 
 class McapMessages:
@@ -96,26 +96,18 @@ class McapMessages:
     def _reader(self) -> Iterator[Any]:
         """A reader of the file at its beginning; errors of the file become ours."""
         exceptions = require("mcap.exceptions")
-        chunk = (require("zstandard").ZstdError, RuntimeError)  # of zstd and lz4
-        corrupt = (exceptions.McapError, *chunk, struct.error, EOFError, OSError, ValueError)
-        try:
-            with self.path.open("rb") as file:
+        remedy = "the file is corrupt, copy it again, or repair it with `mcap recover`"
+        with reading(f"MCAP {self.path}", RecordingError, remedy), self.path.open("rb") as file:
+            try:
                 decoder = require("mcap_ros2.decoder").DecoderFactory()
                 yield require("mcap.reader").make_reader(file, validate_crcs=True, decoder_factories=[decoder])
-        except RecordingError:
-            raise
-        except exceptions.InvalidMagic as error:
-            raise RecordingError(
-                f"MCAP {self.path}: not an MCAP file, or its end is missing ({error}); copy it again, or repair "
-                "it with `mcap recover`"
-            ) from error
-        except exceptions.DecoderNotFoundError as error:
-            raise RecordingError(f"MCAP {self.path}: {error}; name topics of ROS 2 messages") from error
-        except corrupt as error:
-            raise RecordingError(
-                f"MCAP {self.path}: cannot be read ({type(error).__name__}: {error}); the file is corrupt, copy it "
-                "again, or repair it with `mcap recover`"
-            ) from error
+            except exceptions.InvalidMagic as error:
+                raise RecordingError(
+                    f"MCAP {self.path}: not an MCAP file, or its end is missing ({error}); copy it again, or repair "
+                    "it with `mcap recover`"
+                ) from error
+            except exceptions.DecoderNotFoundError as error:
+                raise RecordingError(f"MCAP {self.path}: {error}; name topics of ROS 2 messages") from error
 
 
 def _open(where: str, options: ReadOptions) -> FrameSource:

@@ -10,6 +10,7 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageOps
 
 from quest.errors import InputError, RecordingError
+from quest.untrusted import reading, require_file
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 """Endings of files that are pictures."""
@@ -49,11 +50,10 @@ def decode_picture(file: Path | BytesIO, where: str) -> UInt8[np.ndarray, "H W 3
     Raises:
         InputError: it cannot be read.
     """
-    try:
-        with Image.open(file) as image:
-            return colours_of(upright(image), where)
-    except OSError as error:  # what is no picture, too
-        raise InputError(f"{where}: cannot be read ({error}); copy it again") from error
+    if isinstance(file, Path):
+        require_file(file, InputError)
+    with reading(where, InputError), Image.open(file) as image:
+        return colours_of(upright(image), where)
 
 
 def colours_of(image: Image.Image, where: str) -> UInt8[np.ndarray, "H W 3"]:

@@ -16,6 +16,8 @@ _FOOTPRINT = 1.25
 """Side of the square that a depth pixel covers, over what it would cover on a surface that faces both cameras: slanted
 surfaces are stretched, and tear open without it. Below two, pixels that fall on pixels cover nothing else."""
 _MOST_STRETCH = 4.0
+_MOST_WIDER = 16.0
+"""Pixels of the colours that one of the depth covers, across."""
 
 
 def register_depth(
@@ -80,6 +82,15 @@ class Rig:
     """Lens of the depth pictures, where they are not aligned."""
     colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Rigid transform from the depth camera's axes to the colour camera's, metres."""
+
+    def __post_init__(self) -> None:
+        depth = self.depth_grid
+        wider = max(self.camera.fx / depth.fx, self.camera.fy / depth.fy)
+        if wider > _MOST_WIDER:
+            raise InputError(
+                f"depth_camera: one of its pixels is as wide as {wider:.0f} pixels of the colours, expected at most "
+                f"{_MOST_WIDER:.0f}; check the focal lengths of both"
+            )
 
     @property
     def depth_grid(self) -> Camera:

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from quest.depth import clean_depth
+from quest.depth import clean_depth, metres
 from quest.errors import RecordingError
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
@@ -139,7 +139,7 @@ def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float
     if message.encoding == "32FC1":
         return clean_depth(_pixels(message, "f4", 1, where) * unit_m)
     if message.encoding in DEPTH_ENCODINGS:
-        return _pixels(message, "u2", 1, where).astype(np.float32) * unit_m
+        return metres(_pixels(message, "u2", 1, where), float(unit_m))
     raise RecordingError(
         f"{where}: encoding {message.encoding!r} is not one of depth; expected {', '.join(DEPTH_ENCODINGS)}; name "
         "another topic, or omit the depth"
@@ -179,7 +179,7 @@ def _compressed_depth(message: Any, where: str, unit_m: np.float32) -> np.ndarra
         return units.astype(np.float32) * unit_m
     with np.errstate(divide="ignore"):
         depth_m = quant_a / (units.astype(np.float64) - quant_b)
-    return clean_depth(np.where(units > 0, depth_m * unit_m, 0.0))
+    return clean_depth(np.where((units > 0) & (units < np.iinfo(np.uint16).max), depth_m * unit_m, 0.0))
 
 
 def _grey16(data: bytes, where: str) -> np.ndarray:
@@ -199,5 +199,7 @@ def _decode(data: Any, where: str, flags: int) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise RecordingError(f"{where}: {raw.size} bytes are no JPEG or PNG; the message is corrupt, record it again")
+        raise RecordingError(
+            f"{where}: {raw.size} bytes are no JPEG or PNG, or too large; the message is torn, record it again"
+        )
     return np.asarray(image)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
-import struct
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +12,7 @@ from quest.data.ros_frames import BAG_OPTIONS, open_messages
 from quest.data.ros_topics import Topic
 from quest.errors import RecordingError
 from quest.extras import require
+from quest.untrusted import reading
 
 
 class BagMessages:
@@ -53,36 +52,15 @@ class BagMessages:
     @contextmanager
     def _reader(self) -> Iterator[Any]:
         """An open reader; errors of the bag become ours."""
-        highlevel, typesys, serde = (require(f"rosbags.{name}") for name in ("highlevel", "typesys", "serde"))
-        rosbag1, rosbag2 = require("rosbags.rosbag1"), require("rosbags.rosbag2")
-        corrupt = (
-            highlevel.AnyReaderError,
-            serde.SerdeError,
-            rosbag1.ReaderError,
-            rosbag2.ReaderError,
-            typesys.TypesysError,
-            sqlite3.Error,
-            struct.error,
-            AssertionError,
-            EOFError,
-            LookupError,
-            RuntimeError,  # of lz4
-            ValueError,
-        )
+        highlevel, typesys = (require(f"rosbags.{name}") for name in ("highlevel", "typesys"))
+        reindex = "rosbag reindex" if self.path.suffix.lower() == ".bag" else "ros2 bag reindex"
+        remedy = f"the bag is corrupt, copy it again, or rebuild it with `{reindex}`"
         store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-        try:
-            with highlevel.AnyReader([self.path], default_typestore=store) as reader:
-                yield reader
-        except RecordingError:
-            raise
-        except corrupt as error:
-            reindex = "rosbag reindex" if self.path.suffix.lower() == ".bag" else "ros2 bag reindex"
-            raise RecordingError(
-                f"bag {self.path}: cannot be read ({type(error).__name__}: {error}); the bag is corrupt, copy it "
-                f"again, or rebuild it with `{reindex}`"
-            ) from error
-        except OSError as error:
-            raise RecordingError(f"bag {self.path}: cannot be read ({error}); check the files in it") from error
+        with (
+            reading(f"bag {self.path}", RecordingError, remedy),
+            highlevel.AnyReader([self.path], default_typestore=store) as reader,
+        ):
+            yield reader
 
 
 def _accepts(where: str) -> bool:

@@ -6,11 +6,10 @@ files. Writing is atomic: a take is there as a whole or not at all (:mod:`quest.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ import numpy as np
 from quest.data.store_location import SUFFIX, Draft, LocalFolder, Location, StoreError, open_location
 from quest.data.take_format import (
     HEADER_FILE,
+    REMEDY,
     TAKE_ARRAYS,
     VIEW_ARRAYS,
     TakeHash,
@@ -30,8 +30,9 @@ from quest.data.take_format import (
     parse_header,
     take_arrays,
 )
-from quest.errors import QuestError, TakeError
+from quest.errors import TakeError
 from quest.types import Clip, Take, TakeInfo, View
+from quest.untrusted import is_name, reading
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -41,6 +42,8 @@ if TYPE_CHECKING:
 FRAMES_PER_CHUNK = 4
 FRAMES_PER_SHARD = 60
 PIXEL_ARRAYS = ("rgb", "depth", "link_id", "entity_id")
+_MOST_PACKED = 2**16
+"""Bytes of an array per byte in its files: zstd packs equal bytes 2^15 times."""
 
 
 class TakeStore:
@@ -153,12 +156,10 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with self._opened(name, header) as group:
-            arrays = {
-                key: _read_array(group, key, rows).astype(dtype, copy=False) for key, dtype in TAKE_ARRAYS.items()
-            }
+        with self._opened(name, header) as stored:
+            arrays = {key: stored.read(key, rows).astype(dtype, copy=False) for key, dtype in TAKE_ARRAYS.items()}
             chosen = range(len(header.cameras)) if views is None else views
-            parts = tuple(_read_view(group, name, header, view, rows, arrays["stamp_s"]) for view in chosen)
+            parts = tuple(_read_view(stored, name, header, view, rows, arrays["stamp_s"]) for view in chosen)
         info = header.info
         if rows.step > 1:
             point = arrays["point_world"]
@@ -174,8 +175,8 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with self._opened(name, header) as group:
-            return _read_view(group, name, header, view, rows, _read_array(group, "stamp_s", rows))
+        with self._opened(name, header) as stored:
+            return _read_view(stored, name, header, view, rows, stored.read("stamp_s", rows))
 
     def read_clip(self, name: str, view: int = 0, *, frames: slice | None = None) -> Clip:
         """One camera's frames of a take without any ground truth, loading nothing else.
@@ -185,8 +186,8 @@ class TakeStore:
         """
         header = self.header(name)
         rows = _frames(name, header, frames)
-        with self._opened(name, header) as group:
-            return _read_clip(group, name, header, view, rows, _read_array(group, "stamp_s", rows))
+        with self._opened(name, header) as stored:
+            return _read_clip(stored, name, header, view, rows, stored.read("stamp_s", rows))
 
     def read_small_arrays(self, name: str) -> dict[str, np.ndarray]:
         """Every array of a take but its pixels, by path in the group, such as ``view_0/visible``.
@@ -197,8 +198,8 @@ class TakeStore:
         header = self.header(name)
         small = [key for key in ("cam_from_world", *VIEW_ARRAYS) if key not in PIXEL_ARRAYS]
         paths = [*TAKE_ARRAYS, *(f"view_{view}/{key}" for view in range(len(header.cameras)) for key in small)]
-        with self._opened(name, header) as group:
-            return {path: _read_array(group, path, slice(None)) for path in paths}
+        with self._opened(name, header) as stored:
+            return {path: stored.read(path, slice(None)) for path in paths}
 
     def verify(self, name: str) -> None:
         """Read every array of a take and compare with its recorded hash.
@@ -256,22 +257,15 @@ class TakeStore:
             return error
 
     @contextmanager
-    def _opened(self, name: str, header: TakeHeader) -> Iterator[zarr.Group]:
+    def _opened(self, name: str, header: TakeHeader) -> Iterator[_Arrays]:
         """The open group; damage that only decoding shows becomes a TakeError."""
         import zarr
 
         where = self._location.describe(name)
-        with self._location.reaching():
+        with reading(f"take {name!r}: {where} is torn: an array", TakeError, REMEDY), self._location.reaching():
             store, path = self._location.zarr_group(name, header.arrays_at)
-            try:
-                yield zarr.open_group(store, path=path, mode="r", zarr_format=3, use_consolidated=False)
-            except (QuestError, PermissionError):
-                raise
-            except (KeyError, ValueError, RuntimeError, OSError, TypeError, zlib.error) as error:
-                raise TakeError(
-                    f"take {name!r}: {where} is torn, an array cannot be decoded ({type(error).__name__}: {error}); "
-                    "delete its folder and generate it again"
-                ) from error
+            group = zarr.open_group(store, path=path, mode="r", zarr_format=3, use_consolidated=False)
+            yield _Arrays(group, header)
 
 
 def locate_take(path: str | Path) -> tuple[TakeStore, str]:
@@ -299,8 +293,8 @@ def open_clip(path: str | Path, *, view: int = 0, frames: slice | None = None) -
 
 
 def _check_name(name: str) -> None:
-    if not name or name.startswith(".") or "/" in name or "\\" in name:
-        raise TakeError(f"take {name!r}: a name must not be empty, start with a dot or contain a slash")
+    if not is_name(name):
+        raise TakeError(f"take {name!r}: a name must not be empty or long, start with a dot or contain a slash")
 
 
 def _frames(name: str, header: TakeHeader, frames: slice | None) -> slice:
@@ -313,27 +307,43 @@ def _frames(name: str, header: TakeHeader, frames: slice | None) -> slice:
     return slice(picked.start, picked.stop, picked.step)
 
 
-def _read_array(group: zarr.Group, path: str, rows: slice) -> np.ndarray:
-    return np.asarray(group[path][rows])  # type: ignore[index]
+@dataclass(frozen=True)
+class _Arrays:
+    """The arrays of a take."""
+
+    group: zarr.Group
+    header: TakeHeader
+
+    def read(self, path: str, rows: slice) -> np.ndarray:
+        """Some frames of an array; nothing is allocated that its files cannot hold."""
+        array: Any = self.group[path]
+        files = f"{self.header.arrays_at}/{path}/".removeprefix("/")
+        stored = sum(size for file, size in self.header.files.items() if file.startswith(files))
+        if array.shape[:1] != (self.header.frames,) or array.nbytes > _MOST_PACKED * stored:
+            raise TakeError(
+                f"take {self.header.info.name!r}: {path} has shape {array.shape} for {self.header.frames} frames in "
+                f"{stored} bytes; {REMEDY}"
+            )
+        return np.asarray(array[rows])
 
 
-def _read_clip(group: zarr.Group, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> Clip:
+def _read_clip(arrays: _Arrays, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> Clip:
     if not 0 <= view < len(header.cameras):
         raise TakeError(f"take {name!r}: no view {view}; it has views 0 to {len(header.cameras) - 1}")
-    depth_m = decode_depth(_read_array(group, f"view_{view}/depth", rows)) if header.has_depth[view] else None
+    depth_m = decode_depth(arrays.read(f"view_{view}/depth", rows)) if header.has_depth[view] else None
     return Clip(
         name=header.clip_names[view],
         camera=header.cameras[view],
-        rgb=_read_array(group, f"view_{view}/rgb", rows),
+        rgb=arrays.read(f"view_{view}/rgb", rows),
         depth_m=depth_m,
         stamp_s=stamp_s,
-        cam_from_world=_read_array(group, f"view_{view}/cam_from_world", rows),
+        cam_from_world=arrays.read(f"view_{view}/cam_from_world", rows),
     )
 
 
-def _read_view(group: zarr.Group, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> View:
-    clip = _read_clip(group, name, header, view, rows, stamp_s)
-    return View(clip=clip, **{key: _read_array(group, f"view_{view}/{key}", rows) for key in VIEW_ARRAYS})
+def _read_view(arrays: _Arrays, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> View:
+    clip = _read_clip(arrays, name, header, view, rows, stamp_s)
+    return View(clip=clip, **{key: arrays.read(f"view_{view}/{key}", rows) for key in VIEW_ARRAYS})
 
 
 def _write_take(take: Take, draft: Draft) -> None:

@@ -30,6 +30,7 @@ from urllib.request import url2pathname
 from quest.data.take_format import HEADER_FILE
 from quest.errors import ConfigError, TakeError
 from quest.extras import require
+from quest.untrusted import require_file
 
 if TYPE_CHECKING:
     from zarr.storage import StoreLike
@@ -102,10 +103,11 @@ class LocalFolder:
 
     def header(self, name: str) -> bytes | None:
         """Content of a take's header; None if it has none."""
-        try:
-            return (self.path(name) / HEADER_FILE).read_bytes()
-        except (FileNotFoundError, NotADirectoryError):
+        file = self.path(name) / HEADER_FILE
+        if not file.exists():
             return None
+        require_file(file, TakeError)
+        return file.read_bytes()
 
     def sizes(self, name: str, files: Mapping[str, int]) -> dict[str, int]:
         """Sizes in bytes of those files that are there, by path relative to the take."""

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from quest.errors import InputError, TakeError
-from quest.types import Camera, Entity, Joint, Take, TakeInfo
+from quest.types import Camera, Take, TakeInfo
+from quest.untrusted import build, is_inside, is_name, parse_json, reading
 
 FORMAT = "quest-take"
 VERSIONS = (1, 2)
@@ -85,29 +86,25 @@ class TakeHeader:
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any]) -> TakeHeader:
         """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
-        views = attributes["views"]
-        return cls(
+        views = build(list[dict], attributes["views"], "views")
+        header = cls(
             info=info_from_json(attributes["info"]),
-            frames=int(attributes["frames"]),
-            cameras=tuple(Camera(**view["camera"]) for view in views),
-            clip_names=tuple(view["name"] for view in views),
-            has_depth=tuple(bool(view["has_depth"]) for view in views),
-            data_hash=attributes["data_hash"],
-            files={str(path): int(size) for path, size in attributes["files"].items()},
-            arrays_at=attributes.get("arrays_at", ""),
+            frames=build(int, attributes["frames"], "frames"),
+            cameras=tuple(build(Camera, view["camera"], "camera") for view in views),
+            clip_names=tuple(build(str, view["name"], "name of a view") for view in views),
+            has_depth=tuple(build(bool, view["has_depth"], "has_depth") for view in views),
+            data_hash=build(str, attributes["data_hash"], "data_hash"),
+            files=build(dict[str, int], attributes["files"], "files"),
+            arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
         )
+        if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
+            raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
+        return header
 
 
 def info_from_json(fields: Mapping[str, Any]) -> TakeInfo:
     """The inverse of ``dataclasses.asdict`` on a :class:`TakeInfo` that went through JSON."""
-    return TakeInfo(
-        **{
-            **fields,
-            "entities": tuple(Entity(**entity) for entity in fields["entities"]),
-            "joints": tuple(Joint(**joint) for joint in fields["joints"]),
-            "moved_joints": tuple(fields["moved_joints"]),
-        }
-    )
+    return build(TakeInfo, fields, "info")
 
 
 def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
@@ -123,10 +120,9 @@ def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
     """
     if data is None:
         raise TakeError(f"take {name!r}: {where} holds no {HEADER_FILE}, so it is torn or not a take; {REMEDY}")
-    try:
-        attributes = json.loads(data)["attributes"]
-    except (ValueError, KeyError, TypeError) as error:
-        raise TakeError(f"take {name!r}: {where}/{HEADER_FILE} cannot be read ({error}); {REMEDY}") from error
+    file = f"take {name!r}: {where}/{HEADER_FILE}"
+    group = parse_json(data, file, TakeError)
+    attributes = group.get("attributes") if isinstance(group, dict) else None
     if not isinstance(attributes, dict) or attributes.get("format") != FORMAT:
         raise TakeError(
             f"take {name!r}: {where} is a Zarr group but not a take (no format {FORMAT!r}); give a take's folder"
@@ -136,10 +132,13 @@ def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
             f"take {name!r}: {where} has format version {attributes.get('version')!r}, expected "
             f"{' or '.join(map(str, VERSIONS))}; generate it again, or use the version of quest that wrote it"
         )
-    try:
-        return TakeHeader.from_attributes(attributes)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise TakeError(f"take {name!r}: {where}/{HEADER_FILE} is damaged ({error!r}); {REMEDY}") from error
+    with reading(file, TakeError, REMEDY):
+        header = TakeHeader.from_attributes(attributes)
+    if header.info.name != name or not is_name(name):
+        raise TakeError(f"{file} is of a take of another name, {header.info.name!r}; give its folder that name")
+    if outside := [path for path in header.files if not is_inside(path)]:
+        raise TakeError(f"{file} lists files outside of the take, such as {outside[0]!r}; {REMEDY}")
+    return header
 
 
 def check_files(name: str, where: str, files: Mapping[str, int], found: Mapping[str, int]) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from quest.data.ros_images import header_ns
+from quest.errors import RecordingError
 
 _KEEP_NS = 30_000_000_000
 """How long what moved is remembered."""
@@ -111,9 +112,15 @@ class Transforms:
             edge.forget(stamp_ns - _KEEP_NS)
 
     def _line(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on to the root."""
+        """The frame, its parent, and so on to the root.
+
+        Raises:
+            RecordingError: there is no root.
+        """
         line = [frame_name(frame)]
-        while (edge := self._edges.get(line[-1])) is not None and edge.parent not in line:
+        while (edge := self._edges.get(line[-1])) is not None:
+            if edge.parent in line:
+                raise RecordingError(f"tf: {', '.join(line)} hang on each other in a ring; record the transforms again")
             line.append(edge.parent)
         return line
 

@@ -22,6 +22,7 @@ from quest.evaluation.records import (
     write_records,
 )
 from quest.evaluation.summary import Metrics, Row
+from quest.untrusted import read_json, reading
 from quest.whole_file import whole_file
 
 FORMAT = 1
@@ -140,8 +141,9 @@ def read_results(path: str | Path) -> Results:
     Raises:
         InputError: the file is missing, damaged, or of another format version.
     """
-    try:
-        raw = json.loads(Path(path).read_text(encoding="utf-8"))
+    remedy = "expected a file written by `quest eval --out`"
+    raw = read_json(Path(path), InputError, remedy)
+    with reading(f"results {path}", InputError, remedy):
         if raw["format"] != FORMAT:
             raise InputError(f"results {path}: expected format {FORMAT}, got {raw['format']}; run `quest eval` again")
         return Results(
@@ -151,12 +153,6 @@ def read_results(path: str | Path) -> Results:
             unscored=tuple(Unscored(**u) for u in raw["unscored"]),
             notes=tuple(raw["notes"]),
         )
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"results {path}: expected a file written by `quest eval --out` ({type(error).__name__}: {error})"
-        ) from error
 
 
 def _row(raw: dict[str, Any]) -> Row:

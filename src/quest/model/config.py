@@ -8,6 +8,7 @@ from typing import TypeVar
 
 from quest.errors import ConfigError
 from quest.model.encoder import EncoderConfig
+from quest.untrusted import build, parse_json, reading
 
 _Config = TypeVar("_Config", bound="NetworkConfig")
 
@@ -30,8 +31,7 @@ class NetworkConfig:
         Raises:
             ConfigError: the text is not a network configuration of this version.
         """
-        try:
-            values = json.loads(text)
-            return cls(**{**values, "encoder": EncoderConfig(**values["encoder"])})
-        except (json.JSONDecodeError, KeyError, TypeError) as error:
-            raise ConfigError(f"network configuration cannot be read: {error}") from error
+        what, remedy = "network configuration", "fetch or train the network again"
+        values = parse_json(text, what, ConfigError, remedy)
+        with reading(what, ConfigError, remedy):
+            return build(cls, {**values, "encoder": values["encoder"]}, "configuration")

@@ -7,18 +7,22 @@ follow Oquab et al., DINOv2, TMLR 2024.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 
-from quest.errors import WeightsError
+from quest.errors import ConfigError, WeightsError
+from quest.untrusted import reading
 
 _MEAN = (0.485, 0.456, 0.406)
 _STD = (0.229, 0.224, 0.225)
+_MOST_SIZE, _MOST_DEPTH = 2**14, 1024
+_Module = TypeVar("_Module", bound=nn.Module)
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,11 @@ class EncoderConfig:
     """Number of transformer blocks."""
     heads: int = 6
     """Attention heads."""
+
+    def __post_init__(self) -> None:
+        sizes = (self.image_size, self.patch_size, self.width, self.heads)
+        if min(sizes) < 1 or max(sizes) > _MOST_SIZE or not 0 <= self.depth <= _MOST_DEPTH:
+            raise ConfigError(f"encoder: expected sizes of 1 to {_MOST_SIZE}, blocks to {_MOST_DEPTH}, got {self}")
 
     @property
     def grid(self) -> int:
@@ -139,12 +148,36 @@ class Encoder(nn.Module):
         load_exactly(self, state, what="encoder weights")
 
 
+def read_into(make: Callable[[], _Module], state: Mapping[str, Tensor], *, what: str) -> _Module:
+    """A network with the weights of a file; nothing is allocated before their shapes are known to fit.
+
+    Args:
+        make: makes the network.
+        state: the weights.
+        what: they are, for messages.
+
+    Raises:
+        WeightsError: names or shapes differ from the network's, or no network can be of such a shape.
+    """
+    with reading(what, WeightsError, "fetch or train them again"):
+        with torch.device("meta"):
+            _check_shapes(make(), state, what=what)
+        module = make()
+    load_exactly(module, state, what=what)
+    return module
+
+
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], *, what: str) -> None:
     """Load a state dict, naming what does not fit.
 
     Raises:
         WeightsError: names or shapes differ from the module's.
     """
+    _check_shapes(module, state, what=what)
+    module.load_state_dict(dict(state))
+
+
+def _check_shapes(module: nn.Module, state: Mapping[str, Tensor], *, what: str) -> None:
     own = module.state_dict()
     missing, unknown = sorted(own.keys() - state.keys()), sorted(state.keys() - own.keys())
     shapes = [
@@ -157,7 +190,6 @@ def load_exactly(module: nn.Module, state: Mapping[str, Tensor], *, what: str) -
             f"{what} do not fit this network: missing {missing[:3]}, unknown {unknown[:3]}, shapes {shapes[:3]}; "
             "use the preset that the weights were made with"
         )
-    module.load_state_dict(dict(state))
 
 
 def resize_position(position: Float[Tensor, "1 M D"], grid: tuple[int, int]) -> Float[Tensor, "1 N D"]:

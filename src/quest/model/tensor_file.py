@@ -18,6 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from quest.errors import WeightsError
+from quest.untrusted import build, is_name, parse_json, reading, require_file
 from quest.whole_file import whole_file
 
 
@@ -40,13 +41,15 @@ def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict
     Raises:
         WeightsError: it is torn, or no such file.
     """
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            names = [name for name in file.keys() if parts is None or part_of(name) in parts]  # noqa: SIM118 (not a dict)
-            return metadata, {name: file.get_tensor(name) for name in names}
-    except (SafetensorError, OSError) as error:
-        raise WeightsError(f"{path}: not a whole safetensors file ({error}); fetch or train it again") from error
+    remedy = "not a whole safetensors file, fetch or train it again"
+    require_file(path, WeightsError, remedy)
+    with reading(path, WeightsError, remedy), safe_open(path, framework="pt") as file:
+        metadata = file.metadata() or {}
+        names = [name for name in file.keys() if parts is None or part_of(name) in parts]  # noqa: SIM118 (not a dict)
+        tensors = {name: file.get_tensor(name) for name in names}
+    if bad := [name for name, tensor in tensors.items() if not tensor.isfinite().all()]:
+        raise WeightsError(f"{path}: {bad[0]} has values that are no numbers; fetch or train it again")
+    return metadata, tensors
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping[str, str] | None = None) -> None:
@@ -124,11 +127,12 @@ def fetch_shared(path: Path, metadata: Mapping[str, str], shipped: Mapping[str, 
     """
     if SHARED not in metadata:
         return {}
-    try:
-        said = json.loads(metadata[SHARED])
-        name, parts = str(said["file"]), {str(part): str(digest) for part, digest in said["parts"].items()}
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise WeightsError(f"{path}: what it shares with other weights is torn ({error}); fetch it again") from error
+    torn = f"{path}: what it shares with other weights is torn"
+    said = parse_json(metadata[SHARED], torn, WeightsError)
+    with reading(torn, WeightsError, "fetch it again"):
+        name, parts = build(str, said["file"], "file"), build(dict[str, str], said["parts"], "parts")
+        if not is_name(name):
+            raise ValueError(f"{name!r} is no name of a file")
     beside = path.with_name(f"{name}.safetensors")
     other = beside if beside.is_file() else shipped.get(name)
     if other is None:

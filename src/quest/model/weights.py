@@ -14,7 +14,7 @@ from huggingface_hub import ModelCard, PyTorchModelHubMixin
 from torch import nn
 
 from quest.errors import ConfigError, WeightsError
-from quest.model.encoder import load_exactly
+from quest.model.encoder import read_into
 from quest.model.finder import FinderConfig, FinderNetwork
 from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
 from quest.model.tensor_file import fetch_shared, read_tensors, save_half
@@ -263,11 +263,12 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
             "preset paper, is read by `quest eval`)"
         )
     try:
-        network = FinderNetwork(FinderConfig.from_json(metadata["config"]))
+        config = FinderConfig.from_json(metadata["config"])
     except (ConfigError, KeyError) as error:
         raise WeightsError(f"{path}: {error}; the file is of another version of quest") from error
     state |= fetch_shared(path, metadata, shipped_weights())
-    load_exactly(network, {k: v.to(torch.float32) for k, v in state.items()}, what=f"weights {path}")
+    state = {k: v.to(torch.float32) for k, v in state.items()}
+    network = read_into(lambda: FinderNetwork(config), state, what=f"weights {path}")
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return LoadedNetwork(

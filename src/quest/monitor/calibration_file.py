@@ -10,6 +10,7 @@ from typing import Final, Literal, get_args
 
 from quest.errors import WeightsError
 from quest.monitor.calibration import Calibration
+from quest.untrusted import read_json, reading
 from quest.whole_file import whole_file
 
 Inputs = Literal["depth", "colours"]
@@ -33,10 +34,9 @@ def read_calibrations(path: Path | None = None) -> dict[Inputs, Calibration]:
     file = resources.files("quest").joinpath(*_PACKAGED) if path is None else path
     if path is None and not file.is_file():
         return {}
-    try:
-        raw = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise WeightsError(f"monitor {file}: cannot be read ({error}); make it with `quest calibrate`") from error
+    remedy = "make it with `quest calibrate`"
+    with reading(f"monitor {file}", WeightsError, remedy):
+        raw = json.loads(file.read_text(encoding="utf-8")) if path is None else read_json(path, WeightsError, remedy)
     if not isinstance(raw, dict) or not raw or not raw.keys() <= set(get_args(Inputs)):
         known = " or ".join(get_args(Inputs))
         raise WeightsError(f"monitor {file}: expected calibrations for {known}; make it with `quest calibrate`")

@@ -50,13 +50,14 @@ from torch import Tensor, nn
 
 from quest.errors import ConfigError, WeightsError
 from quest.model.config import NetworkConfig
-from quest.model.encoder import Encoder, load_exactly
+from quest.model.encoder import Encoder, read_into
 from quest.model.frames import FrameBatch
 from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 from quest.model.weights import shipped_weights
 from quest.paper.decoder import DecoderLayer, Tokens
 from quest.paper.flow_head import FlowHead
 from quest.types import LABELS
+from quest.untrusted import reading
 
 FORMAT = "quest-paper-1"
 
@@ -277,10 +278,12 @@ def read_paper(path: Path) -> LoadedPaper:
     metadata, state = read_tensors(path)
     if metadata.get("format") != FORMAT:
         raise WeightsError(f"{path}: expected weights of format {FORMAT!r}, got {metadata.get('format')!r}")
-    network = PaperNetwork(PaperConfig.from_json(metadata["config"]))
+    with reading(path, WeightsError, "fetch or train it again"):
+        config, about, licence = PaperConfig.from_json(metadata["config"]), metadata["about"], metadata["licence"]
     state |= fetch_shared(path, metadata, shipped_weights())
-    load_exactly(network, {name: tensor.float() for name, tensor in state.items()}, what=f"weights {path}")
-    return LoadedPaper(network.eval(), metadata["about"], metadata["licence"])
+    state = {name: tensor.float() for name, tensor in state.items()}
+    network = read_into(lambda: PaperNetwork(config), state, what=f"weights {path}")
+    return LoadedPaper(network.eval(), about, licence)
 
 
 def _gather(value: Tensor, slot: Int[Tensor, "B E"]) -> Tensor:

@@ -12,7 +12,6 @@ Links that no entry speaks of keep the entities that are found without a descrip
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -26,6 +25,7 @@ from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.entities import PlacedEntity
 from quest.types import GRIPS, LABELS
+from quest.untrusted import read_json
 
 DESCRIPTION_NAME = "entities.json"
 """Name of the file beside the URDF."""
@@ -82,10 +82,7 @@ def read_description(path: Path) -> Description:
     Raises:
         ObjectError: it is not JSON, or an entry has a field that is unknown, missing or of a wrong kind.
     """
-    try:
-        raw = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise ObjectError(f"{path}: not readable as JSON ({error}); mend it, see docs/objects.md") from None
+    raw = read_json(path, ObjectError, "mend it, see docs/objects.md")
     _check_keys(raw, _KEYS, str(path))
     sizes = {key: _positive(raw[key], f"{path}: {key}") for key in ("size_m", "height_m") if key in raw}
     if len(sizes) > 1:

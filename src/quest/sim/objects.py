@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from quest.sim.entities import MOVES_AT_LEAST, SimEntity, find_entities, part_la
 from quest.sim.standing import closed, placed, real_scale, scaled, size_scale, with_scaled_origins
 from quest.sim.urdf import Urdf, UrdfVisual, read_urdf
 from quest.types import Joint
+from quest.untrusted import read_json, reading
 
 OBJECTS_VARIABLE = "QUEST_OBJECTS"
 """Environment variable that names the folder of PartNet-Mobility folders."""
@@ -147,7 +147,12 @@ def load_object(path: Path) -> SimObject:
         ObjectError: the folder, its URDF or its description is missing or broken, all meshes are missing, or nothing
             moves.
     """
-    urdf_path = find_urdf(Path(path))
+    with reading(path, ObjectError, "use another object"):
+        return _load(Path(path))
+
+
+def _load(path: Path) -> SimObject:
+    urdf_path = find_urdf(path)
     folder = urdf_path.parent
     warnings: list[str] = []
     urdf = read_urdf(urdf_path)
@@ -181,7 +186,7 @@ def load_object(path: Path) -> SimObject:
         raise ObjectError(
             f"{folder}: expected at most {_MOST_ENTITIES} handles, knobs, rims, fronts and hinges, got {len(entities)}"
         )
-    object_id = object_id_of(Path(path))
+    object_id = object_id_of(path)
     return SimObject(
         source, object_id, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
     )  # fmt: skip
@@ -248,9 +253,9 @@ def _read_json(path: Path, warnings: list[str]) -> Any:
     if not path.exists():
         return None
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        warnings.append(f"{path.name} is not readable ({error}) and was left out")
+        return read_json(path, ObjectError)
+    except ObjectError as error:
+        warnings.append(f"left out: {error}")
         return None
 
 

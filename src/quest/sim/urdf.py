@@ -14,6 +14,11 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import ObjectError
+from quest.untrusted import reading, require_file
+
+_MOST = 1e6
+"""Beyond which no number of a URDF is believed."""
+_MOST_BYTES = 2**26
 
 CONTINUOUS_RANGE_RAD = np.pi / 2
 """How far a joint without limits is taken to turn."""
@@ -79,28 +84,22 @@ def read_urdf(path: Path) -> Urdf:
     Raises:
         ObjectError: the file is missing, is not XML, or its links do not form a tree.
     """
-    try:
+    if not path.exists():
+        raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf")
+    require_file(path, ObjectError, most=_MOST_BYTES)
+    with reading(path, ObjectError, "not a readable URDF, restore the file from its source"):
         root = ElementTree.parse(path).getroot()
-    except FileNotFoundError:
-        raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf") from None
-    except (ElementTree.ParseError, ValueError, LookupError) as error:  # the latter two: of its encoding
-        raise ObjectError(f"{path}: not a readable URDF ({error}); restore the file from its source") from None
     if any("ros.org/wiki/xacro" in str(element.tag) for element in root.iter()):
         raise ObjectError(
             f"{path}: expected a URDF, got xacro, which has to be expanded; run: xacro {path.name} > expanded.urdf"
         )
     colours = {m.get("name"): rgba for m in root.findall("material") if (rgba := _rgba(m)) is not None}
-    try:
+    with reading(f"{path}: a link, visual or joint", ObjectError, "restore the file from its source"):
         links = {
             link.attrib["name"]: tuple(_visual(v, path.parent, colours) for v in link.findall("visual"))
             for link in root.findall("link")
         }
         joints = [_joint(joint) for joint in root.findall("joint")]
-    except (KeyError, ValueError, AttributeError) as error:
-        raise ObjectError(
-            f"{path}: a link, visual or joint lacks a field or has an unreadable one ({error!r}); "
-            "restore the file from its source"
-        ) from None
     return Urdf(links, _ordered(joints, links, path))
 
 
@@ -120,10 +119,17 @@ def pose_matrix(xyz: Float[np.ndarray, "3"], rpy: Float[np.ndarray, "3"]) -> Flo
 def _numbers(text: str | None, default: tuple[float, ...]) -> np.ndarray:
     if text is None:
         return np.array(default, dtype=np.float64)
-    values = np.array([float(v) for v in text.split()])
-    if values.shape != (len(default),) or not np.isfinite(values).all():
+    values = np.array([_number(v) for v in text.split()])
+    if values.shape != (len(default),):
         raise ValueError(f"expected {len(default)} finite numbers, got {text!r}")
     return values
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not abs(value) < _MOST:
+        raise ValueError(f"expected a number below {_MOST:g}, got {text!r}")
+    return value
 
 
 def _origin(element: ElementTree.Element) -> Float[np.ndarray, "4 4"]:
@@ -152,14 +158,14 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
         scale = (
             _numbers(scale_text, (1, 1, 1))
             if len((scale_text or "1 1 1").split()) == 3
-            else np.full(3, float(scale_text or 1))
+            else np.full(3, _number(scale_text or "1"))
         )
     elif shape.tag == "box":
         size = _numbers(shape.attrib["size"], (0, 0, 0))
     elif shape.tag == "cylinder":
-        size = np.array([float(shape.attrib["radius"]), float(shape.attrib["length"])])
+        size = np.array([_number(shape.attrib["radius"]), _number(shape.attrib["length"])])
     elif shape.tag == "sphere":
-        size = np.array([float(shape.attrib["radius"])])
+        size = np.array([_number(shape.attrib["radius"])])
     else:
         raise ValueError(f"unknown geometry {shape.tag!r}")
     material = element.find("material")
@@ -202,9 +208,7 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
         if urdf_type == "continuous" or limit is None:
             lower, upper = 0.0, CONTINUOUS_RANGE_RAD if kind == "revolute" else 0.0
         else:
-            lower, upper = sorted((float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0))))
-        if not (np.isfinite(lower) and np.isfinite(upper)):
-            raise ValueError(f"joint {element.get('name')!r} has limits {lower}, {upper}")
+            lower, upper = sorted((_number(limit.get("lower", "0")), _number(limit.get("upper", "0"))))
     return UrdfJoint(
         element.attrib["name"], kind, parent.attrib["link"], child.attrib["link"], _origin(element),
         axis / max(norm, 1e-9), lower, upper, None if mimic is None else mimic.get("joint"),

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 
 import cv2
@@ -16,13 +15,18 @@ from quest.errors import InputError
 from quest.filter.picture import Picture
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.xfeat import MULTIPLE, XFeat
+from quest.track.health import Health, digest_of
 from quest.types import Camera
+from quest.untrusted import reading
 
 NO_DEPTH_FLAG = "no depth: pixels only, world points are NaN"
 DEPTH_BEGINS_FLAG = "depth begins: world points from here on"
 
 _CLOCK_RESTART_S = 5.0
 _LEAST_DEPTHS = 16
+_LATEST_S = 1e12
+"""Thirty thousand years."""
+_LEAST_BEYOND = 0.001
 
 
 class Arrival(Enum):
@@ -53,6 +57,8 @@ class PreprocessorState:
     """Whether the poses that were given tell how the camera moves: they have changed."""
     has_depth: bool = False
     """Whether a frame so far brought depth."""
+    health: Health = field(default_factory=Health)
+    """What pictures and depth are compared with."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +73,8 @@ class Prepared:
     """Pose of the camera; None where none is given, and before those that are given change."""
     first_pose: Float[np.ndarray, "4 4"] | None
     """That of the first frame of the stream that has one; None in all others."""
+    blind: bool
+    """Whether the picture shows nothing, so that nothing can be told from the frame."""
 
 
 class Preprocessor:
@@ -99,14 +107,19 @@ class Preprocessor:
         depth_m: Float32[np.ndarray, "H W"] | None,
         stamp_s: float,
         cam_from_world: Float[np.ndarray, "4 4"] | None,
-    ) -> None:
-        """Refuse what no camera sends.
+    ) -> float:
+        """Refuse what no camera sends; returns the stamp as a number of Python's.
 
         Raises:
-            InputError: the frame does not have the camera's size or type, its stamp is not finite, its pose is not
-                rigid, or the first depth is not in metres.
+            InputError: the frame does not have the camera's size or type, its stamp is no time, its pose is not rigid,
+                or the first depth is not in metres.
         """
         expected = (self.camera.height, self.camera.width, 3)
+        for what, given in (("colours", rgb), ("depth", depth_m)):
+            if given is not None and not isinstance(given, np.ndarray):
+                raise InputError(f"frame {frame}: expected {what} as an array of NumPy, got {type(given).__name__}")
+        if rgb is None:
+            raise InputError(f"frame {frame}: expected colours {expected} of uint8, got None")
         if rgb.shape != expected or rgb.dtype != np.uint8:
             raise InputError(f"frame {frame}: expected colours {expected} of uint8, got {rgb.shape} of {rgb.dtype}")
         if depth_m is not None and depth_m.shape != expected[:2]:
@@ -119,14 +132,20 @@ class Preprocessor:
         median_m = None if depth_m is None or self.state.has_depth else _implausible(depth_m)
         if median_m is not None:
             raise InputError(f"frame {frame}: expected depth in metres, got {median_m:.3g} in the median")
-        if not np.isfinite(stamp_s):
-            raise InputError(f"frame {frame}: expected a finite time stamp in seconds, got {stamp_s}")
-        pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world)
+        with reading(f"frame {frame}: stamp or pose", InputError, "expected numbers"):
+            seconds = float(stamp_s)
+            pose = np.eye(4) if cam_from_world is None else np.asarray(cam_from_world, dtype=np.float64)
+        if not abs(seconds) < _LATEST_S:
+            raise InputError(
+                f"frame {frame}: expected a time stamp in seconds, below {_LATEST_S:g}, got {seconds:g}; divide "
+                "nanoseconds by 1e9"
+            )
         if pose.shape != (4, 4) or not is_rigid(pose):
             raise InputError(
                 f"frame {frame}: expected cam_from_world as a rigid 4 x 4 transform (rotation, translation in metres, "
                 f"last row 0 0 0 1), got {pose.tolist()}; None where it is unknown"
             )
+        return seconds
 
     def accept(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> Arrival:
         """Whether a frame is the next one; what comes too late or twice changes nothing.
@@ -141,7 +160,7 @@ class Preprocessor:
                 state.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
                 return Arrival.LATE
             state.flags = (f"clock went back by {before - stamp_s:.1f} s",)
-        digest = hashlib.blake2b(np.ascontiguousarray(rgb).data, digest_size=16).hexdigest()
+        digest = digest_of(rgb)
         if digest == state.digest and stamp_s == before:
             state.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
             return Arrival.DUPLICATE
@@ -159,12 +178,21 @@ class Preprocessor:
     ) -> Prepared:
         """The frame that was accepted last."""
         state = self.state
+        flags, blind = state.health.of_picture(rgb, state.digest)
+        state.flags += flags
         median_m = None if depth_m is None else _implausible(depth_m)
         if median_m is not None:
             state.flags += (f"depth ignored: {median_m:.3g} m in the median",)
             depth_m = None
         if depth_m is not None:
-            depth_m = np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(0))
+            beyond = float((depth_m > PLAUSIBLE_DEPTH_M[1]).mean())
+            if beyond > _LEAST_BEYOND:
+                state.flags += (f"depth beyond {PLAUSIBLE_DEPTH_M[1]:g} m ignored: {beyond:.0%} of the pixels",)
+            depth_m = np.where((depth_m > 0) & (depth_m <= PLAUSIBLE_DEPTH_M[1]), depth_m, np.float32(0))
+            wrong = state.health.of_depth(depth_m)
+            if wrong is not None:
+                state.flags += (f"depth ignored: {wrong}",)
+                depth_m = None
         if depth_m is None or not depth_m.any():
             state.flags += (NO_DEPTH_FLAG,)
             depth_m = None
@@ -172,7 +200,7 @@ class Preprocessor:
             if state.pose is not None or state.now_s > 0:
                 state.flags += (DEPTH_BEGINS_FLAG,)
             state.has_depth = True
-        return Prepared(grey_of(rgb), depth_m, *self._poses(cam_from_world))
+        return Prepared(grey_of(rgb), depth_m, *self._poses(cam_from_world), blind)
 
     def _poses(self, cam_from_world: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The frame's pose, and the same if it is the stream's first.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import deque
 from dataclasses import fields, is_dataclass
@@ -11,14 +12,14 @@ from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import torch
-from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from quest.errors import InputError
+from quest.untrusted import reading
 
-FORMAT = "quest-stream-12"
+FORMAT = "quest-stream-13"
 _KEY = "quest-stream"
 _T = TypeVar("_T")
 
@@ -31,6 +32,7 @@ def save(tree: object) -> bytes:
     """
     tensors: dict[str, Tensor] = {}
     header = {"format": FORMAT, "tree": _flatten(tree, "tree", tensors)}
+    header["sha256"] = _digest(header["tree"], tensors)
     # One entry: the order of several is not fixed.
     return save_tensors(tensors, metadata={_KEY: json.dumps(header, sort_keys=True)})
 
@@ -46,17 +48,25 @@ def load(data: bytes, kind: type[_T] | GenericAlias, *, device: torch.device | s
     Raises:
         InputError: the bytes are corrupt, of another format, or hold another kind of tree.
     """
-    try:
+    with reading(f"saved stream of {len(data)} bytes", InputError, "give the bytes of Tracker.save()"):
         tensors = load_tensors(data)
         length = int.from_bytes(data[:8], "little")
         header = json.loads(json.loads(data[8 : 8 + length])["__metadata__"][_KEY])
-        if header["format"] == FORMAT:
-            return _unflatten(kind, header["tree"], tensors, torch.device(device))
-    except (SafetensorError, KeyError, ValueError, TypeError) as error:
-        raise InputError(
-            f"saved stream: expected the bytes of Tracker.save(), got {len(data)} bytes that are not ({error})"
-        ) from error
-    raise InputError(f"saved stream: expected format {FORMAT!r}, got {header['format']!r}")
+        if header["format"] != FORMAT:
+            raise InputError(f"saved stream: expected format {FORMAT!r}, got {header['format']!r}")
+        if header.keys() != {"format", "tree", "sha256"} or header["sha256"] != _digest(header["tree"], tensors):
+            raise InputError("saved stream: the bytes were changed, their checksum is another; save it again")
+        return _unflatten(kind, header["tree"], tensors, torch.device(device))
+
+
+def _digest(tree: Any, tensors: dict[str, Tensor]) -> str:
+    """SHA-256 of all that is kept, in hexadecimal."""
+    digest = hashlib.sha256(json.dumps(tree, sort_keys=True).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        plain = tensor.view(torch.int16) if tensor.dtype == torch.bfloat16 else tensor  # which NumPy lacks
+        digest.update(plain.contiguous().numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _flatten(value: Any, path: str, tensors: dict[str, Tensor]) -> Any:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import TypedDict
 
 from quest.errors import WeightsError
+from quest.untrusted import build, parse_json, reading
 
 REVISION = 10
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
@@ -53,9 +54,5 @@ class TrackerConfig:
         Raises:
             WeightsError: the text holds no settings.
         """
-        try:
-            stored = {name: float(value) for name, value in json.loads(text).items()}
-            whole = {name: int(stored.pop(name)) for name in ("size_px", "most") if name in stored}
-            return replace(cls(**stored), **whole)  # type: ignore[arg-type]
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError) as error:
-            raise WeightsError(f"settings stored with the weights cannot be read: {error}") from error
+        with reading("settings stored with the weights", WeightsError, "fetch or train them again"):
+            return build(cls, parse_json(text, "settings stored with the weights", WeightsError), "settings")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -26,6 +27,8 @@ from quest.track.reasons import reason
 from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
 from quest.types import LABELS, Camera, Query, State
+
+_LOG = logging.getLogger(__name__)
 
 WITHHELD_FLAG = "no P(lost) and no alarms: the monitor is not calibrated for what the frames bring so far"
 POSES_BEGIN_FLAG = "poses begin: world points were in the first camera's axes before"
@@ -182,7 +185,10 @@ class Stream:
             self._monitor.rename(number, name)
 
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
-        """Call a function with every alarm at the end of the step that raises it; it may save the stream."""
+        """Call a function with every alarm at the end of the step that raises it; it may save the stream.
+
+        What it raises is logged, and the step goes on.
+        """
         self._callbacks.append(callback)
 
     def step(
@@ -209,8 +215,8 @@ class Stream:
                 rigid; the stream stays as it was.
             Exception: whatever the finder raises, in a look in the background too; the next frame can be tracked.
         """
-        preprocessor, memory, stamp_s = self._preprocessor, self._memory, float(stamp_s)
-        preprocessor.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
+        preprocessor, memory = self._preprocessor, self._memory
+        stamp_s = preprocessor.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
         arrival = preprocessor.accept(rgb, stamp_s)
         memory.frame += 1
         if arrival is not Arrival.NEW:
@@ -232,12 +238,17 @@ class Stream:
         memory.answer, raised = self._answer(memory.filter)
         for alarm in raised:
             for callback in self._callbacks:
-                callback(alarm)
+                try:
+                    callback(alarm)
+                except Exception:  # of the user's own: neither the answer nor another callback is to be lost by it
+                    _LOG.exception("a callback of on_alarm failed")
         return memory.answer
 
     def _filter(self, frame: Prepared) -> FilterState:
         """The filter's state after a frame."""
         memory, now_s = self._memory, self._preprocessor.state.now_s
+        if frame.blind and memory.filter is not None:
+            return memory.filter
         picture = to_picture(frame.grey, self._features)
         if memory.filter is None:
             # In the first camera's axes, so that answers do not depend on where the world has its origin.
@@ -287,12 +298,15 @@ class Stream:
         memory, following = self._memory, self._queries.state.following
         answer, numbers = filtering.read_off(state, self._noise), [f.number for f in following]
         lost_p, alarms, raised = self._watch(numbers, answer, state)
-        doubt = probability(answer.lost_log_odds)
+        doubt, blind_s = probability(answer.lost_log_odds), self._preprocessor.state.now_s - state.stamp_s
+        if blind_s > 0:  # while nothing is seen, everything may come to move
+            stays = np.exp(-blind_s / self._noise.hidden_s)
+            lost_p, doubt = (1 - (1 - p) * stays for p in (lost_p, doubt))
         lost = [
             (p if np.isfinite(p) else d) > 0.5 or alarm is not None
             for p, d, alarm in zip(lost_p, doubt, alarms, strict=True)
         ]
-        visible = answer.visible & ~np.array([alarm is not None for alarm in alarms], bool)
+        visible = answer.visible & (blind_s <= 0) & ~np.array([alarm is not None for alarm in alarms], bool)
         joints = tuple(None if j is None else j.moved(memory.world_from_filter) for j in answer.joint)
         point = move(memory.world_from_filter, answer.point_world)
         told = StreamState(

@@ -1,0 +1,201 @@
+"""Any damage to any file that is read ends in an answer or in one of our errors; ``make fuzz`` tries thousands."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import quest
+from quest.data.lerobot_export import Episode, export_lerobot
+from quest.data.recording import read_recording, write_recording
+from quest.data.stats import store_stats
+from quest.data.store import TakeStore
+from quest.errors import QuestError
+from quest.model.weights import save_network
+from quest.sim.objects import load_object
+from quest.track import Tracker
+from quest.tracks import read_tracks, write_tracks
+from quest.types import Query
+from tests.data.bag_drive import recording
+from tests.data.bags import write_bag, write_mcap
+from tests.sim.small_objects import write_cabinet
+from tests.synthetic import make_take
+from tests.tiny import make_finder
+from tests.track.clips import make_clip, make_tracker
+
+EXAMPLES = int(os.environ.get("QUEST_FUZZ", "12"))
+"""Damages tried of each kind of file."""
+
+NASTY = st.sampled_from(
+    [
+        *(None, True, False, [], {}, [[]], [None], {"": None}, ""),
+        *(
+            "x",
+            "../x",
+            "/",
+            "\0",
+            "\x1b[2J",
+            "n" * 300,
+            "{",
+            "{chunk_index:2000000000d}",
+            "{0.__class__}",
+            "NaN",
+            "1e999",
+        ),
+        *(0, -1, 1, 3, 2**31, 2**63, -(2**63), 10**40, 0.5, -0.0, 1e-300, 1e300),
+    ]
+)
+
+
+def write_folder(folder: Path) -> None:
+    write_recording(make_clip(frames=3, size=(40, 32)), folder / "r", rgb="png")
+
+
+def write_video(folder: Path) -> None:
+    write_recording(make_clip(frames=3, size=(40, 32)), folder / "r")
+
+
+def write_takes(folder: Path) -> None:
+    store = TakeStore(folder / "s")
+    for seed in range(2):
+        store.write(make_take(frames=3, views=1, entities=1, size=(16, 16), seed=seed))
+
+
+def read_takes(folder: Path) -> None:
+    store = TakeStore(folder / "s")
+    assert len(store.problems()) < 2, "one damaged take hides the other"
+    for name in store.names():
+        store.read(name)
+    store_stats(store, report=lambda done, total: None)
+
+
+def write_dataset(folder: Path) -> None:
+    export_lerobot([Episode.of_take(make_take(frames=3, views=1, entities=1, size=(32, 32)))], folder / "d")
+
+
+def write_answers(folder: Path) -> None:
+    clip = make_clip(frames=3)
+    write_tracks(make_tracker().track(clip, [Query.point(0, 20.0, 20.0)]), folder / "t.parquet")
+
+
+def write_stream(folder: Path) -> None:
+    tracker, clip = make_tracker(), make_clip(frames=3)
+    stream = tracker.stream(clip.camera, [Query.point(0, 20.0, 20.0)])
+    stream.step(clip.rgb[0], None, 0.0)
+    (folder / "stream.bin").write_bytes(tracker.save(stream))
+
+
+def write_weights(folder: Path) -> None:
+    save_network(folder / "w.safetensors", make_finder(), settings="{}", about="made up")
+
+
+def load_weights(folder: Path) -> None:
+    assert isinstance(quest.load(folder / "w.safetensors", monitor=False), Tracker)
+
+
+KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
+    "folder": (write_folder, lambda folder: read_recording(folder / "r")),
+    "video": (write_video, lambda folder: read_recording(folder / "r")),
+    "takes": (write_takes, read_takes),
+    "lerobot": (write_dataset, lambda folder: read_recording(folder / "d")),
+    "tracks": (write_answers, lambda folder: read_tracks(folder / "t.parquet")),
+    "stream": (write_stream, lambda folder: make_tracker().restore((folder / "stream.bin").read_bytes())),
+    "weights": (write_weights, load_weights),
+    "object": (lambda folder: write_cabinet(folder / "cabinet"), lambda folder: load_object(folder / "cabinet")),
+    "mcap": (lambda f: write_mcap(f / "b.mcap", recording()), lambda folder: read_recording(folder / "b.mcap")),
+    "bag": (lambda f: write_bag(f / "b", recording()), lambda folder: read_recording(folder / "b")),
+}
+"""What writes files of each kind into a folder, and what reads them."""
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """Folders of whole files, made once."""
+    made: dict[str, Path] = {}
+
+    def write(kind: str) -> Path:
+        if kind not in made:
+            made[kind] = tmp_path_factory.mktemp(kind)
+            KINDS[kind][0](made[kind])
+        return made[kind]
+
+    return write
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_end_in_our_errors(kind: str, written: Callable[[str], Path], tmp_path: Path) -> None:
+    whole = written(kind)
+    KINDS[kind][1](whole)
+    files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
+
+    @settings(max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES < 100, database=None,
+              suppress_health_check=(HealthCheck.too_slow, HealthCheck.data_too_large))  # fmt: skip
+    @given(st.data())
+    def damage(data: st.DataObject) -> None:
+        folder = tmp_path / "damaged"
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(whole, folder)
+        file = folder / data.draw(st.sampled_from(files))
+        file.write_bytes(spoiled(file.read_bytes(), data))
+        with contextlib.suppress(QuestError):
+            KINDS[kind][1](folder)
+
+    damage()
+
+
+def spoiled(content: bytes, data: st.DataObject) -> bytes:
+    """The same bytes with something wrong: a value of their JSON, a bit, an end, a hole."""
+    start, stop = json_in(content)
+    if start < stop and data.draw(st.booleans()):
+        text = json.dumps(changed(json.loads(content[start:stop]), data)).encode()
+        head = struct.pack("<Q", len(text)) if start == 8 else content[:start]
+        return head + text + content[stop:]
+    at = data.draw(st.integers(0, max(len(content) - 1, 0)))
+    how = data.draw(st.sampled_from(["flip", "cut", "hole", "insert", "word"]))
+    if how == "cut":
+        return content[:at]
+    if how == "insert":
+        return content[:at] + data.draw(st.binary(min_size=1, max_size=9)) + content[at:]
+    if how == "word":
+        number = struct.pack("<Q", data.draw(st.sampled_from([0, 2**31 - 1, 2**32 - 1, 2**60, 2**64 - 1])))
+        return content[:at] + number + content[at + 8 :]
+    if how == "hole":
+        return content[:at] + bytes(min(64, len(content) - at)) + content[at + 64 :]
+    turned = bytes([content[at] ^ (1 << data.draw(st.integers(0, 7)))]) if content else b""
+    return content[:at] + turned + content[at + 1 :]
+
+
+def json_in(content: bytes) -> tuple[int, int]:
+    """Where in some bytes there is JSON: all of them, or the header of safetensors; nowhere is 0, 0."""
+    if content[:1] in (b"{", b"["):
+        return 0, len(content)
+    length = int.from_bytes(content[:8], "little")
+    return (8, 8 + length) if content[8:9] == b"{" and length < len(content) else (0, 0)
+
+
+def changed(value: Any, data: st.DataObject) -> Any:
+    """JSON in which one value, at any depth, is another one or is gone."""
+    if not isinstance(value, dict | list) or not value or data.draw(st.integers(0, 3)) == 0:
+        return data.draw(NASTY)
+    keys = list(value) if isinstance(value, dict) else list(range(len(value)))
+    key = keys[data.draw(st.integers(0, len(keys) - 1))]
+    inner = value[key]
+    if isinstance(inner, str) and inner[:1] == "{":  # JSON in a text, as in the metadata of safetensors
+        inner = json.dumps(changed(json.loads(inner), data))
+        return {**value, key: inner} if isinstance(value, dict) else [*value[:key], inner, *value[key + 1 :]]
+    if data.draw(st.integers(0, 5)) == 0:
+        kept = [k for k in keys if k != key]
+        return {k: value[k] for k in kept} if isinstance(value, dict) else [value[k] for k in kept]
+    inner = changed(inner, data)
+    return {**value, key: inner} if isinstance(value, dict) else [*value[:key], inner, *value[key + 1 :]]

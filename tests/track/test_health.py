@@ -1,0 +1,92 @@
+"""A camera that fails is said to, and nothing is learned from what it does not see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from quest.track.health import Health, Repeats
+from quest.track.state import StreamState
+from quest.types import Query, State
+from tests.filter.scenes import scene
+from tests.track.clips import make_tracker
+
+FRAMES, BAD = 40, slice(20, 30)
+AT = (70.0, 60.0)
+RNG = np.random.default_rng(0)
+
+BLIND: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "covered": lambda rgb, before: np.zeros_like(rgb),
+    "overexposed": lambda rgb, before: np.full_like(rgb, 255),
+    "noise": lambda rgb, before: RNG.integers(0, 256, rgb.shape).astype(np.uint8),
+    "frozen": lambda rgb, before: before,
+}
+CHANGED: dict[str, tuple[str, Callable[[np.ndarray], np.ndarray]]] = {
+    "upside down": ("another picture", lambda rgb: rgb[::-1, ::-1]),
+    "half of it black": ("black", lambda rgb: np.where(np.arange(rgb.shape[1])[None, :, None] < 80, 0, rgb)),
+    "out of focus": ("focus", lambda rgb: cv2.GaussianBlur(rgb, (0, 0), 6.0)),
+}
+
+
+def played(change: Callable[[np.ndarray, np.ndarray], np.ndarray], *, depth: bool) -> list[StreamState]:
+    """Answers to a wall that rests while the camera slides, with something wrong with some of its frames."""
+    clip = scene(np.linspace(0, 0.2, FRAMES), depth=depth)
+    rgb = clip.rgb.copy()
+    for t in range(BAD.start, BAD.stop):
+        rgb[t] = change(clip.rgb[t], clip.rgb[BAD.start - 1])
+    clip = replace(clip, rgb=rgb)
+    stream = make_tracker().stream(clip.camera, [Query.point(0, *AT)])
+    frames = (clip.frame(t) for t in range(FRAMES))
+    return [stream.step(f.rgb, f.depth_m, f.stamp_s, f.cam_from_world) for f in frames]
+
+
+@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("what", BLIND)
+def test_a_blind_camera_follows_nothing_and_finds_it_again(what: str, depth: bool) -> None:
+    states = played(BLIND[what], depth=depth)
+    for state in states[BAD]:
+        assert any(flag.startswith(("covered", "frozen")) for flag in state.flags)
+        assert state.state[0] != State.TRACKING
+    unsure = [1 - float(state.confidence[0]) for state in states[BAD]]
+    assert np.all(np.diff(unsure) > 0)
+    assert states[-1].state[0] == State.TRACKING
+    sound = played(lambda rgb, before: rgb, depth=depth)
+    assert not any(state.flags for state in sound[1:] if depth)
+    np.testing.assert_allclose(states[-1].uv_px, sound[-1].uv_px, atol=1.0)
+
+
+@pytest.mark.parametrize("what", CHANGED)
+def test_what_no_motion_explains_is_said(what: str) -> None:
+    words, change = CHANGED[what]
+    states = played(lambda rgb, before: np.ascontiguousarray(change(rgb)).astype(np.uint8), depth=True)
+    assert any(words in flag for flag in states[BAD.start].flags)
+
+
+def test_exchanged_colours_are_said() -> None:
+    health, rgb = Health(), RNG.integers(0, 256, (60, 80, 3)).astype(np.uint8)
+    rgb = cv2.GaussianBlur(rgb, (0, 0), 4.0)
+    rgb = cv2.normalize(rgb, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
+    assert health.of_picture(rgb, "a") == ((), False)
+    flags, blind = health.of_picture(np.ascontiguousarray(rgb[..., ::-1]), "b")
+    assert "red and blue exchanged at once" in flags
+    assert not blind
+
+
+def test_depth_that_cannot_be_is_not_used() -> None:
+    depth_m = RNG.uniform(1.0, 2.0, (30, 40)).astype(np.float32)
+    health = Health()
+    assert health.of_depth(depth_m) is None
+    assert "before" in str(health.of_depth(10 * depth_m))
+    assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5)))
+    assert health.of_depth(depth_m + np.float32(0.01)) is None
+
+
+def test_pictures_that_often_come_twice_are_usual() -> None:
+    repeats, steady = Repeats(), Repeats()
+    assert not any(repeats.are_faults(str(t // 2)) for t in range(16))
+    assert not any(steady.are_faults(str(t)) for t in range(20))
+    assert steady.are_faults("19")
