@@ -69,7 +69,7 @@ class DenseMatch:
 
         Raises:
             ConfigError: a query that is not a point.
-            InputError: a query outside the clip, or pictures with a side below 32 pixels (XFeat).
+            InputError: a query outside the clip, or pictures with a side below 16 pixels (XFeat).
         """
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
         assert queries is not None

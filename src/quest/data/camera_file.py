@@ -92,9 +92,12 @@ def read_camera(path: Path) -> CameraFile:
     Raises:
         RecordingError: the file is missing, is not JSON, lacks or misspells a field, or a value makes no sense.
     """
-    if not path.exists():
-        raise RecordingError(f"camera file {path}: no such file; write one such as {EXAMPLE}, or name another one")
-    fields = read_json(path, RecordingError)
+    where, remedy = f"camera file {path}", f"expected such as {EXAMPLE}"
+    with reading(where, RecordingError, remedy):
+        there = path.exists()
+    if not there:
+        raise RecordingError(f"{where}: no such file; write one such as {EXAMPLE}, or name another one")
+    fields = read_json(path, RecordingError, remedy)
     if not isinstance(fields, dict):
         raise RecordingError(f"camera file {path}: expected an object such as {EXAMPLE}, got {type(fields).__name__}")
     missing = [name for name in _INTRINSICS if name not in fields]
@@ -105,7 +108,7 @@ def read_camera(path: Path) -> CameraFile:
             f"camera file {path}: {' and '.join(said)}; known are {', '.join((*_INTRINSICS, *_OPTIONAL))}, "
             f"for example {EXAMPLE}"
         )
-    with reading(f"camera file {path}", RecordingError, f"expected such as {EXAMPLE}"):
+    with reading(where, RecordingError, remedy):
         setup = _parse(fields)
         assert setup.rig  # which checks how both cameras go together
         return setup

@@ -20,7 +20,9 @@ from quest.errors import InputError
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import read_tensors
 
-MULTIPLE = 32
+LEAST_PX = 16
+"""Shortest side of a picture, pixels."""
+_MULTIPLE = 32
 """Sides of the pictures that the network reads are multiples of this, in pixels."""
 
 
@@ -72,9 +74,9 @@ class XFeat(nn.Module):
     def features(self, grey: UInt8[Tensor, "H W"]) -> tuple[Float[Tensor, "64 h w"], Float[Tensor, "h w"]]:
         """Descriptors and reliability of a picture.
 
-        The picture is resized, bilinearly, so that its sides are the next smaller multiples of 32 pixels. Its corners
-        stay corners: the source's pixel (x, y) lies at (x * w / W, y * h / H) of the maps. Centres of pixels and of
-        cells are at half-integers. :func:`sample` reads descriptors there.
+        The picture is resized, bilinearly, so that its sides are the next smaller multiples of 32 pixels, at least 32.
+        Its corners stay corners: the source's pixel (x, y) lies at (x * w / W, y * h / H) of the maps. Centres of
+        pixels and of cells are at half-integers. :func:`sample` reads descriptors there.
 
         Args:
             grey: mean of red, green and blue, at the source's resolution, on the network's device.
@@ -83,14 +85,14 @@ class XFeat(nn.Module):
             Descriptors of length 1, and the probability, from 0 to 1, that a cell can be matched.
 
         Raises:
-            InputError: a side is shorter than 32 pixels, or these are no grey values of 8 bits.
+            InputError: a side is shorter than 16 pixels, or these are no grey values of 8 bits.
         """
-        if grey.dtype != torch.uint8 or grey.ndim != 2 or min(grey.shape) < MULTIPLE:
+        if grey.dtype != torch.uint8 or grey.ndim != 2 or min(grey.shape) < LEAST_PX:
             raise InputError(
-                f"picture for XFeat: expected uint8 [H, W] with sides of at least {MULTIPLE} pixels, got {grey.dtype} "
+                f"picture for XFeat: expected uint8 [H, W] with sides of at least {LEAST_PX} pixels, got {grey.dtype} "
                 f"{list(grey.shape)}; enlarge small pictures, and average colours"
             )
-        size = [side // MULTIPLE * MULTIPLE for side in grey.shape]
+        size = [max(side // _MULTIPLE, 1) * _MULTIPLE for side in grey.shape]
         image = F.interpolate(grey[None, None].float() / 255, size=size, mode="bilinear")
         descriptors, reliability = self(image)
         return F.normalize(descriptors[0], dim=0), reliability[0, 0].sigmoid()

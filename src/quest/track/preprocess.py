@@ -14,7 +14,7 @@ from quest.depth import PLAUSIBLE_DEPTH_M
 from quest.errors import InputError
 from quest.filter.picture import Picture
 from quest.geometry.poses import is_rigid, nearest_rigid
-from quest.model.xfeat import MULTIPLE, XFeat
+from quest.model.xfeat import LEAST_PX, XFeat
 from quest.track.health import Health, digest_of
 from quest.types import Camera
 from quest.untrusted import reading
@@ -88,13 +88,13 @@ class Preprocessor:
         state: what the next frame depends on.
 
     Raises:
-        InputError: pictures with a side below 32 pixels.
+        InputError: pictures with a side below 16 pixels.
     """
 
     def __init__(self, camera: Camera) -> None:
-        if min(camera.width, camera.height) < MULTIPLE:
+        if min(camera.width, camera.height) < LEAST_PX:
             raise InputError(
-                f"camera: expected pictures with sides of at least {MULTIPLE} pixels, got {camera.width} x "
+                f"camera: expected pictures with sides of at least {LEAST_PX} pixels, got {camera.width} x "
                 f"{camera.height}; enlarge them"
             )
         self.camera = camera

@@ -79,7 +79,7 @@ class Stream:
         finding: how finding goes on, from the first frame on; None where it does not.
 
     Raises:
-        InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
+        InputError: a point query lies outside the image, or pictures have a side below 16 pixels.
     """
 
     def __init__(

@@ -120,7 +120,7 @@ class Tracker:
                 alarms then come as readily late in a stream as early.
 
         Raises:
-            InputError: a point query lies outside the image, or pictures have a side below 32 pixels.
+            InputError: a point query lies outside the image, or pictures have a side below 16 pixels.
             ConfigError: alpha is no probability, there are no frames, or ``online`` is no time or comes with queries.
         """
         finding = Finding.of(online, behind=not wait)
@@ -272,7 +272,7 @@ def pick_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device)
+        torch.zeros(1, device=device).item()  # also what holds no numbers
     except (RuntimeError, AssertionError) as error:
         raise ConfigError(f"device {name!r} cannot be used ({error}); try cpu") from error
     return device
