@@ -361,6 +361,16 @@ BAD: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "torn episodes": (lambda f: tear(f, "meta/episodes/*/*.parquet"), {}, "file-000.parquet: cannot be read"),
     "torn video": (lambda f: tear(f, "videos/*/*/*.mp4"), {}, "cannot be decoded"),
     "short video": (cut_video, {}, "has 6 of the 8 frames of episode 0; the file is corrupt"),
+    "attributes in a path": (
+        lambda f: edit_info(f, data_path="{chunk_index.__class__}/x"),
+        {},
+        "expected a path below",
+    ),
+    "a path of gigabytes": (lambda f: edit_info(f, data_path="{chunk_index:2000000000d}"), {}, "expected a path below"),
+    "a path that leads out": (lambda f: edit_info(f, data_path="../{file_index:03d}"), {}, "expected a path below"),
+    "an unknown field": (lambda f: edit_info(f, data_path="{episode}"), {}, "expected fields"),
+    "no rate": (lambda f: edit_info(f, fps=0), {}, "fps: expected frames per second"),
+    "features in a list": (lambda f: edit_info(f, features=[1]), {}, "features: expected an object"),
     "no video": (lambda f: next(f.glob("videos/*/*/*.mp4")).unlink(), {}, "no such file"),
 }
 

@@ -169,6 +169,15 @@ def edit_header(folder: Path, **attributes: object) -> None:
     path.write_text(json.dumps(header))
 
 
+def edit_info(folder: Path, **fields: object) -> None:
+    edit_header(folder, info=json.loads((folder / "zarr.json").read_text())["attributes"]["info"] | fields)
+
+
+def grow(folder: Path, array: str, frames: int) -> None:
+    path = folder / array / "zarr.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"shape": [frames]}))
+
+
 def tear_array(folder: Path) -> None:
     for path in (folder / "view_0" / "rgb").rglob("*"):
         if path.is_file():
@@ -188,7 +197,23 @@ TORN = {
     "other version": (lambda folder: edit_header(folder, version=99), "format version 99, expected 1"),
     "other group": (lambda folder: edit_header(folder, format="x"), "not a take"),
     "damaged header": (lambda folder: edit_header(folder, info={}), "cannot be read"),
+    "another name": (lambda folder: edit_info(folder, name="../x"), "of another name"),
+    "no frame rate": (lambda folder: edit_info(folder, frames_per_s=0), "to be positive"),
+    "files elsewhere": (lambda folder: edit_header(folder, files={"../../x": 1}), "outside of the take"),
+    "a number for a text": (lambda folder: edit_info(folder, category=3), "info.category: expected a text"),
+    "a pipe": (lambda folder: ((folder / "zarr.json").unlink(), os.mkfifo(folder / "zarr.json")), "as a file"),
+    "an array without end": (lambda folder: grow(folder, "stamp_s", 2**40), "stamp_s/zarr.json has"),
 }
+
+
+def test_nothing_is_allocated_that_the_files_cannot_hold(store: TakeStore):
+    folder = store.path("panels")
+    grow(folder, "stamp_s", 2**40)
+    header = json.loads((folder / "zarr.json").read_text())["attributes"]
+    files = header["files"] | {"stamp_s/zarr.json": (folder / "stamp_s" / "zarr.json").stat().st_size}
+    edit_header(folder, files=files, frames=2**40)
+    with pytest.raises(TakeError, match="stamp_s has shape"):
+        store.read_small_arrays("panels")
 
 
 @pytest.mark.parametrize("how", TORN)

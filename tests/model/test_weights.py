@@ -102,3 +102,21 @@ def test_shipped_names_are_files():
     shipped = shipped_weights()
     assert set(DEFAULTS) < set(shipped)
     assert all(path.is_file() and path.stem == DEFAULTS.get(name, name) for name, path in shipped.items())
+
+
+def test_values_that_are_no_numbers_are_refused(tmp_path: Path) -> None:
+    network = make_finder()
+    with torch.no_grad():
+        next(network.parameters()).fill_(float("nan"))
+    save_network(tmp_path / "net.safetensors", network, settings="{}", about="made up")
+    with pytest.raises(WeightsError, match="no numbers"):
+        load_network(tmp_path / "net.safetensors")
+
+
+@pytest.mark.parametrize("change", [{"width": 2**13}, {"depth": 1024}, {"depth": 10**7}, {"heads": "six"}])
+def test_impossible_networks_are_refused_before_they_are_made(tmp_path: Path, change: dict[str, object]) -> None:
+    config = json.loads(FINDER.to_json())
+    config["encoder"] |= change
+    path = rewritten(saved(tmp_path), config=json.dumps(config))
+    with pytest.raises(WeightsError, match=r"net\.safetensors"):
+        load_network(path)

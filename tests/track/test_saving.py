@@ -113,3 +113,13 @@ def test_what_is_no_such_tree_is_refused():
         load(data, Twig)
     with pytest.raises(InputError, match="expected format 'quest-stream-"):
         load(data.replace(b"quest-stream-1", b"quest-stream-0"), Tree)
+
+
+def test_any_turned_bit_is_refused():
+    data = save(make_tree())
+    length = int.from_bytes(data[:8], "little")
+    blanks = range(8 + len(data[8 : 8 + length].rstrip()), 8 + length)  # what fills the header up says nothing
+    for at in range(len(data)):
+        if at not in blanks:
+            with pytest.raises(InputError):
+                load(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :], Tree)

@@ -67,7 +67,7 @@ class Health:
 
     coarse: Float32[np.ndarray, "h w 3"] | None = None
     """Cells of the newest picture that showed something; None before the first."""
-    some: UInt8[np.ndarray, "h w 3"] | None = None
+    some: UInt8[np.ndarray, "rows columns 3"] | None = None
     """Every eighth pixel of it along each side."""
     same: float = 0.0
     """Share of pixels that were as before to the bit, so far."""
@@ -83,7 +83,7 @@ class Health:
     def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: str) -> tuple[tuple[str, ...], bool]:
         """What is wrong with the next picture, in words, and whether it shows nothing.
 
-        A picture without noise that stands still may be a scene that does: it is said, and looked at.
+        Where pictures have no noise, one that stands still is that of a scene that does.
 
         Args:
             rgb: the picture.
@@ -93,8 +93,8 @@ class Health:
         cell_px = max(_CELL_PX, max(width, height) / _SIDE)
         cells = np.maximum(np.rint(np.array([width, height]) / cell_px), 2).astype(int)
         coarse = cv2.resize(rgb, cells.tolist(), interpolation=cv2.INTER_AREA).astype(np.float32)
-        if self.pictures.are_faults(digest) and self.coarse is not None:
-            return ("frozen: the picture before, to the bit",), self.same < _NOISELESS
+        if self.pictures.are_faults(digest) and self.coarse is not None and self.same < _NOISELESS:
+            return ("frozen: the picture before, to the bit",), True
         if coarse.std() < _PLAIN and self.coarse is not None:
             return ("covered: nothing stands out in the picture",), True
         grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
