@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tyro
-from rich.console import Console
 
+from quest.cli.console import Console
 from quest.cli.main import main
 from quest.cli.progress import counting
 from quest.cli.source import Source
