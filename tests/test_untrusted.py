@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from quest.cli.console import Console
+from quest.cli.console import Console, shown
 from quest.errors import InputError, QuestError, RecordingError, TakeError
 from quest.types import TakeInfo
 from quest.untrusted import (
@@ -28,7 +28,6 @@ from quest.untrusted import (
     reading,
     require_file,
     require_table,
-    shown,
 )
 
 JSON = st.recursive(

@@ -17,13 +17,11 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from quest.errors import MissingExtraError, QuestError
 
-_MOST_TEXT = 64 * 2**20
+MOST_TEXT = 64 * 2**20
 """Bytes of text, JSON or XML, beyond which a file is not read."""
 _LONGEST_NAME = 255
 _MOST_ROWS = 8
 """Rows of a table per byte of its file."""
-_UNSHOWN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
-"""Control characters, but for the tab and the end of a line."""
 
 
 @contextmanager
@@ -78,7 +76,7 @@ def require_table(path: Path, error: type[QuestError]) -> None:
 
 def read_json(path: Path, error: type[QuestError], remedy: str = "restore it") -> Any:
     """JSON of an ordinary file, as of :func:`parse_json`."""
-    require_file(path, error, remedy, most=_MOST_TEXT)
+    require_file(path, error, remedy, most=MOST_TEXT)
     with reading(path, error, remedy):
         text = path.read_text(encoding="utf-8")
     return parse_json(text, path, error, remedy)
@@ -175,8 +173,3 @@ def is_inside(path: object) -> bool:
         return False
     parts = PurePosixPath(path).parts
     return bool(parts) and not PurePosixPath(path).is_absolute() and ".." not in parts
-
-
-def shown(text: str) -> str:
-    """A text as it may be shown in a terminal: control characters, which could command it, are written out."""
-    return _UNSHOWN.sub(lambda found: f"\\x{ord(found[0]):02x}", text)

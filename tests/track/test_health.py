@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from quest.track.health import Health, Repeats
+from quest.data.recording import open_recording
+from quest.track.health import Health, Repeats, digest_of
 from quest.track.state import StreamState
 from quest.types import Query, State
 from tests.filter.scenes import scene
@@ -18,6 +20,7 @@ from tests.track.clips import make_tracker
 FRAMES, BAD = 40, slice(20, 30)
 AT = (70.0, 60.0)
 RNG = np.random.default_rng(0)
+REAL = Path(__file__).parents[3] / "shared" / "data" / "real"
 
 BLIND: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "covered": lambda rgb, before: np.zeros_like(rgb),
@@ -80,13 +83,46 @@ def test_depth_that_cannot_be_is_not_used() -> None:
     depth_m = RNG.uniform(1.0, 2.0, (30, 40)).astype(np.float32)
     health = Health()
     assert health.of_depth(depth_m) is None
-    assert "before" in str(health.of_depth(10 * depth_m))
+    assert "10 times" in str(health.of_depth(10 * depth_m))
     assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5)))
     assert health.of_depth(depth_m + np.float32(0.01)) is None
 
 
-def test_pictures_that_often_come_twice_are_usual() -> None:
-    repeats, steady = Repeats(), Repeats()
-    assert not any(repeats.are_faults(str(t // 2)) for t in range(16))
-    assert not any(steady.are_faults(str(t)) for t in range(20))
-    assert steady.are_faults("19")
+def test_a_hand_before_the_lens_is_no_other_unit() -> None:
+    depth_m = RNG.uniform(1.0, 2.0, (64, 80)).astype(np.float32)
+    near = depth_m.copy()
+    near[:, :60] = RNG.uniform(0.1, 0.3, (64, 60))
+    health = Health()
+    assert [health.of_depth(each) for each in (depth_m, near, depth_m)] == [None] * 3
+
+
+def come_again(frames: np.ndarray) -> list[bool]:
+    repeats = Repeats()
+    return [repeats.are_faults(frame, digest_of(frame)) for frame in frames]
+
+
+def test_what_stands_still_is_a_fault_where_there_is_noise_and_none_did_so_far() -> None:
+    noisy = RNG.integers(0, 256, (20, 16, 16, 3)).astype(np.uint8)
+    assert not any(come_again(noisy))
+    assert come_again(np.concatenate([noisy, noisy[-1:]])) == [False] * 20 + [True]
+    assert not any(come_again(noisy.repeat(2, axis=0)))
+    moved = np.zeros((20, 80, 80, 3), np.uint8)
+    moved[np.arange(20), 0, 0] = np.arange(20)[:, None]  # one corner moves, nothing else has noise
+    assert not any(come_again(np.concatenate([moved, moved[-1:]])))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="needs the real recordings of ../shared/data")
+def test_cameras_in_good_health_are_told_so() -> None:
+    """At most one frame of a thousand; the clip of stills, each of another kitchen, is none of a camera."""
+    flagged = frames = 0
+    for folder in sorted((*(REAL / "video").iterdir(), *(REAL / "posed").iterdir())):
+        if not folder.is_dir() or folder.name == "handles":
+            continue
+        health = Health()
+        for frame in open_recording(folder):
+            flags, _ = health.of_picture(frame.rgb, digest_of(frame.rgb))
+            wrong = None if frame.depth_m is None else health.of_depth(frame.depth_m)
+            flagged, frames = flagged + (bool(flags) or wrong is not None), frames + 1
+    assert frames > 1500
+    assert flagged <= frames / 1000

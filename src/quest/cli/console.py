@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 
 import rich.console
 from rich.segment import Segment
 
-from quest.untrusted import shown
+_UNSHOWN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
+"""Control characters, but for the tab and the end of a line."""
 
 
 class Console(rich.console.Console):
@@ -19,3 +21,8 @@ class Console(rich.console.Console):
         """What is shown, piece by piece."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else Segment(shown(segment.text), segment.style)
+
+
+def shown(text: str) -> str:
+    """A text as it may be shown: control characters, which could command the terminal, are written out."""
+    return _UNSHOWN.sub(lambda found: f"\\x{ord(found[0]):02x}", text)

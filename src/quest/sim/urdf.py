@@ -14,11 +14,10 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import ObjectError
-from quest.untrusted import reading, require_file
+from quest.untrusted import MOST_TEXT, reading, require_file
 
 _MOST = 1e6
 """Beyond which no number of a URDF is believed."""
-_MOST_BYTES = 2**26
 
 CONTINUOUS_RANGE_RAD = np.pi / 2
 """How far a joint without limits is taken to turn."""
@@ -86,7 +85,7 @@ def read_urdf(path: Path) -> Urdf:
     """
     if not path.exists():
         raise ObjectError(f"{path}: expected a URDF file, found none; name a folder that holds mobility.urdf")
-    require_file(path, ObjectError, most=_MOST_BYTES)
+    require_file(path, ObjectError, most=MOST_TEXT)
     with reading(path, ObjectError, "not a readable URDF, restore the file from its source"):
         root = ElementTree.parse(path).getroot()
     if any("ros.org/wiki/xacro" in str(element.tag) for element in root.iter()):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, Shaped, UInt8
 
 _CELL_PX, _SIDE = 16, 40
 """Least width of the cells of the coarse picture, and how many there are along its longer side at most."""
@@ -26,8 +26,9 @@ _BLUR = 2.5
 """Fall of the logarithm of the sharpness; of 1,600 real pictures none fell by more than 1.8."""
 _PART = 0.3
 """Share of the picture that turned black or white at once."""
-_DEEPER = 3.0
-"""Factor between the medians of depth in two frames."""
+_DEEPER, _MOST, _ALIKE = 3.0, (0.25, 0.75), 0.2
+"""Factor between the depths of two frames, and how far it differs, in its logarithm, in half of the pixels, at which
+they are in other units."""
 _NOISELESS = 0.9
 """Share of pixels as before above which pictures have no noise: rendered ones, or still parts of a video."""
 _RARELY = 0.1
@@ -41,24 +42,37 @@ def digest_of(data: np.ndarray) -> str:
 
 @dataclass
 class Repeats:
-    """How often something came again to the bit."""
+    """How often pictures, or depths, came again to the bit."""
 
     digest: str = ""
     """Of the newest."""
+    some: Shaped[np.ndarray, "rows columns ..."] | None = None
+    """Every eighth of its pixels along each side; None before the first."""
+    same: float = 0.0
+    """Share of pixels that were as before, in those that were not so as a whole."""
     seen: int = 0
     """How many came."""
     runs: int = 0
-    """How often it stood still."""
+    """How often they stood still."""
     still: bool = False
-    """Whether it does now."""
+    """Whether they do now."""
 
-    def are_faults(self, digest: str) -> bool:
-        """Whether the next one is that before, and this is not what is usual."""
-        again = digest == self.digest
+    def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: str) -> bool:
+        """Whether the next one is that before, and this is not what is usual.
+
+        Without noise, what stands still may be a scene that does.
+
+        Args:
+            data: the next one.
+            digest: of its bytes.
+        """
+        again, some = digest == self.digest, data[::8, ::8].copy()
         self.runs += again and not self.still
         self.seen += not again
-        self.digest, self.still = digest, again
-        return again and (self.runs + 1) / (self.seen + 2) < _RARELY
+        if not again and self.some is not None:
+            self.same += (float((some == self.some).mean()) - self.same) / (self.seen - 1)
+        self.digest, self.some, self.still = digest, some, again
+        return again and self.same < _NOISELESS and (self.runs + 1) / (self.seen + 2) < _RARELY
 
 
 @dataclass
@@ -67,23 +81,15 @@ class Health:
 
     coarse: Float32[np.ndarray, "h w 3"] | None = None
     """Cells of the newest picture that showed something; None before the first."""
-    some: UInt8[np.ndarray, "rows columns 3"] | None = None
-    """Every eighth pixel of it along each side."""
-    same: float = 0.0
-    """Share of pixels that were as before to the bit, so far."""
     sharpness: float = 0.0
     """Logarithm of its Laplacian's variance."""
-    depth_m: float = 0.0
-    """Median of the newest depth that was used; 0 before the first."""
-    flat: bool = False
-    """Whether that was the same everywhere."""
+    depth_m: Float32[np.ndarray, "rows columns"] | None = None
+    """Every eighth pixel of the newest depth that was used; None before the first."""
     pictures: Repeats = field(default_factory=Repeats)
     depths: Repeats = field(default_factory=Repeats)
 
     def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: str) -> tuple[tuple[str, ...], bool]:
         """What is wrong with the next picture, in words, and whether it shows nothing.
-
-        Where pictures have no noise, one that stands still is that of a scene that does.
 
         Args:
             rgb: the picture.
@@ -93,7 +99,7 @@ class Health:
         cell_px = max(_CELL_PX, max(width, height) / _SIDE)
         cells = np.maximum(np.rint(np.array([width, height]) / cell_px), 2).astype(int)
         coarse = cv2.resize(rgb, cells.tolist(), interpolation=cv2.INTER_AREA).astype(np.float32)
-        if self.pictures.are_faults(digest) and self.coarse is not None and self.same < _NOISELESS:
+        if self.pictures.are_faults(rgb, digest) and self.coarse is not None:
             return ("frozen: the picture before, to the bit",), True
         if coarse.std() < _PLAIN and self.coarse is not None:
             return ("covered: nothing stands out in the picture",), True
@@ -102,25 +108,25 @@ class Health:
         flags = () if self.coarse is None else tuple(_changes(self.coarse, coarse))
         if self.coarse is not None and sharpness < self.sharpness - _BLUR:
             flags += ("out of focus at once",)
-        some = rgb[::8, ::8].copy()
-        if self.some is not None:
-            self.same += ((some == self.some).all(axis=-1).mean() - self.same) / self.pictures.seen
-        self.coarse, self.sharpness, self.some = coarse, sharpness, some
+        self.coarse, self.sharpness = coarse, sharpness
         return flags, False
 
     def of_depth(self, depth_m: Float32[np.ndarray, "H W"]) -> str | None:
         """Why the next depth is not to be used, in words; None if it is."""
-        seen = depth_m[depth_m > 0]
-        if self.depths.are_faults(digest_of(depth_m)):
+        if self.depths.are_faults(depth_m, digest_of(depth_m)):
             return "the depth before, to the bit"
-        if not len(seen):
+        some, before = depth_m[::8, ::8].copy(), self.depth_m
+        if not some.any():
             return None
-        median_m, flat = float(np.median(seen)), float(np.ptp(seen)) == 0
-        if self.depth_m and flat and not self.flat:
-            return f"everywhere {median_m:.3g} m"
-        if self.depth_m and not 1 / _DEEPER < median_m / self.depth_m < _DEEPER:
-            return f"{median_m:.3g} m in the median, {self.depth_m:.3g} m before"
-        self.depth_m, self.flat = median_m, flat
+        if before is not None:
+            if np.ptp(some[some > 0]) == 0 < np.ptp(before[before > 0]):
+                return f"everywhere {some.max():.3g} m"
+            both = (some > 0) & (before > 0)
+            factor = np.log(some[both] / before[both])
+            # What moves, or another place, changes every pixel by a factor of its own; another unit all alike.
+            if both.any() and abs(np.median(factor)) > np.log(_DEEPER) and np.ptp(np.quantile(factor, _MOST)) < _ALIKE:
+                return f"{np.exp(np.median(factor)):.3g} times that of before"
+        self.depth_m = some
         return None
 
 
