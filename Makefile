@@ -17,11 +17,11 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgro
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: demo test lint format types pytest fuzz render-deps clean help
+.PHONY: demo test lint format types pytest fuzz soak render-deps clean help
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | render-deps | clean"
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | render-deps | clean"
 
 demo: $(BASE)
 	$(BIN)/quest track sample --out $(DEMO_OUT)
@@ -45,9 +45,18 @@ types: $(ALL)
 pytest: $(ALL) render-deps
 	$(PYTEST) --jaxtyping-packages=quest,beartype.beartype
 
-# Thousands of damaged files of every kind; QUEST_FUZZ says how many of each.
+# Thousands of damaged files of every kind: QUEST_FUZZ of each, then as many seconds of each guided by coverage.
+QUEST_FUZZ ?= 2000
+GUIDED_S ?= 30
+KINDS = $$($(BIN)/python -c "from tests.test_fuzz import KINDS; print(*KINDS)")
 fuzz: $(ALL)
-	QUEST_FUZZ=$${QUEST_FUZZ:-2000} $(PYTEST) --timeout 0 tests/test_fuzz.py
+	QUEST_FUZZ=$(QUEST_FUZZ) $(PYTEST) --timeout 0 tests/test_fuzz.py
+	$(PIP) atheris
+	for kind in $(KINDS); do $(BIN)/python -m tests.guided_fuzz $$kind -max_total_time=$(GUIDED_S) || exit 1; done
+
+# An hour of a stream with random faults, queries that come and go, saving and restoring; memory must stay flat.
+soak: $(ALL)
+	$(BIN)/python benchmarks/endurance.py --frames 100000 --out outputs/soak.json
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \

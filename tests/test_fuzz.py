@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import resource
 import shutil
 import struct
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,7 @@ from quest.tracks import read_tracks, write_tracks
 from quest.types import Query
 from tests.data.bag_drive import recording
 from tests.data.bags import write_bag, write_mcap
+from tests.data.layout_writers import nerfstudio, record3d, rscan, stray, tum
 from tests.sim.small_objects import write_cabinet
 from tests.synthetic import make_take
 from tests.tiny import make_finder
@@ -35,6 +38,8 @@ from tests.track.clips import make_clip, make_tracker
 
 EXAMPLES = int(os.environ.get("QUEST_FUZZ", "12"))
 """Damages tried of each kind of file."""
+LONGEST_S = 5.0
+MOST_KIB = 2**20
 
 NASTY = st.sampled_from(
     [
@@ -113,45 +118,58 @@ KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "weights": (write_weights, load_weights),
     "object": (lambda folder: write_cabinet(folder / "cabinet"), lambda folder: load_object(folder / "cabinet")),
     "mcap": (lambda f: write_mcap(f / "b.mcap", recording()), lambda folder: read_recording(folder / "b.mcap")),
+    "tum": (tum, lambda folder: read_recording(folder / "rgbd_dataset_own")),
+    "7-scenes": (rscan, read_recording),
+    "record3d": (record3d, read_recording),
+    "stray": (stray, read_recording),
+    "nerfstudio": (nerfstudio, read_recording),
     "bag": (lambda f: write_bag(f / "b", recording()), lambda folder: read_recording(folder / "b")),
 }
 """What writes files of each kind into a folder, and what reads them."""
 
 
-@pytest.fixture(scope="module")
-def written(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Folders of whole files, made once."""
-    made: dict[str, Path] = {}
-
-    def write(kind: str) -> Path:
-        if kind not in made:
-            made[kind] = tmp_path_factory.mktemp(kind)
-            KINDS[kind][0](made[kind])
-        return made[kind]
-
-    return write
+@contextlib.contextmanager
+def limits() -> Iterator[None]:
+    """Fail at what takes long, or much memory for files of some kilobytes."""
+    begun_s, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert time.monotonic() - begun_s < LONGEST_S
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < MOST_KIB
 
 
-@pytest.mark.plain
-@pytest.mark.parametrize("kind", KINDS)
-def test_damaged_files_end_in_our_errors(kind: str, written: Callable[[str], Path], tmp_path: Path) -> None:
-    whole = written(kind)
-    KINDS[kind][1](whole)
+def damaging(kind: str, whole: Path, folder: Path) -> Callable[[], None]:
+    """A Hypothesis test that damages whole files of a kind at random and reads them.
+
+    Args:
+        kind: one of :data:`KINDS`.
+        whole: where whole files are written.
+        folder: where the damaged ones go.
+    """
+    write, read = KINDS[kind]
+    whole.mkdir(exist_ok=True)
+    write(whole)
+    read(whole)
     files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
 
     @settings(max_examples=EXAMPLES, deadline=None, derandomize=EXAMPLES < 100, database=None,
               suppress_health_check=(HealthCheck.too_slow, HealthCheck.data_too_large))  # fmt: skip
     @given(st.data())
     def damage(data: st.DataObject) -> None:
-        folder = tmp_path / "damaged"
         shutil.rmtree(folder, ignore_errors=True)
         shutil.copytree(whole, folder)
         file = folder / data.draw(st.sampled_from(files))
         file.write_bytes(spoiled(file.read_bytes(), data))
-        with contextlib.suppress(QuestError):
-            KINDS[kind][1](folder)
+        with contextlib.suppress(QuestError), limits():
+            read(folder)
 
-    damage()
+    return damage
+
+
+@pytest.mark.plain
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_files_end_in_our_errors(kind: str, tmp_path: Path) -> None:
+    damaging(kind, tmp_path / "whole", tmp_path / "damaged")()
+    assert {path.name for path in tmp_path.iterdir()} <= {"whole", "damaged"}, "written elsewhere"
 
 
 def spoiled(content: bytes, data: st.DataObject) -> bytes:

@@ -120,7 +120,7 @@ def test_only_ordinary_files_are_read(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="at most 99"):
         require_file(tmp_path / "large", InputError, most=99)
     for name in ("loop", "none", "n" * 300, "a\0b"):
-        with pytest.raises(InputError, match="cannot be read"):
+        with pytest.raises(InputError, match="no such file" if name == "none" else "cannot be read"):
             require_file(tmp_path / name, InputError)
 
 

@@ -25,17 +25,25 @@ _MOST_ROWS = 8
 
 
 @contextmanager
-def reading(where: object, error: type[QuestError], remedy: str = "copy it again") -> Iterator[None]:
+def reading(
+    where: object,
+    error: type[QuestError],
+    remedy: str = "copy it again",
+    *,
+    known: type[QuestError] | None = None,
+) -> Iterator[None]:
     """Whatever a library throws at bad bytes becomes one error that names what was read.
 
     Args:
         where: what is read, such as a path.
         error: the error's class.
         remedy: what to do about it.
+        known: errors that name what was read already; by default the class itself.
     """
+    passed = (known or error, MissingExtraError)
     try:
         yield
-    except (error, MissingExtraError):
+    except passed:
         raise
     except Exception as failure:  # libraries throw what they like: of their own, of Python's, of what they rest on
         said = str(failure).strip().partition("\n")[0][:300]
@@ -55,7 +63,10 @@ def require_file(
         most: bytes that it may have; any number by default.
     """
     with reading(path, error, remedy):
-        found = path.stat()
+        try:
+            found = path.stat()
+        except FileNotFoundError:
+            raise error(f"{path}: no such file; {remedy}") from None
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "no file of bytes, such as a pipe"
         raise error(f"{path}: cannot be read as a file: it is {kind}; {remedy}")

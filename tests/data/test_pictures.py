@@ -59,8 +59,8 @@ def test_depth_goes_with_the_colours_of_its_name(tmp_path: Path):
         path.rename(path.with_name(f"depth{path.name}"))
     assert len(read_recording(tmp_path, camera=ACROSS)) == 3
     for path in (tmp_path / "depth").iterdir():
-        path.rename(path.with_suffix(".npy"))
-    with pytest.raises(RecordingError, match=r"expected 16-bit PNG images, got files such as depth0\.npy"):
+        path.rename(path.with_suffix(".dat"))
+    with pytest.raises(RecordingError, match=r"expected 16-bit PNG images, got files such as depth0\.dat"):
         read_recording(tmp_path, camera=ACROSS)
 
 

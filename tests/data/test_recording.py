@@ -170,7 +170,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda f: resize(f / "depth" / "000005.png"),
         "32 x 24, but colour frames are 64 x 48; align",
     ),
-    "depth of 8 bits": (lambda f: write_depth(f, 0.1, dtype=np.uint8), "expected 16-bit grey, got mode L"),
+    "depth of 8 bits": (
+        lambda f: write_depth(f, 0.1, dtype=np.uint8),
+        "expected one channel of 16 bits or floats, got uint8",
+    ),
     "depth missing everywhere": (lambda f: write_depth(f, 1e9), "every pixel is missing"),
     "depth in millimetres read as tenths": (
         lambda f: edit_camera(f, depth_scale_m=1.0),

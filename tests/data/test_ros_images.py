@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from quest.data.recording import read_recording
 from quest.data.ros_frames import NO_DEPTH, NO_POSE
+from quest.data.rvl import decode_rvl
 from tests.data.bag_drive import (
     BEGIN,
     DEPTH_MM,
@@ -28,6 +30,7 @@ from tests.data.bags import (
     compressed,
     image,
     png,
+    rvl,
     write_mcap,
 )
 
@@ -92,7 +95,8 @@ def depth_messages() -> dict[str, tuple[str, str, dict[str, Any]]]:
     a, b = 10_000.0, -0.5
     header, kind = struct.Struct("<iff"), "sensor_msgs/msg/CompressedImage"
     plain = header.pack(0, 0.0, 0.0) + png(DEPTH_MM[0])
-    quantised = header.pack(0, a, b) + png(np.rint(a / metres + b).astype(np.uint16))
+    units = np.rint(a / metres + b).astype(np.uint16)
+    quantised, run = header.pack(0, a, b) + png(units), header.pack(0, a, b) + rvl(units)
     return {
         "16UC1": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, pad=4)),
         "16UC1 big": (DEPTH, IMAGE, image(DEPTH_MM[0], "16UC1", BEGIN, big_endian=True)),
@@ -104,6 +108,16 @@ def depth_messages() -> dict[str, tuple[str, str, dict[str, Any]]]:
             DEPTH + "/compressedDepth",
             kind,
             compressed(quantised, "32FC1; compressedDepth png", BEGIN),
+        ),
+        "compressedDepth rvl": (
+            DEPTH + "/compressedDepth",
+            kind,
+            compressed(header.pack(0, 0.0, 0.0) + rvl(DEPTH_MM[0]), "16UC1; compressedDepth rvl", BEGIN),
+        ),
+        "compressedDepth 32FC1 rvl": (
+            DEPTH + "/compressedDepth",
+            kind,
+            compressed(run, "32FC1; compressedDepth rvl", BEGIN),
         ),
         "png": (DEPTH + "/compressed", kind, compressed(png(DEPTH_MM[0]), "16UC1; png compressed ", BEGIN)),
     }
@@ -131,3 +145,18 @@ def test_depth_scale_overrules_millimetres(tmp_path: Path):
     found = read_recording(path, depth_scale_m=1e-4)
     assert found.depth_m is not None
     np.testing.assert_allclose(found.depth_m[0], DEPTH_MM[0] / 10_000, atol=1e-6)
+
+
+@pytest.mark.parametrize("holes", [0.0, 0.4, 1.0])
+def test_rvl_of_any_depth(holes: float):
+    rng = np.random.default_rng(3)
+    picture = rng.integers(0, 2**16, (17, 23)).astype(np.uint16) * (rng.random((17, 23)) >= holes)
+    np.testing.assert_array_equal(decode_rvl(rvl(picture)), picture)
+    for end in range(0, len(rvl(picture)) - 8, 4):  # a cut one may end in zeros that were never written
+        with contextlib.suppress(ValueError):
+            assert decode_rvl(rvl(picture)[:end]).shape == picture.shape
+
+
+def test_rvl_that_claims_to_be_huge():
+    with pytest.raises(ValueError, match="4294967295"):
+        decode_rvl(b"\xff" * 64)

@@ -166,6 +166,33 @@ def test_distorted_colours_are_rectified(model: str, d: tuple[float, ...], tmp_p
     assert (frames[0].rgb != RGB[0]).any()
 
 
+def test_regions_of_interest_and_binning_move_the_camera(tmp_path: Path):
+    whole = Camera(160.0, 164.0, 100.5, 70.5, 200, 150)
+    roi = {"x_offset": 40, "y_offset": 30, "height": 96, "width": 128, "do_rectify": False}
+    sensor = camera_info(whole, BEGIN) | {"roi": roi, "binning_x": 4, "binning_y": 4}
+    path = write_mcap(tmp_path / "a.mcap", [(COLOUR_INFO, INFO, sensor, BEGIN), colours(0)])
+    assert open_recording(path).camera == Camera(40.0, 41.0, 15.125, 10.125, 32, 24)
+    # A driver that says so but has it in its numbers already.
+    done = camera_info(CAMERA, BEGIN) | {"binning_x": 4, "binning_y": 4}
+    path = write_mcap(tmp_path / "b.mcap", [(COLOUR_INFO, INFO, done, BEGIN), colours(0)])
+    assert open_recording(path).camera == CAMERA
+
+
+def test_zeros_behind_the_coefficients_are_none(tmp_path: Path):
+    lens = (-0.3, 0.1, 0.0, 0.0, 0.0)
+    five, eight = (
+        read_recording(write_mcap(tmp_path / f"{len(d)}.mcap", [info(d=d), colours(0)])).rgb
+        for d in (lens, (*lens, 0.0, 0.0, 0.0))
+    )
+    np.testing.assert_array_equal(five, eight)
+
+
+def test_a_bag_that_was_never_finished(tmp_path: Path):
+    (tmp_path / "drive.bag.active").write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(RecordingError, match="rosbag reindex"):
+        open_recording(tmp_path / "drive.bag.active")
+
+
 def test_rectified_topics_use_the_projection_matrix(tmp_path: Path):
     message = camera_info(CAMERA, BEGIN, d=(-0.3, 0.1, 0.0, 0.0, 0.0))
     message["p"][0] = 55.0
@@ -313,7 +340,7 @@ BAD: dict[str, tuple[Callable[[], list[Sent]], dict[str, Any], str]] = {
         {},
         "the units are wrong, depth_scale_m = 0.001 would give 1.8",
     ),
-    "RVL": (
+    "torn RVL": (
         lambda: [
             info(),
             colours(0),
@@ -325,7 +352,7 @@ BAD: dict[str, tuple[Callable[[], list[Sent]], dict[str, Any], str]] = {
             ),
         ],
         {},
-        "compressed as RVL",
+        "cannot be read .*the message is torn",
     ),
 }
 

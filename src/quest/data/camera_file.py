@@ -41,8 +41,8 @@ class CameraFile:
 
     camera: Camera
     """Intrinsics, pixel centres at half-integers whatever the file's convention."""
-    depth_scale_m: float = DEFAULT_DEPTH_SCALE_M
-    """Metres per unit of the depth images."""
+    depth_scale_m: float | None = None
+    """Metres per unit of the depth images, or None if the file does not tell."""
     frames_per_s: float | None = None
     """Frame rate, or None if the file does not tell."""
     stamp_s: Float[np.ndarray, " S"] | None = None
@@ -57,6 +57,11 @@ class CameraFile:
     """Their lens."""
     colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Rigid transform from the depth camera's axes to the colour camera's, metres."""
+
+    @property
+    def unit_m(self) -> float:
+        """Metres per unit of depth images of integers."""
+        return DEFAULT_DEPTH_SCALE_M if self.depth_scale_m is None else self.depth_scale_m
 
     @property
     def rig(self) -> Rig:
@@ -129,7 +134,7 @@ def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None =
 def find_setup(
     where: str,
     options: ReadOptions,
-    known: Path | CameraFile | None,
+    known: CameraFile | None,
     *,
     size: tuple[int, int],
     depth: bool,
@@ -140,7 +145,7 @@ def find_setup(
     Args:
         where: the recording, for messages.
         options: with a camera, or a field of view, or neither.
-        known: the recording's own camera, if it has one.
+        known: the recording's own camera, if it has one; what the user's file leaves out is taken from it.
         size: width and height of the frames, pixels, for a guess.
         depth: whether there is depth; without intrinsics it would be of no use.
         notes: where a guess is noted.
@@ -153,7 +158,15 @@ def find_setup(
     if camera is not None:
         if options.fov_deg is not None:
             raise RecordingError(f"{where}: --fov is for recordings without a camera, and this has one; omit --fov")
-        return read_setup(camera, options.depth_scale_m)
+        setup = read_setup(camera, options.depth_scale_m)
+        own = setup if known is None else known
+        return replace(
+            setup,
+            depth_scale_m=own.depth_scale_m if setup.depth_scale_m is None else setup.depth_scale_m,
+            frames_per_s=own.frames_per_s if setup.frames_per_s is None else setup.frames_per_s,
+            stamp_s=own.stamp_s if setup.stamp_s is None and setup.frames_per_s is None else setup.stamp_s,
+            cam_from_world=own.cam_from_world if setup.cam_from_world is None else setup.cam_from_world,
+        )
     if depth and options.fov_deg is None:
         raise RecordingError(
             f"recording {where}: it has depth but no camera, and depth needs intrinsics; give a camera file such as "
@@ -177,7 +190,7 @@ def write_camera(file: CameraFile, path: Path) -> None:
     """Write a camera file that :func:`read_camera` reads."""
     camera = file.camera
     fields: dict[str, Any] = {name: getattr(camera, name) for name in _INTRINSICS}
-    fields |= {"pixel_centre": "half-integer", "depth_scale_m": file.depth_scale_m}
+    fields |= {"pixel_centre": "half-integer", "depth_scale_m": file.unit_m}
     if file.frames_per_s is not None:
         fields["fps"] = file.frames_per_s
     if file.stamp_s is not None:
@@ -208,7 +221,7 @@ def _parse(fields: dict[str, Any]) -> CameraFile:
         raise ValueError("colour_from_depth is given without depth_camera; give the intrinsics of the depth images too")
     return CameraFile(
         camera=_parse_intrinsics(fields, shift),
-        depth_scale_m=check_depth_scale(fields.get("depth_scale_m", DEFAULT_DEPTH_SCALE_M)),
+        depth_scale_m=None if "depth_scale_m" not in fields else check_depth_scale(fields["depth_scale_m"]),
         frames_per_s=None if "fps" not in fields else _positive("fps", fields["fps"]),
         stamp_s=None if "stamp_s" not in fields else _parse_stamps(fields["stamp_s"]),
         cam_from_world=None

@@ -47,6 +47,8 @@ class Distortion:
                 f"distortion model {self.model!r} is unknown; expected one of {', '.join(_COEFFICIENTS)}, or rectified "
                 "images with no coefficients"
             )
+        if len(self.coefficients) > numbers[-1] and not any(self.coefficients[numbers[-1] :]):
+            object.__setattr__(self, "coefficients", self.coefficients[: numbers[-1]])  # some drivers send more zeros
         if len(self.coefficients) not in numbers:
             expected = " or ".join(str(number) for number in numbers)
             raise InputError(

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from quest.depth import check_units
-from quest.errors import RecordingError
+from quest.errors import QuestError, RecordingError
 from quest.types import Camera, Clip, Frame
+from quest.untrusted import reading
 
 _ENOUGH_DEPTH = 0.05
 
@@ -137,7 +138,7 @@ class FrameSource:
         """
         self.notes.restart()
         unchecked, before = True, -np.inf
-        for t, frame in enumerate(self.frames()):
+        for t, frame in enumerate(self._guarded()):
             if frame.rgb.shape[:2] != (self.camera.height, self.camera.width):
                 raise RecordingError(
                     f"recording {self.name}: frame {t} is {frame.rgb.shape[1]} x {frame.rgb.shape[0]} but the camera "
@@ -157,6 +158,16 @@ class FrameSource:
             yield frame
         if before == -np.inf:
             raise RecordingError(f"recording {self.name}: expected at least one frame, got none; record it again")
+
+    def _guarded(self) -> Iterator[Frame]:
+        where, frames = f"recording {self.name}", None
+        while True:
+            with reading(where, RecordingError, known=QuestError):
+                frames = self.frames() if frames is None else frames
+                frame = next(frames, None)
+            if frame is None:
+                return
+            yield frame
 
     def clip(self, *, report: Callable[[int], object] | None = None) -> Clip:
         """All frames in memory; depth is zero in frames that have none.

@@ -284,7 +284,7 @@ def _units_m(episode: _Episode, key: str | None, setup: CameraFile, depth_scale_
             )
         return _Units(depth_scale_m, depth_scale_m)
     in_metres = feature.get("dtype") == "video" or (feature.get("info") or {}).get("depth_unit") == "m"
-    return _Units() if in_metres else _Units(setup.depth_scale_m)
+    return _Units() if in_metres else _Units(setup.unit_m)
 
 
 class _Rows:

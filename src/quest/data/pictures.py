@@ -12,13 +12,26 @@ from PIL import ExifTags, Image, ImageOps
 from quest.errors import InputError, RecordingError
 from quest.untrusted import reading, require_file
 
-PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".pgm", ".ppm", ".tif", ".tiff")
 """Endings of files that are pictures."""
 
 TURNED = (
     "EXIF or the video's header says that the colours are to be turned, and their depth is not turned with them; "
     "write colours and depth the same way up and omit the orientation, or omit the depth"
 )
+
+
+def open_image(path: Path) -> Image.Image:
+    """An image file, decoded.
+
+    Raises:
+        RecordingError: it cannot be read.
+    """
+    require_file(path, RecordingError)
+    remedy = "the file is torn, copy or record it again"
+    with reading(f"image {path}", RecordingError, remedy), Image.open(path) as image:
+        image.load()
+        return image
 
 
 def is_turned(image: Image.Image) -> bool:

@@ -1,7 +1,8 @@
 """Recordings, in whatever form: one registry of readers, and recording folders written.
 
 A recording folder holds ``rgb/`` (images, in natural order of their names) or one video, optionally ``depth/`` (16-bit
-PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The other forms are as their makers describe them.
+PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The other forms are as their makers describe them
+(:mod:`quest.data.layouts` for folders).
 """
 
 from __future__ import annotations
@@ -27,8 +28,9 @@ from quest.data.frame_source import (
 )
 from quest.data.video import frame_rate, write_video
 from quest.depth import clean_depth
-from quest.errors import InputError, RecordingError
+from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Clip
+from quest.untrusted import reading
 
 __all__ = [
     "FrameSource",
@@ -61,9 +63,9 @@ def open_recording(
     """Open a recording; its frames are read when they are asked for.
 
     Args:
-        path: a recording folder, a folder of images, a video, a LeRobot v3 dataset, an MCAP file, a ROS bag (the
-            folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``), a take (``STORE/NAME.zarr``, also as a URL), or
-            the word ``sample`` or ``sample-alarm`` for a packaged clip.
+        path: a recording folder, one of another recorder, a folder of images, a video, a LeRobot v3 dataset, an MCAP
+            file, a ROS bag (the folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``), a take (``STORE/NAME.zarr``,
+            also as a URL), or the word ``sample`` or ``sample-alarm`` for a packaged clip.
         depth: folder of 16-bit depth images, one per frame, of folders and videos alone; by default ``depth`` in the
             recording folder (or beside a video), where there is one. Without it there are colours only.
         camera: camera file, or the intrinsics themselves; by default those that the recording has, such as
@@ -101,7 +103,8 @@ def open_recording(
             kinds = " or ".join(reader.kind for reader in known if name in reader.options)
             option = "--fov" if name == "fov_deg" else "--" + name.replace("_", "-")
             raise RecordingError(f"{where}: {option} {value} is for {kinds}, and this is {reader.kind}; omit {option}")
-    return reader.open(where, options)
+    with reading(f"recording {where}", RecordingError, known=QuestError):
+        return reader.open(where, options)
 
 
 def read_recording(

@@ -212,10 +212,23 @@ def _camera_of(info: Any, topic: str, size: tuple[int, ...], where: str) -> tupl
             f"{where}: camera_info of {topic} is of a camera that was never calibrated (fx = {matrix[0, 0]:g}); give "
             "the intrinsics with --camera FILE"
         )
-    height, width = (info.height, info.width) if info.width and info.height else size
     lens = Distortion() if rectified else Distortion(str(info.distortion_model) or "plumb_bob", tuple(d.tolist()))
     fx, fy, cx, cy = (float(matrix[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
-    return Camera(fx, fy, cx + 0.5, cy + 0.5, int(width), int(height)), lens  # ROS has centres at integers
+    whole = (info.height, info.width) if info.width and info.height else size
+    (left, top), (across, down), cut = _window(info, whole)
+    if cut != size:  # the driver says what it left out, and has it in its numbers already
+        (left, top), (across, down), cut = (0, 0), (1, 1), whole
+    centre = (cx + 0.5 - left) / across, (cy + 0.5 - top) / down  # ROS has centres at integers
+    return Camera(fx / across, fy / down, *centre, int(cut[1]), int(cut[0])), lens
+
+
+def _window(info: Any, whole: tuple[int, ...]) -> tuple[tuple[int, int], tuple[int, int], tuple[int, ...]]:
+    """Region of interest and binning: left and top, pixels in one across and down, and height and width then."""
+    bins = max(int(getattr(info, "binning_x", 1)), 1), max(int(getattr(info, "binning_y", 1)), 1)
+    roi = getattr(info, "roi", None)
+    height, width = (int(roi.height), int(roi.width)) if roi is not None and roi.width and roi.height else whole
+    corner = (0, 0) if roi is None else (int(roi.x_offset), int(roi.y_offset))
+    return corner, bins, (height // bins[1], width // bins[0])
 
 
 class _Play:

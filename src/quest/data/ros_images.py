@@ -15,8 +15,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, UInt8
 
+from quest.data.rvl import decode_rvl
 from quest.depth import clean_depth, metres
 from quest.errors import RecordingError
+from quest.untrusted import reading
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
 """Encodings of depth; mono16 also occurs for infrared pictures."""
@@ -167,14 +169,14 @@ def _compressed_depth(message: Any, where: str, unit_m: np.float32) -> np.ndarra
     kind = encoding.partition(";")[0].strip()
     if "compressedDepth" not in encoding:
         return _grey16(data, where).astype(np.float32) * unit_m
-    if "rvl" in encoding.lower():
-        raise RecordingError(
-            f"{where}: depth is compressed as RVL ({encoding!r}), which is not read; record it as png, or as raw Image"
-        )
     if len(data) <= _HEADER.size:
         raise RecordingError(f"{where}: {len(data)} bytes of compressed depth; the message is corrupt, record it again")
     _, quant_a, quant_b = _HEADER.unpack_from(data)
-    units = _grey16(data[_HEADER.size :], where)
+    if "rvl" in encoding.lower():
+        with reading(where, RecordingError, "the message is torn, record it again"):
+            units = decode_rvl(data[_HEADER.size :])
+    else:
+        units = _grey16(data[_HEADER.size :], where)
     if kind != "32FC1":
         return units.astype(np.float32) * unit_m
     with np.errstate(divide="ignore"):

@@ -65,10 +65,16 @@ class BagMessages:
 
 def _accepts(where: str) -> bool:
     path = Path(where)
-    return (path.suffix.lower() in (".bag", ".db3") and path.is_file()) or (path / "metadata.yaml").is_file()
+    ends = (".bag", ".db3", ".active")
+    return (path.suffix.lower() in ends and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
 def _open(where: str, options: ReadOptions) -> FrameSource:
+    if where.lower().endswith(".active"):
+        raise RecordingError(
+            f"bag {where}: it was never finished: its recorder still runs, or died; close it with `rosbag reindex` and "
+            "name the .bag that this makes"
+        )
     return open_messages(BagMessages(Path(where)), options)
 
 

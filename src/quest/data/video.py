@@ -17,6 +17,7 @@ from av.video.stream import VideoStream
 from jaxtyping import Float, Shaped, UInt8, UInt16
 
 from quest.errors import InputError, RecordingError
+from quest.untrusted import require_file
 from quest.whole_file import whole_file
 from quest.wording import counted
 
@@ -157,8 +158,7 @@ def read_video(path: Path) -> tuple[UInt8[np.ndarray, "T H W 3"], Float[np.ndarr
 
 @contextmanager
 def _open(path: Path) -> Iterator[InputContainer]:
-    if not path.is_file():
-        raise RecordingError(f"video {path}: no such file; check the path")
+    require_file(path, RecordingError)
     try:
         # Resolved, because FFmpeg takes what precedes a colon for a protocol.
         container = av.open(str(path.resolve()), metadata_errors="replace")

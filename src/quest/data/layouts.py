@@ -1,0 +1,507 @@
+"""Folders as recorders and data sets leave them: which pictures they hold, and what their files say of the camera.
+
+Known are recording folders of our own, and those of Open3D, ScanNet, TUM RGB-D, 7-Scenes, 3RScan, Record3D, Stray
+Scanner and nerfstudio. Poses in them are ``world_from_cam``; those of Record3D and nerfstudio have OpenGL's axes.
+
+Reference: the pages of these data sets and tools that describe their formats; Sturm et al. 2012 (TUM RGB-D, with the
+calibration of its three cameras); Shotton et al. 2013 (7-Scenes).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+from quest.data.camera_file import CameraFile, read_camera
+from quest.data.depth_file import DEPTH_SUFFIXES, read_depth_file
+from quest.data.distortion import Distortion
+from quest.data.pictures import PICTURES
+from quest.data.video import SUFFIXES
+from quest.errors import RecordingError
+from quest.geometry.poses import is_rigid, nearest_rigid
+from quest.types import Camera
+from quest.untrusted import MOST_TEXT, is_inside, read_json, reading, require_file
+
+Size = tuple[int, int]
+"""Width and height, pixels."""
+
+_COLOURS = ("rgb", "color", "colour", "images", "image")
+_POSES = ("pose", "poses")
+_MATRICES = (
+    *("K.txt", "cam_K.txt", "intrinsics.txt", "intrinsic.txt", "camera_intrinsics.txt", "camera-intrinsics.txt"),
+    *("intrinsic/intrinsic_color.txt", "intrinsics/intrinsic_color.txt", "camera_matrix.csv"),
+)
+_OPEN3D = ("intrinsic.json", "camera_intrinsic.json", "camera_primesense.json")
+_SIDE_BY_SIDE = re.compile(r"(.+[._-])colou?r\.[^.]+", re.IGNORECASE)
+_SYNC_S = 0.02
+_STALE_S = 0.5
+_GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
+_FREIBURG = {
+    "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
+    "2": ((520.9, 521.0, 325.1, 249.7), (0.2312, -0.7849, -0.0033, -0.0001, 0.9172)),
+    "3": ((535.4, 539.2, 320.1, 247.6), ()),
+}
+"""Intrinsics and lens of the three cameras of TUM RGB-D, pixel centres at integers."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The pictures of a recording, in order, and what its files say of the camera."""
+
+    colours: tuple[Path, ...]
+    """Images, or one video."""
+    depth_folder: Path
+    """Where depth is or would be, for messages."""
+    depths: tuple[Path | None, ...] | None = None
+    """One for every frame, None where a frame has none; None where there is no depth at all."""
+    setup: Callable[[Size], CameraFile | None] = lambda size: None
+    """What is known of the camera, for colours of a size."""
+    numbered: bool = True
+    """Whether all that goes by frames must be as many as the colours; else the shortest counts."""
+    notes: tuple[str, ...] = ()
+    """Degradations in words."""
+
+
+def find_layout(source: Path) -> Layout:
+    """What a video, or a folder of one of the known layouts, holds.
+
+    Raises:
+        RecordingError: a file in it is missing, or says what makes no sense.
+    """
+    if source.suffix.lower() == ".r3d":
+        raise RecordingError(f"recording {source}: .r3d is compressed as LZFSE; export it from Record3D as EXR + RGB")
+    if source.is_file():
+        return Layout((source,), depth := source.parent / "depth", _depths(depth), setup=_own_camera(source.parent))
+    if (source / "EXR_RGBD" / "metadata.json").is_file():
+        source = source / "EXR_RGBD"
+    makers = {"rgb.txt": _tum, "metadata.json": _record3d, "transforms.json": _nerfstudio, "odometry.csv": _stray}
+    for name, make in makers.items():
+        if (source / name).is_file():
+            return make(source)
+    return _side_by_side(source) or _folders(source)
+
+
+def is_layout(folder: Path) -> bool:
+    """Whether a folder holds colours."""
+    marks = ("camera.json", "rgb.txt", "transforms.json", "EXR_RGBD")
+    return any((folder / name).exists() for name in (*marks, *_COLOURS)) or any(map(_is_colours, folder.iterdir()))
+
+
+def list_images(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Files with some endings, in the natural order of their names."""
+    paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
+    return sorted(paths, key=_natural)
+
+
+def _is_colours(path: Path) -> bool:
+    return path.suffix.lower() in (*PICTURES, *SUFFIXES) and not path.name.startswith(".")
+
+
+def _natural(path: Path) -> list[tuple[float, float, str]]:
+    """Sorts frame 2 before frame 10, and names that are times by these."""
+    time = re.fullmatch(r"\d+\.\d+", path.stem)
+    parts = ["", path.stem, ""] if time else re.split(r"(\d+)", path.stem)
+    key: list[tuple[float, float, str]] = []
+    for part in parts:
+        key.append((1, float(part), "") if (time and part) or part.isdecimal() else (0, 0, part))
+    return [*key, (0, 0, path.suffix)]
+
+
+# --- Layouts ----------------------------------------------------------------------------------------------------------
+
+
+def _folders(root: Path) -> Layout:
+    """Colours in a folder of their own, or in the root; depth, poses and intrinsics beside them."""
+    inner = next((root / name for name in _COLOURS if (root / name).is_dir()), root)
+    videos = [] if inner != root else list_images(root, SUFFIXES)
+    if len(videos) > 1:
+        found = ", ".join(video.name for video in videos)
+        raise RecordingError(f"recording {root}: expected one video, got {found}; name the video itself")
+    colours = tuple(videos or list_images(inner, PICTURES))
+    depth = root / "depth"
+    poses, notes = (None, ()) if videos else _beside(root, colours)
+    return Layout(
+        colours,
+        depth,
+        _depths(depth),
+        setup=_own_camera(root, cam_from_world=poses),
+        notes=notes,
+    )
+
+
+def _depths(folder: Path) -> tuple[Path, ...] | None:
+    return tuple(list_depth(folder)) if folder.exists() else None
+
+
+def list_depth(folder: Path) -> list[Path]:
+    """Depth pictures of a folder, in order.
+
+    Raises:
+        RecordingError: there is no such folder, or only other files in it.
+    """
+    if not folder.is_dir():
+        raise RecordingError(f"depth {folder}: no such folder; expected one 16-bit PNG per colour frame")
+    found = list_images(folder, DEPTH_SUFFIXES)
+    others = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    if others and not found:
+        raise RecordingError(f"depth {folder}: expected 16-bit PNG images, got files such as {others[0]}; convert them")
+    return found
+
+
+def _side_by_side(root: Path) -> Layout | None:
+    """7-Scenes, 3RScan and others: ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt``."""
+    colours = {m[1]: p for p in list_images(root, PICTURES) if (m := _SIDE_BY_SIDE.fullmatch(p.name)) is not None}
+    if not colours:
+        return None
+    there = {path.name.lower(): path for path in root.iterdir()}
+    depths = [
+        next((there[name] for end in DEPTH_SUFFIXES if (name := f"{stem}depth{end}".lower()) in there), None)
+        for stem in colours
+    ]
+    poses = [there.get(f"{stem}pose.txt".lower()) for stem in colours]
+    cam_from_world, notes = _poses_of_files(poses) if None not in poses else (None, ())
+    own = _own_camera(root, cam_from_world=cam_from_world)
+
+    def setup(size: Size) -> CameraFile | None:
+        info = next((path for name in ("_info.txt", "info.txt") if (path := root / name).is_file()), None)
+        known = own(size) or (None if info is None else _scan_info(info))
+        if known is None and size == (640, 480) and colours.keys() == {s for s in colours if s.startswith("frame-")}:
+            known = CameraFile(Camera(585.0, 585.0, 320.0, 240.0, *size))  # as the page of 7-Scenes has it
+        return known and replace(known, cam_from_world=cam_from_world)
+
+    return Layout(tuple(colours.values()), root, _some(depths), setup=setup, notes=notes)
+
+
+def _tum(root: Path) -> Layout:
+    """TUM RGB-D and those who follow it: lists of pictures by time, and where the camera was."""
+    colours = _timed_files(root, "rgb.txt")
+    stamp_s = np.array([time for time, _ in colours])
+    depths: list[Path | None] | None = None
+    if (root / "depth.txt").is_file():
+        listed = _timed_files(root, "depth.txt")
+        at_s = np.array([time for time, _ in listed])
+        near = np.abs(at_s[None] - stamp_s[:, None]).argmin(1)
+        depths = [
+            listed[i][1] if abs(at_s[i] - time) <= _SYNC_S else None for i, time in zip(near, stamp_s, strict=True)
+        ]
+    poses, notes = None, list[str]()
+    if (truth := root / "groundtruth.txt").is_file():
+        table = _table(truth, 8)
+        poses, stale = _poses_between(table[:, 0], table[:, 1:4], table[:, 4:], stamp_s, truth)
+        notes += [f"poses end or have a gap of more than {_STALE_S:g} s: {stale} frames have the nearest"] * (stale > 0)
+    camera = re.search(r"freiburg([123])", root.resolve().name)
+    known = None if camera is None else _FREIBURG[camera[1]]
+    own = _own_camera(root)
+    if known is None and own((640, 480)) is None:
+        notes.append("no camera file: the intrinsics are those that TUM RGB-D recommends for any of its cameras")
+
+    def setup(size: Size) -> CameraFile | None:
+        values, lens = known or ((525.0, 525.0, 319.5, 239.5), ())
+        given = own(size)
+        if given is None and size != (640, 480):
+            return None
+        found = given or CameraFile(_camera(np.array(values), size), distortion=Distortion(coefficients=lens))
+        return replace(
+            found,
+            depth_scale_m=found.depth_scale_m or 1 / 5000,
+            stamp_s=stamp_s - stamp_s[0],
+            cam_from_world=poses if found.cam_from_world is None else found.cam_from_world,
+        )
+
+    return Layout(
+        tuple(path for _, path in colours),
+        root / "depth",
+        None if depths is None else _some(depths),
+        setup=setup,
+        notes=tuple(notes),
+    )
+
+
+def _record3d(root: Path) -> Layout:
+    """What Record3D exports as EXR + RGB: ``rgb/``, ``depth/`` in metres, and ``metadata.json``."""
+    file = root / "metadata.json"
+    fields = _object(file)
+    layout = _folders(root)
+    with _asking(file):
+        width, height = int(fields["w"]), int(fields["h"])
+        lenses = np.array(fields.get("perFrameIntrinsicCoeffs") or [], np.float64).reshape(-1, 4)
+        matrix = np.array(fields["K"], np.float64).reshape(3, 3)  # column by column
+        values = np.median(lenses, 0) if len(lenses) else matrix[[0, 1, 2, 2], [0, 1, 0, 1]]
+        depth_size = int(fields.get("dw") or width), int(fields.get("dh") or height)
+        stamps = np.array(fields.get("frameTimestamps") or [], np.float64)
+        poses = np.array(fields.get("poses") or [], np.float64).reshape(-1, 7)
+        camera = _camera(values, (width, height))
+        setup = CameraFile(
+            camera,
+            frames_per_s=float(fields["fps"]) if fields.get("fps") else None,
+            stamp_s=stamps - stamps[0] if len(stamps) else None,
+            cam_from_world=_cam_from_world(_matrices(poses[:, 4:], poses[:, :4]) @ _GL_FROM_CV) if len(poses) else None,
+            depth_camera=None if depth_size == (width, height) else _scaled(camera, depth_size),
+        )
+    steady = not len(lenses) or np.ptp(lenses[:, 0]) < 0.01 * values[0]
+    notes = () if steady else ("the focal length changes: its median is used",)
+    return replace(layout, setup=lambda size: setup, notes=(*layout.notes, *notes), numbered=False)
+
+
+def _stray(root: Path) -> Layout:
+    """What the Stray Scanner app leaves: a video, ``depth/``, ``odometry.csv`` and ``camera_matrix.csv``."""
+    file = root / "odometry.csv"
+    layout = _folders(root)
+    with _asking(file):
+        names = [name.strip() for name in _text(file).splitlines()[0].split(",")]
+        table = _table(file, len(names), skip=1)
+        column = dict(zip(names, table.T, strict=True))
+        stamps = column["timestamp"]
+        position, quaternion = (np.stack([column[name] for name in group], -1) for group in ("xyz", _QUATERNION))
+        poses = _cam_from_world(_matrices(position, quaternion))
+    own = _own_camera(root)
+    depth_size = read_depth_file(layout.depths[0]).shape[::-1] if layout.depths and layout.depths[0] else None
+
+    def setup(size: Size) -> CameraFile | None:
+        found = own(size)
+        return found and replace(
+            found,
+            stamp_s=stamps - stamps[0],
+            cam_from_world=poses,
+            depth_camera=None if depth_size is None else _scaled(found.camera, depth_size),
+        )
+
+    return replace(layout, setup=setup, numbered=False)
+
+
+def _nerfstudio(root: Path) -> Layout:
+    """Nerfstudio's ``transforms.json``; without depth its poses are of unknown scale, and not used."""
+    file = root / "transforms.json"
+    fields = _object(file)
+    with _asking(file):
+        frames = sorted(fields["frames"], key=lambda frame: _natural(Path(frame["file_path"])))
+        colours = tuple(_inside(root, frame["file_path"], file) for frame in frames)
+        named = [frame.get("depth_file_path") for frame in frames]
+        depths = _some([None if name is None else _inside(root, name, file) for name in named])
+        fx, fy, cx, cy = (float(fields[name]) for name in ("fl_x", "fl_y", "cx", "cy"))
+        camera = Camera(fx, fy, cx, cy, int(fields["w"]), int(fields["h"]))
+        fisheye = "FISHEYE" in str(fields.get("camera_model"))
+        lens = tuple(float(fields.get(n, 0)) for n in (("k1", "k2", "k3", "k4") if fisheye else _PLUMB_BOB))
+        poses = _cam_from_world(np.array([frame["transform_matrix"] for frame in frames], np.float64) @ _GL_FROM_CV)
+        setup = CameraFile(
+            camera,
+            depth_scale_m=float(fields.get("depth_unit_scale_factor", 1e-3)),
+            cam_from_world=None if depths is None else poses,
+            distortion=Distortion("equidistant" if fisheye else "plumb_bob", lens if fisheye or any(lens) else ()),
+        )
+    notes = () if depths is not None else ("transforms.json has no depth: its poses are of unknown scale and not used",)
+    return Layout(colours, root, depths, setup=lambda size: setup, notes=notes)
+
+
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_PLUMB_BOB = ("k1", "k2", "p1", "p2", "k3")
+
+
+# --- Cameras ----------------------------------------------------------------------------------------------------------
+
+
+def _own_camera(root: Path, *, cam_from_world: np.ndarray | None = None) -> Callable[[Size], CameraFile | None]:
+    """What a folder's own file says of the camera: ``camera.json``, Open3D's JSON, or a matrix as text."""
+
+    def setup(size: Size) -> CameraFile | None:
+        if (root / "camera.json").exists():
+            found = read_camera(root / "camera.json")
+        elif (open3d := next((p for name in _OPEN3D if (p := root / name).is_file()), None)) is not None:
+            found = _open3d_camera(open3d)
+        elif (matrix := next((p for name in _MATRICES if (p := root / name).is_file()), None)) is not None:
+            found = _matrix_camera(matrix, size)
+        else:
+            return None
+        return found if found.cam_from_world is not None else replace(found, cam_from_world=cam_from_world)
+
+    return setup
+
+
+def _camera(values: Float[np.ndarray, "4"], size: Size) -> Camera:
+    """A camera of fx, fy, cx and cy with pixel centres at integers."""
+    fx, fy, cx, cy = values.tolist()
+    return Camera(fx, fy, cx + 0.5, cy + 0.5, *size)
+
+
+def _scaled(camera: Camera, size: Size) -> Camera:
+    """The same camera with other pixels."""
+    x, y = size[0] / camera.width, size[1] / camera.height
+    return Camera(camera.fx * x, camera.fy * y, camera.cx * x, camera.cy * y, *size)
+
+
+def _open3d_camera(file: Path) -> CameraFile:
+    fields = _object(file)
+    with _asking(file):
+        matrix = np.array(fields["intrinsic_matrix"], np.float64)
+        matrix = matrix.reshape(3, 3).T if matrix.ndim == 1 else matrix  # column by column
+        units = fields.get("depth_scale")
+        return CameraFile(
+            _camera(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(fields["width"]), int(fields["height"]))),
+            depth_scale_m=None if units is None else 1 / float(units),
+        )
+
+
+def _matrix_camera(file: Path, size: Size) -> CameraFile:
+    """A camera whose matrix stands in a text, for pictures of a size; ScanNet's has the depth's beside it."""
+    with _asking(file):
+        camera = _camera(_matrix(file)[[0, 1, 0, 1], [0, 1, 2, 2]], size)
+        depth, turned = file.with_name("intrinsic_depth.txt"), np.eye(4)
+        if file.name != "intrinsic_color.txt" or not depth.is_file():
+            return CameraFile(camera)
+        sides = [
+            _matrix(path) for name in ("color", "depth") if (path := file.with_name(f"extrinsic_{name}.txt")).is_file()
+        ]
+        if len(sides) == 2 and all(map(is_rigid, sides)):
+            turned = np.linalg.inv(sides[0]) @ sides[1]
+        return CameraFile(
+            camera,
+            depth_camera=_camera(_matrix(depth)[[0, 1, 0, 1], [0, 1, 2, 2]], (640, 480)),
+            colour_from_depth=turned,
+        )
+
+
+def _scan_info(file: Path) -> CameraFile:
+    """The calibration of 3RScan and BundleFusion: lines ``m_colorWidth = 960``."""
+    with _asking(file):
+        lines = (line.partition("=") for line in _text(file).splitlines())
+        fields = {name.strip(): value.split() for name, _, value in lines}
+
+        def camera(which: str) -> Camera:
+            matrix = np.array(fields[f"m_calibration{which}Intrinsic"], np.float64).reshape(4, 4)
+            size = (int(fields[f"m_{which.lower()}{side}"][0]) for side in ("Width", "Height"))
+            return _camera(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (next(size), next(size)))
+
+        colours, depth = camera("Color"), camera("Depth")
+        unit_m = 1 / float(fields.get("m_depthShift", ["1000"])[0])
+        return CameraFile(colours, depth_scale_m=unit_m, depth_camera=None if depth == colours else depth)
+
+
+# --- Poses ------------------------------------------------------------------------------------------------------------
+
+
+def _beside(root: Path, colours: Sequence[Path]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Poses in a folder with a matrix for every picture, or in Open3D's ``trajectory.log``; with notes."""
+    folder = next((root / name for name in _POSES if (root / name).is_dir()), None)
+    if folder is not None and (files := list_images(folder, (".txt",))):
+        if len(files) == len(colours):
+            return _poses_of_files(files)
+        return None, (f"{len(files)} poses for {len(colours)} pictures: not used",)
+    log = next((p for name in ("trajectory.log", "scene/trajectory.log") if (p := root / name).is_file()), None)
+    if log is None:
+        return None, ()
+    with _asking(log):
+        lines = [line for line in _text(log).splitlines() if line.strip()]
+        rows = np.array([line.split() for t, line in enumerate(lines) if t % 5], np.float64).reshape(-1, 4, 4)
+        if len(rows) != len(colours):
+            return None, (f"{len(rows)} poses for {len(colours)} pictures: not used",)
+        return _cam_from_world(rows), ()
+
+
+def _poses_of_files(files: Sequence[Path | None]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """``cam_from_world`` of files with a matrix each; where the recorder lost itself, the pose before."""
+    matrices = [_matrix(file) for file in files if file is not None]
+    known = [t for t, matrix in enumerate(matrices) if matrix.shape == (4, 4) and is_rigid(matrix)]
+    if not known:
+        return None, ("no pose is a rigid transform: not used",)
+    nearest = [known[np.abs(np.array(known) - t).argmin()] for t in range(len(matrices))]
+    lost = len(matrices) - len(known)
+    notes = (f"no pose: {lost} frame{'s have' if lost > 1 else ' has'} that of the nearest frame",) * (lost > 0)
+    return _cam_from_world(np.stack([matrices[t] for t in nearest])), notes
+
+
+def _cam_from_world(world_from_cam: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4 4"]:
+    if not is_rigid(world_from_cam):
+        raise ValueError("a pose is not a rigid transform")
+    return np.linalg.inv(np.stack([nearest_rigid(pose) for pose in world_from_cam]))
+
+
+def _matrices(position: Float[np.ndarray, "T 3"], quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4 4"]:
+    """Transforms of places and of quaternions x, y, z, w."""
+    found = np.tile(np.eye(4), (len(position), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
+    return found
+
+
+def _poses_between(
+    time_s: np.ndarray, position: np.ndarray, quaternion: np.ndarray, at_s: np.ndarray, file: Path
+) -> tuple[np.ndarray, int]:
+    """``cam_from_world`` at some times, on the line and the shortest arc; how many are far from any that is known."""
+    with _asking(file):
+        time_s, first = np.unique(time_s, return_index=True)
+        position, quaternion = position[first], quaternion[first]
+        after = np.clip(np.searchsorted(time_s, at_s), 1, max(len(time_s) - 1, 1)) % len(time_s)
+        gap_s = np.minimum(np.abs(time_s[after] - at_s), np.abs(time_s[after - 1] - at_s))
+        inside = np.clip(at_s, time_s[0], time_s[-1])
+        places = np.stack([np.interp(inside, time_s, axis) for axis in position.T], -1)
+        turns = np.repeat(quaternion, len(at_s), axis=0)  # of one pose
+        if len(time_s) > 1:
+            turns = Slerp(time_s, Rotation.from_quat(quaternion))(inside).as_quat()
+        return _cam_from_world(_matrices(places, turns)), int((gap_s > _STALE_S).sum())
+
+
+# --- Files ------------------------------------------------------------------------------------------------------------
+
+
+def _asking(file: Path) -> Any:
+    return reading(file, RecordingError, "restore it as its recorder wrote it, or give --camera FILE")
+
+
+def _object(file: Path) -> dict[str, Any]:
+    fields = read_json(file, RecordingError)
+    if not isinstance(fields, dict):
+        raise RecordingError(f"{file}: expected an object, got {type(fields).__name__}; restore it")
+    return fields
+
+
+def _text(file: Path) -> str:
+    require_file(file, RecordingError, most=MOST_TEXT)
+    return file.read_text(encoding="utf-8")
+
+
+def _table(file: Path, columns: int, *, skip: int = 0) -> Float[np.ndarray, "N C"]:
+    """Numbers in columns with spaces or commas between; lines that begin with # are left out."""
+    lines = [line for line in _text(file).splitlines()[skip:] if line.strip() and not line.startswith("#")]
+    table = np.array([line.replace(",", " ").split() for line in lines], np.float64).reshape(-1, columns)
+    if not len(table) or not np.isfinite(table).all():
+        raise ValueError("expected rows of finite numbers")
+    return table
+
+
+def _matrix(file: Path) -> np.ndarray:
+    """A matrix of 3 × 3, 3 × 4 or 4 × 4 as text; may hold infinities, where a recorder lost its place."""
+    with _asking(file):
+        rows = [line.replace(",", " ").split() for line in _text(file).splitlines() if line.strip()]
+        matrix = np.array(rows, np.float64)
+        matrix = matrix.reshape(3, 3) if matrix.size == 9 else matrix
+        if matrix.shape not in ((3, 3), (3, 4), (4, 4)):
+            raise ValueError(f"its numbers are of shape {matrix.shape}, expected 3 x 3 or 4 x 4")
+        return matrix
+
+
+def _timed_files(root: Path, name: str) -> list[tuple[float, Path]]:
+    """Times and files of a list, in its order."""
+    file = root / name
+    with _asking(file):
+        lines = [line.split() for line in _text(file).splitlines() if line.strip() and not line.startswith("#")]
+        found = [(float(time), _inside(root, path, file)) for time, path in lines]
+        if not found or not np.isfinite([time for time, _ in found]).all():
+            raise ValueError("expected lines with a time and a file")
+        return sorted(found, key=lambda each: each[0])
+
+
+def _inside(root: Path, name: object, file: Path) -> Path:
+    if not is_inside(name):
+        raise RecordingError(f"{file}: {name!r} is no file in this folder; restore it")
+    return root / str(name)
+
+
+def _some(depths: Iterable[Path | None]) -> tuple[Path | None, ...] | None:
+    found = tuple(depths)
+    return found if any(path is not None for path in found) else None

@@ -1,0 +1,175 @@
+"""Recordings in the layouts of others, written here as their recorders do."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from quest.data.layouts import find_layout
+from quest.data.recording import open_recording, read_recording
+from quest.errors import RecordingError
+from quest.types import Camera
+from tests.data.layout_writers import (
+    CAMERA,
+    DEPTH_M,
+    FRAMES,
+    HEIGHT,
+    POSES,
+    RGB,
+    WIDTH,
+    exr,
+    matrix_as_text,
+    nerfstudio,
+    open3d,
+    record3d,
+    rscan,
+    scannet,
+    seven_scenes,
+    stray,
+    tum,
+)
+
+SEVEN_SCENES = Camera(585.0, 585.0, 320.0, 240.0, WIDTH, HEIGHT)
+TUM = Camera(525.0, 525.0, 320.0, 240.0, WIDTH, HEIGHT)
+LAYOUTS: dict[str, tuple[Callable[[Path], Path], Camera]] = {
+    "TUM RGB-D": (tum, TUM),
+    "7-Scenes": (seven_scenes, SEVEN_SCENES),
+    "3RScan": (rscan, CAMERA),
+    "Open3D": (open3d, CAMERA),
+    "ScanNet": (scannet, CAMERA),
+    "matrix": (matrix_as_text, CAMERA),
+    "Record3D": (record3d, CAMERA),
+    "Stray Scanner": (stray, CAMERA),
+    "nerfstudio": (nerfstudio, CAMERA),
+}
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_layouts_as_they_come(name: str, tmp_path: Path):
+    write, camera = LAYOUTS[name]
+    root = tmp_path / "it"
+    root.mkdir()
+    clip = read_recording(write(root))
+    np.testing.assert_allclose(np.array(clip.camera.matrix), camera.matrix, atol=1e-9)
+    assert len(clip) == FRAMES
+    assert np.abs(clip.rgb.astype(int) - RGB).mean() < (6 if name in ("Stray Scanner", "3RScan") else 1e-9)
+    assert clip.depth_m is not None
+    small = name in ("Record3D", "Stray Scanner", "3RScan")  # registered: every pixel is drawn as a square
+    for t in (0, FRAMES - 1):
+        both = (clip.depth_m[t] > 0) & (DEPTH_M > 0)
+        assert both.mean() > 0.8
+        off = np.abs(clip.depth_m[t] - DEPTH_M)[both]
+        assert np.quantile(off, 0.9 if small else 1.0) < (0.06 if small else 1e-5)
+        assert (clip.depth_m[t][:40] == 0).all()
+    poses = np.linalg.inv(POSES)
+    if name == "matrix":
+        poses[:] = np.eye(4)
+    if name == "ScanNet":
+        poses[2] = poses[1]
+        assert any("1 frame has" in note for note in clip.notes)
+    np.testing.assert_allclose(clip.cam_from_world, poses, atol=1e-6)
+    seconds = np.arange(FRAMES) / (25 if name in ("TUM RGB-D", "Record3D", "Stray Scanner") else 30)
+    np.testing.assert_allclose(clip.stamp_s, seconds, atol=1e-6)
+
+
+def test_frames_of_tum_without_depth_have_none(tmp_path: Path):
+    source = open_recording(tum(tmp_path))
+    assert [frame.depth_m is None for frame in source] == [False, False, False, True, False]
+    assert any("no depth" in flag for flag in source.flags)
+    assert any("TUM RGB-D recommends" in flag for flag in source.flags)
+
+
+def test_the_cameras_of_tum_are_known(tmp_path: Path):
+    source = open_recording(tum(tmp_path, "rgbd_dataset_freiburg3_cabinet"))
+    assert source.camera == Camera(535.4, 539.2, 320.6, 248.1, WIDTH, HEIGHT)
+    assert not any("recommends" in flag for flag in source.flags)
+
+
+def test_a_camera_of_the_user_keeps_times_poses_and_units(tmp_path: Path):
+    root = tum(tmp_path)
+    clip = read_recording(root, camera=CAMERA)
+    assert clip.camera == CAMERA
+    assert clip.depth_m is not None
+    assert np.median(clip.depth_m[0][DEPTH_M > 0]) == pytest.approx(np.median(DEPTH_M[DEPTH_M > 0]), abs=1e-3)
+    np.testing.assert_allclose(clip.cam_from_world, np.linalg.inv(POSES), atol=1e-6)
+    assert clip.stamp_s[-1] == pytest.approx(0.16)
+
+
+@pytest.mark.parametrize("suffix", [".tiff", ".exr", ".npy"])
+def test_floats_are_metres(suffix: str, tmp_path: Path):
+    root = open3d(tmp_path)
+    for file in (root / "depth").iterdir():
+        file.unlink()
+    for t in range(FRAMES):
+        path = root / "depth" / f"{t:06d}{suffix}"
+        metres = DEPTH_M.astype(np.float32)
+        if suffix == ".exr":
+            exr(path, metres)
+        elif suffix == ".npy":
+            np.save(path, metres)
+        else:
+            Image.fromarray(metres).save(path)
+    clip = read_recording(root)
+    assert clip.depth_m is not None
+    np.testing.assert_allclose(clip.depth_m[0], DEPTH_M, atol=1e-6)
+
+
+def test_a_stray_scan_with_fewer_depth_pictures_is_cut_and_says_so(tmp_path: Path):
+    root = stray(tmp_path)
+    (root / "depth" / f"{FRAMES - 1:06d}.png").unlink()
+    clip = read_recording(root)
+    assert len(clip) == FRAMES - 1
+    assert any("the first 4 are read" in note for note in clip.notes)
+
+
+def test_poses_of_nerfstudio_without_depth_are_not_used(tmp_path: Path):
+    root = nerfstudio(tmp_path)
+    fields = json.loads((root / "transforms.json").read_text())
+    for frame in fields["frames"]:
+        del frame["depth_file_path"]
+    (root / "transforms.json").write_text(json.dumps(fields))
+    clip = read_recording(root)
+    assert (clip.cam_from_world == np.eye(4)).all()
+    assert any("unknown scale" in note for note in clip.notes)
+
+
+BROKEN: dict[str, tuple[Callable[[Path], Path], str, Callable[[str], str]]] = {
+    "TUM: a path that leads out": (tum, "rgb.txt", lambda text: text.replace("rgb/13", "../13", 1)),
+    "TUM: three columns": (tum, "rgb.txt", lambda text: text + "1.0 a b\n"),
+    "TUM: nothing listed": (tum, "rgb.txt", lambda text: "#\n"),
+    "TUM: quaternions of zeros": (tum, "groundtruth.txt", lambda text: re.sub(r"( \S+){4}\n", " 0 0 0 0\n", text)),
+    "Open3D: no matrix": (open3d, "intrinsic.json", lambda text: text.replace("intrinsic_matrix", "matrix")),
+    "Open3D: a list": (open3d, "intrinsic.json", lambda text: "[]"),
+    "matrix: letters": (matrix_as_text, "K.txt", lambda text: "fx fy cx"),
+    "matrix: another camera": (matrix_as_text, "K.txt", lambda text: "0 0 0\n0 0 0\n0 0 0"),
+    "Record3D: no JSON": (record3d, "EXR_RGBD/metadata.json", lambda text: text.replace('"K": [5', '"K": [[5')),
+    "Stray: no such column": (stray, "odometry.csv", lambda text: text.replace("qw", "w")),
+    "Stray: one row too short": (stray, "odometry.csv", lambda text: text + "1, 2\n"),
+    "nerfstudio: no frames": (nerfstudio, "transforms.json", lambda text: text.replace('"frames"', '"images"')),
+    "nerfstudio: out": (nerfstudio, "transforms.json", lambda text: text.replace("images/frame_00003", "/etc/frame")),
+    "3RScan: no depth": (rscan, "_info.txt", lambda text: text.replace("m_depthWidth", "m_width")),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("how", BROKEN)
+def test_broken_files_are_named(how: str, tmp_path: Path):
+    write, name, spoil = BROKEN[how]
+    root = write(tmp_path)
+    file = root / name
+    spoilt = spoil(file.read_text())
+    assert spoilt != file.read_text()
+    file.write_text(spoilt)
+    with pytest.raises(RecordingError, match=re.escape(file.name)):
+        read_recording(root)
+
+
+def test_what_cannot_be_read_says_what_to_do(tmp_path: Path):
+    (tmp_path / "scan.r3d").write_bytes(b"PK")
+    with pytest.raises(RecordingError, match=r"EXR \+ RGB"):
+        find_layout(tmp_path / "scan.r3d")
