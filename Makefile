@@ -54,9 +54,10 @@ fuzz: $(ALL)
 	$(PIP) atheris
 	for kind in $(KINDS); do $(BIN)/python -m tests.guided_fuzz $$kind -max_total_time=$(GUIDED_S) || exit 1; done
 
-# An hour of a stream with random faults, queries that come and go, saving and restoring; memory must stay flat.
+# A long stream with a camera that fails, queries that come and go, saving and restoring: memory and time must stay flat.
+SOAK_FRAMES ?= 100000
 soak: $(ALL)
-	$(BIN)/python benchmarks/endurance.py --frames 100000 --out outputs/soak.json
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.endurance --frames $(SOAK_FRAMES) --disturbed --out outputs/soak.json
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \

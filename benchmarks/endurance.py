@@ -1,10 +1,11 @@
 """Run one stream for a very long time: does its memory grow, does a frame take longer?
 
-    OMP_NUM_THREADS=1 python benchmarks/endurance.py --frames 100000 --out benchmarks/results/endurance/endurance.json
+    OMP_NUM_THREADS=1 python -m benchmarks.endurance --frames 100000 --out benchmarks/results/endurance/endurance.json
 
 The sample clip is played forth and back without end, with time stamps that go on; two handles that move are followed,
-with alarms where the monitor is calibrated. Other jobs may run meanwhile: the processor's time counts, wall time stands
-beside it. The result file is written anew at every reading.
+with alarms where the monitor is calibrated. With ``--disturbed`` (``make soak``) the camera fails every ten seconds,
+each time in another way, queries come and go, and the stream is saved and restored. Other jobs may run meanwhile: the
+processor's time counts, wall time stands beside it. The result file is written anew at every reading.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,12 +26,16 @@ from rich.console import Console
 from rich.table import Table
 
 import quest
+from benchmarks.sensor_faults import BLIND, DEGRADED, DEPTH
 from quest.data.recording import read_recording
 from quest.data.sample import sample_folder
 from quest.errors import ConfigError, InputError
 from quest.evaluation.bootstrap import LEVEL
 from quest.evaluation.report import provenance, write_report
-from quest.types import Query
+from quest.monitor import Alarm
+from quest.track.stream import Stream
+from quest.track.tracker import Tracker
+from quest.types import Frame, Query
 
 RESAMPLES = 1000
 
@@ -144,6 +149,29 @@ def time_change(readings: Sequence[Reading], *, clock: str, seed: int = 0) -> Ch
     return Change(before, after, 100.0 * (after / before - 1.0), float(low), float(high), len(late))
 
 
+PERIOD, LASTS = 300, 30
+"""Frames from one fault to the next, and how long it lasts."""
+
+
+def faulty(frame: Frame, last: Frame, t: int) -> Frame:
+    """A frame with the fault that step ``t`` has, if any."""
+    if t % PERIOD < PERIOD - LASTS:
+        return frame
+    rng = np.random.default_rng(t)
+    kinds = list((BLIND | DEGRADED | DEPTH).values())
+    rgb, depth_m = kinds[t // PERIOD % len(kinds)](frame.rgb, frame.depth_m, last, rng)
+    return replace(frame, rgb=rgb, depth_m=depth_m)
+
+
+def disturbed(tracker: Tracker, stream: Stream, t: int, queries: Sequence[Query]) -> Stream:
+    """The stream as it goes on at step ``t``: with a query more or less, or restored from what was saved."""
+    if t % PERIOD == PERIOD // 4:
+        stream.add(replace(queries[t // PERIOD % len(queries)], frame=t, name=f"again {t}"))
+    if t % PERIOD == PERIOD // 2:
+        stream.retire(f"again {t - PERIOD // 4}")
+    return tracker.restore(tracker.save(stream)) if t % (3 * PERIOD) == 1 else stream
+
+
 FRAMES_PER_S = 30.0
 MEMORY_PERCENT, TIME_PERCENT = 2.0, 5.0
 """Changes up to these are accepted."""
@@ -159,6 +187,8 @@ class Endurance:
     """Memory is compared with that after so many frames; at most a tenth of them."""
     weights: str = "quest-s16"
     """Name or file of the weights."""
+    disturbed: bool = False
+    """Whether the camera fails now and then, queries come and go, and the stream is saved and restored."""
     out: Path | None = None
     """Result file."""
 
@@ -180,17 +210,27 @@ class Endurance:
             "weights_hash": tracker.weights_hash,
             "alpha": None if stream.budget is None else stream.budget.alpha,
             "frames": self.frames,
+            "disturbed": self.disturbed,
         }
         alarms: list[str] = []
-        stream.on_alarm(lambda alarm: alarms.append(f"frame {alarm.frame}: {alarm.name}, {alarm.reason}"[:200]))
+
+        def heard(alarm: Alarm) -> None:
+            alarms.append(f"frame {alarm.frame}: {alarm.name}, {alarm.reason}"[:200])
+
+        stream.on_alarm(heard)
         readings = [Reading(0, resident_bytes(), 0.0, 0.0)]
         start_s, start_cpu_s = time.perf_counter(), time.process_time()
         off_px: list[float] = []
         for t in range(every * 100):
             i = forth_and_back(t, len(clip))
             frame = clip.frame(i)
+            if self.disturbed:
+                before, stream = stream, disturbed(tracker, stream, t, queries)
+                if stream is not before:  # callbacks are not saved
+                    stream.on_alarm(heard)
+                frame = faulty(frame, clip.frame(forth_and_back(max(t - 1, 0), len(clip))), t)
             state = stream.step(frame.rgb, frame.depth_m, t / FRAMES_PER_S, frame.cam_from_world)
-            if i == 0:
+            if i == 0 and not self.disturbed:
                 off_px = np.linalg.norm(state.uv_px - list(handles.values()), axis=1).round(2).tolist()
             if (t + 1) % every:
                 continue
@@ -199,7 +239,7 @@ class Endurance:
             seen = {
                 "alarms": len(alarms),
                 "first_alarms": alarms[:10],
-                "off_px": dict(zip(handles, off_px, strict=True)),
+                "off_px": dict(zip(handles, off_px, strict=False)),
             }
             report = about | self._found(readings) | seen
             console.print(_line(readings))

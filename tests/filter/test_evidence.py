@@ -8,6 +8,7 @@ import pytest
 from quest.filter.camera_motion import LEAST, estimate_pose, picture_motion
 from quest.filter.local_motion import corners, follow
 from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
+from quest.filter.rigid_motion import Seen, misfit_unsure, predicted_spread
 from quest.filter.view import View
 from tests.filter.scenes import SIZE, plain, shifted, texture
 
@@ -62,6 +63,19 @@ def test_a_pose_is_found_among_outliers() -> None:
     assert not estimate.inlier[:15].any()
     assert estimate.inlier[15:].all()
     assert estimate_pose(points[: LEAST - 1], uv_px[: LEAST - 1], matrix, np.eye(4)) is None
+
+
+def test_points_before_or_behind_the_camera_are_on_no_body() -> None:
+    matrix = np.array([[150.0, 0, 80], [0, 150, 60], [0, 0, 1]])
+    places = np.array([[0.0, 0, 2], [1e9, 1e9, -1], [3.0, 1, 0]])
+    seen = Seen(np.full((3, 2), [80.0, 60.0]), np.full(3, 2.0), np.tile(np.eye(2), (3, 1, 1)), np.full(3, 0.01))
+    view, singular = View(matrix, np.eye(4), None), False
+    for size in 10.0 ** np.arange(-6, 12):  # how well the pose is known
+        spread = seen.spread + predicted_spread(places, np.zeros(3), size * np.eye(6), np.zeros((3, 3)), view)
+        singular |= bool((np.linalg.det(spread) == 0).any())
+        off = misfit_unsure(places, np.zeros(3), size * np.eye(6), np.zeros((3, 3)), seen, view)
+        assert off[0] < 1e-6
+    assert singular, "the test tries what it is for"
 
 
 def test_without_depth_the_picture_moves_by_a_homography() -> None:

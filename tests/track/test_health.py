@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from quest.data.recording import open_recording
-from quest.track.health import Health, Repeats, digest_of
+from quest.track.health import ELSEWHERE, Health, Repeats, digest_of
 from quest.track.state import StreamState
 from quest.types import Query, State
 from tests.filter.scenes import scene
@@ -82,10 +82,19 @@ def test_exchanged_colours_are_said() -> None:
 def test_depth_that_cannot_be_is_not_used() -> None:
     depth_m = RNG.uniform(1.0, 2.0, (30, 40)).astype(np.float32)
     health = Health()
-    assert health.of_depth(depth_m) is None
-    assert "10 times" in str(health.of_depth(10 * depth_m))
-    assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5)))
-    assert health.of_depth(depth_m + np.float32(0.01)) is None
+    assert health.of_depth(depth_m, elsewhere=False) is None
+    assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5), elsewhere=False))
+    for t in range(9):  # however it changes meanwhile
+        moved = np.roll(depth_m, 10 * t, axis=1) if t % 2 else depth_m
+        assert "10 times" in str(health.of_depth(10 * moved, elsewhere=False))
+    assert health.of_depth(depth_m + np.float32(0.01), elsewhere=False) is None
+
+
+def test_at_another_place_another_depth_is_no_other_unit() -> None:
+    health = Health()
+    for far, elsewhere in ((1.0, False), (4.0, True), (4.0, False)):
+        wall = (far * RNG.uniform(1.0, 1.02, (30, 40))).astype(np.float32)
+        assert health.of_depth(wall, elsewhere=elsewhere) is None
 
 
 def test_a_hand_before_the_lens_is_no_other_unit() -> None:
@@ -93,7 +102,7 @@ def test_a_hand_before_the_lens_is_no_other_unit() -> None:
     near = depth_m.copy()
     near[:, :60] = RNG.uniform(0.1, 0.3, (64, 60))
     health = Health()
-    assert [health.of_depth(each) for each in (depth_m, near, depth_m)] == [None] * 3
+    assert [health.of_depth(each, elsewhere=False) for each in (depth_m, near, depth_m)] == [None] * 3
 
 
 def come_again(frames: np.ndarray) -> list[bool]:
@@ -105,6 +114,7 @@ def test_what_stands_still_is_a_fault_where_there_is_noise_and_none_did_so_far()
     noisy = RNG.integers(0, 256, (20, 16, 16, 3)).astype(np.uint8)
     assert not any(come_again(noisy))
     assert come_again(np.concatenate([noisy, noisy[-1:]])) == [False] * 20 + [True]
+    assert come_again(np.concatenate([noisy[:9], noisy[8:9], noisy[8:9]])) == [False] * 9 + [True] * 2
     assert not any(come_again(noisy.repeat(2, axis=0)))
     moved = np.zeros((20, 80, 80, 3), np.uint8)
     moved[np.arange(20), 0, 0] = np.arange(20)[:, None]  # one corner moves, nothing else has noise
@@ -122,7 +132,8 @@ def test_cameras_in_good_health_are_told_so() -> None:
         health = Health()
         for frame in open_recording(folder):
             flags, _ = health.of_picture(frame.rgb, digest_of(frame.rgb))
-            wrong = None if frame.depth_m is None else health.of_depth(frame.depth_m)
+            elsewhere = ELSEWHERE in flags
+            wrong = None if frame.depth_m is None else health.of_depth(frame.depth_m, elsewhere=elsewhere)
             flagged, frames = flagged + (bool(flags) or wrong is not None), frames + 1
     assert frames > 1500
     assert flagged <= frames / 1000

@@ -89,7 +89,11 @@ def misfit_unsure(
     """
     off, _ = _linearise(point_world, middle, seen, view)
     spread = seen.spread + predicted_spread(point_world, middle, covariance, error_world, view)
-    value = np.einsum("ni,nij,nj->n", off, np.linalg.inv(spread), off)
+    try:
+        inverse = np.linalg.inv(spread)
+    except np.linalg.LinAlgError:  # of points right before or behind the camera nothing is told
+        inverse = np.linalg.inv(np.where((np.linalg.det(spread) > 0)[:, None, None], spread, np.nan))
+    value = np.einsum("ni,nij,nj->n", off, inverse, off)
     return np.where(np.isfinite(value), value, np.inf)
 
 

@@ -13,6 +13,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32, Shaped, UInt8
 
+ELSEWHERE = "another picture at once"
+"""Flag of a picture that shows something else."""
 _CELL_PX, _SIDE = 16, 40
 """Least width of the cells of the coarse picture, and how many there are along its longer side at most."""
 _PLAIN = 6.0
@@ -53,7 +55,7 @@ class Repeats:
     seen: int = 0
     """How many came."""
     runs: int = 0
-    """How often they stood still."""
+    """How often they stood still and went on."""
     still: bool = False
     """Whether they do now."""
 
@@ -67,7 +69,7 @@ class Repeats:
             digest: of its bytes.
         """
         again, some = digest == self.digest, data[::8, ::8].copy()
-        self.runs += again and not self.still
+        self.runs += self.still and not again
         self.seen += not again
         if not again and self.some is not None:
             self.same += (float((some == self.some).mean()) - self.same) / (self.seen - 1)
@@ -84,7 +86,9 @@ class Health:
     sharpness: float = 0.0
     """Logarithm of its Laplacian's variance."""
     depth_m: Float32[np.ndarray, "rows columns"] | None = None
-    """Every eighth pixel of the newest depth that was used; None before the first."""
+    """Every eighth pixel of the newest depth; None before the first."""
+    unit: float = 1.0
+    """Its unit, over that of the first."""
     pictures: Repeats = field(default_factory=Repeats)
     depths: Repeats = field(default_factory=Repeats)
 
@@ -111,8 +115,15 @@ class Health:
         self.coarse, self.sharpness = coarse, sharpness
         return flags, False
 
-    def of_depth(self, depth_m: Float32[np.ndarray, "H W"]) -> str | None:
-        """Why the next depth is not to be used, in words; None if it is."""
+    def of_depth(self, depth_m: Float32[np.ndarray, "H W"], *, elsewhere: bool) -> str | None:
+        """Why the next depth is not to be used, in words; None if it is.
+
+        Args:
+            depth_m: the next one, metres.
+            elsewhere: whether the colours say that the camera looks at something else at once: units are not told then.
+        """
+        if elsewhere:
+            self.depth_m, self.unit = None, 1.0
         if self.depths.are_faults(depth_m, digest_of(depth_m)):
             return "the depth before, to the bit"
         some, before = depth_m[::8, ::8].copy(), self.depth_m
@@ -125,16 +136,16 @@ class Health:
             factor = np.log(some[both] / before[both])
             # What moves, or another place, changes every pixel by a factor of its own; another unit all alike.
             if both.any() and abs(np.median(factor)) > np.log(_DEEPER) and np.ptp(np.quantile(factor, _MOST)) < _ALIKE:
-                return f"{np.exp(np.median(factor)):.3g} times that of before"
+                self.unit *= float(np.exp(np.median(factor)))
         self.depth_m = some
-        return None
+        return f"{self.unit:.3g} times that of before" if abs(np.log(self.unit)) > np.log(_DEEPER) else None
 
 
 def _changes(before: Float32[np.ndarray, "h w 3"], now: Float32[np.ndarray, "h w 3"]) -> list[str]:
     """What no motion explains between two coarse pictures, in words."""
     found = []
     if _correlation(before, now) < _CHANGED:
-        found.append("another picture at once")
+        found.append(ELSEWHERE)
     red, redder = (each[..., 0] - each[..., 2] for each in (before, now))
     if min(red.std(), redder.std()) > _COLOURFUL and _correlation(red, redder) < _EXCHANGED:
         found.append("red and blue exchanged at once")

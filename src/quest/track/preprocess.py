@@ -15,7 +15,7 @@ from quest.errors import InputError
 from quest.filter.picture import Picture
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.xfeat import LEAST_PX, XFeat
-from quest.track.health import Health, digest_of
+from quest.track.health import ELSEWHERE, Health, digest_of
 from quest.types import Camera
 from quest.untrusted import reading
 
@@ -189,7 +189,7 @@ class Preprocessor:
             if beyond > _LEAST_BEYOND:
                 state.flags += (f"depth beyond {PLAUSIBLE_DEPTH_M[1]:g} m ignored: {beyond:.0%} of the pixels",)
             depth_m = np.where((depth_m > 0) & (depth_m <= PLAUSIBLE_DEPTH_M[1]), depth_m, np.float32(0))
-            wrong = state.health.of_depth(depth_m)
+            wrong = state.health.of_depth(depth_m, elsewhere=ELSEWHERE in flags)
             if wrong is not None:
                 state.flags += (f"depth ignored: {wrong}",)
                 depth_m = None
