@@ -17,11 +17,11 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgro
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: demo test lint format types pytest fuzz soak render-deps clean help
+.PHONY: demo test lint format types pytest fuzz soak lowest render-deps clean help
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | render-deps | clean"
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | lowest | render-deps | clean"
 
 demo: $(BASE)
 	$(BIN)/quest track sample --out $(DEMO_OUT)
@@ -58,6 +58,17 @@ fuzz: $(ALL)
 SOAK_FRAMES ?= 100000
 soak: $(ALL)
 	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.endurance --frames $(SOAK_FRAMES) --disturbed --out outputs/soak.json
+
+# The tests of recordings and of tracking with the lowest versions that pyproject.toml allows, but for torch.
+LOWEST = $(VENV)-lowest
+PINS = import tomllib; names = tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"]
+lowest:
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -c '$(PINS); print(*(n.replace(">=", "==") + ".*" for n in names if "torch" not in n), sep="\n")' > $(LOWEST)/pins.txt
+	$(LOWEST)/bin/python -m pip install --quiet --requirement $(LOWEST)/pins.txt "$$(grep ^torch== constraints.txt)" \
+	  beartype hypothesis "pandas<3" pytest pytest-timeout pytest-xdist
+	$(LOWEST)/bin/python -m pip install --quiet --no-deps --editable .
+	$(LOWEST)/bin/python -m pytest -n $(WORKERS) tests/data tests/filter tests/geometry tests/monitor tests/track tests/test_tracks.py
 
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \

@@ -106,7 +106,7 @@ def test_a_hand_before_the_lens_is_no_other_unit() -> None:
 
 
 def come_again(frames: np.ndarray) -> list[bool]:
-    repeats = Repeats()
+    repeats = Repeats(noiseless=0.9)
     return [repeats.are_faults(frame, digest_of(frame)) for frame in frames]
 
 
@@ -119,6 +119,15 @@ def test_what_stands_still_is_a_fault_where_there_is_noise_and_none_did_so_far()
     moved = np.zeros((20, 80, 80, 3), np.uint8)
     moved[np.arange(20), 0, 0] = np.arange(20)[:, None]  # one corner moves, nothing else has noise
     assert not any(come_again(np.concatenate([moved, moved[-1:]])))
+
+
+@pytest.mark.parametrize("name", ["sample", "sample-alarm"])
+def test_still_parts_of_the_packaged_clips_are_no_faults(name: str) -> None:
+    health = Health()
+    for frame in open_recording(name):
+        assert frame.depth_m is not None
+        assert health.of_picture(frame.rgb, digest_of(frame.rgb)) == ((), False)
+        assert health.of_depth(frame.depth_m, elsewhere=False) is None
 
 
 @pytest.mark.slow

@@ -31,8 +31,9 @@ _PART = 0.3
 _DEEPER, _MOST, _ALIKE = 3.0, (0.25, 0.75), 0.2
 """Factor between the depths of two frames, and how far it differs, in its logarithm, in half of the pixels, at which
 they are in other units."""
-_NOISELESS = 0.9
-"""Share of pixels as before above which pictures have no noise: rendered ones, or still parts of a video."""
+_STILLEST, _STILLEST_DEPTH = 0.97, 0.8
+"""Share of pixels as before, in the stillest frame so far, above which pictures have no noise: rendered ones, or video
+in which nothing moves. Most real videos, which compress noise away, come to 0.95 and less; real depth to 0.66."""
 _RARELY = 0.1
 """Share of repeated pictures so far, below which one is a fault."""
 
@@ -46,12 +47,14 @@ def digest_of(data: np.ndarray) -> str:
 class Repeats:
     """How often pictures, or depths, came again to the bit."""
 
+    noiseless: float
+    """Share of pixels as before above which there is no noise."""
     digest: str = ""
     """Of the newest."""
     some: Shaped[np.ndarray, "rows columns ..."] | None = None
     """Every eighth of its pixels along each side; None before the first."""
     same: float = 0.0
-    """Share of pixels that were as before, in those that were not so as a whole."""
+    """Largest share of pixels that were as before, in those that were not so as a whole."""
     seen: int = 0
     """How many came."""
     runs: int = 0
@@ -72,9 +75,9 @@ class Repeats:
         self.runs += self.still and not again
         self.seen += not again
         if not again and self.some is not None:
-            self.same += (float((some == self.some).mean()) - self.same) / (self.seen - 1)
+            self.same = max(self.same, float((some == self.some).mean()))
         self.digest, self.some, self.still = digest, some, again
-        return again and self.same < _NOISELESS and (self.runs + 1) / (self.seen + 2) < _RARELY
+        return again and self.same < self.noiseless and (self.runs + 1) / (self.seen + 2) < _RARELY
 
 
 @dataclass
@@ -89,8 +92,8 @@ class Health:
     """Every eighth pixel of the newest depth; None before the first."""
     unit: float = 1.0
     """Its unit, over that of the first."""
-    pictures: Repeats = field(default_factory=Repeats)
-    depths: Repeats = field(default_factory=Repeats)
+    pictures: Repeats = field(default_factory=lambda: Repeats(_STILLEST))
+    depths: Repeats = field(default_factory=lambda: Repeats(_STILLEST_DEPTH))
 
     def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: str) -> tuple[tuple[str, ...], bool]:
         """What is wrong with the next picture, in words, and whether it shows nothing.
