@@ -79,8 +79,8 @@ def imports(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def may_import(importer: str, imported: str) -> bool:
-    if importer in (imported, "__init__") or (importer, imported) in ALLOWED_WITHIN_RANK:
-        return True  # the package's own __init__ is the public door: it opens onto every room
+    if importer in (imported, "__init__", "__main__") or (importer, imported) in ALLOWED_WITHIN_RANK:
+        return True  # the package's own __init__ and __main__ are the public doors: they open onto every room
     low, high = RANKS.get(imported, 0), RANKS.get(importer, 0)
     return low < high or low == high == 0
 
