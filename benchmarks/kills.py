@@ -1,6 +1,6 @@
 """Every long command, killed at random moments: is anything torn, and is what a second run ends with the same?
 
-    python -m benchmarks.kills --takes TAKES --objects-root OBJECTS --out benchmarks/results/kills.json
+    python -m benchmarks.kills --takes TAKES --teach TAKES --choose TAKES --out benchmarks/results/kills.json
 
 Every command runs once undisturbed. Then it is killed (SIGKILL) at a random moment of that time, again and again in
 folders of their own, and run once more to its end. What stands in the folder then is compared with the first run:
@@ -115,9 +115,11 @@ class Kills:
     """Kill every long command at random moments."""
 
     takes: Path
-    """A small store of takes."""
-    objects_root: Path | None = None
-    """Folder of PartNet-Mobility, for takes of its objects; by default procedural furniture."""
+    """A small store of takes, to track and export."""
+    teach: Path | None = None
+    """A small store of takes of training objects; training is left out without it."""
+    choose: Path | None = None
+    """The same of validation objects."""
     kills: int = 20
     """How often each is killed."""
     only: tuple[str, ...] = ()
@@ -133,23 +135,16 @@ class Kills:
         quick = ["--training.steps", "12", "--training.validate-every", "4", "--training.validation-batches", "1"]
         return {
             "generate": [
-                "generate",
-                "--out",
-                "OUT/takes",
-                "--procedural",
-                "2",
-                "--takes-per-object",
-                "2",
-                "--frames",
-                "12",
+                *("generate", "--out", "OUT/takes", "--procedural", "2", "--takes-per-object", "2"),
+                *("--frames-per-joint", "12", "--frames", "24"),
             ],
             "train": [
-                *("train", "--stage", "1", "--weights", "quest-paper", "--data", takes, "--validation", takes),
-                *("--windows.batch", "2", "--training.precision", "32-true", *quick, "--out", "OUT/run"),
+                *("train", "--stage", "1", "--weights", "quest-paper", "--data", str(self.teach)),
+                *("--validation", str(self.choose), "--windows.batch", "2", "--training.precision", "32-true"),
+                *(*quick, "--out", "OUT/run"),
             ],
             "track": ["track", "sample", "--out", "OUT/sample"],
             "eval": ["eval", "--takes", takes, "--trackers", "lk", "hold-still", "--out", "OUT/result.json"],
-            "calibrate": ["calibrate", "--takes", takes, "--records", "OUT/records", "--out", "OUT/monitor.json"],
             "export": ["data", "export", takes, "--format", "lerobot", "--out", "OUT/dataset"],
         }
 
@@ -157,7 +152,7 @@ class Kills:
         """Kill them all; 1 if anything was torn or differs."""
         console, rng, rows = Console(highlight=False), np.random.default_rng(self.seed), list[dict[str, Any]]()
         for name, command in self.commands().items():
-            if self.only and name not in self.only:
+            if (self.only and name not in self.only) or (name == "train" and self.teach is None):
                 continue
             with tempfile.TemporaryDirectory(prefix="quest-kills-") as folder:
                 rows.append({"command": name} | self._torture(Path(folder), command, rng))
