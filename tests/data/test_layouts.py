@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from quest.data.layouts import find_layout
+from quest.data.depth_file import read_depth_file
+from quest.data.layouts import find_layout, nearest
 from quest.data.recording import open_recording, read_recording
 from quest.errors import RecordingError
 from quest.types import Camera
@@ -72,7 +73,7 @@ def test_layouts_as_they_come(name: str, tmp_path: Path):
         poses[:] = np.eye(4)
     if name == "ScanNet":
         poses[2] = poses[1]
-        assert any("1 frame has" in note for note in clip.notes)
+        assert any("no pose in 1 frame" in note for note in clip.notes)
     np.testing.assert_allclose(clip.cam_from_world, poses, atol=1e-6)
     seconds = np.arange(FRAMES) / (25 if name in ("TUM RGB-D", "Record3D", "Stray Scanner") else 30)
     np.testing.assert_allclose(clip.stamp_s, seconds, atol=1e-6)
@@ -83,6 +84,18 @@ def test_frames_of_tum_without_depth_have_none(tmp_path: Path):
     assert [frame.depth_m is None for frame in source] == [False, False, False, True, False]
     assert any("no depth" in flag for flag in source.flags)
     assert any("TUM RGB-D recommends" in flag for flag in source.flags)
+
+
+def test_lists_pair_by_time_whatever_the_names(tmp_path: Path):
+    root = tum(tmp_path)
+    for kind in ("rgb", "depth"):
+        lines = []
+        for t, line in enumerate((root / f"{kind}.txt").read_text().splitlines()[1:]):
+            seconds, name = line.split()
+            (root / name).rename(root / kind / f"{t}.png")
+            lines.append(f"{seconds} {kind}/{t}.png")
+        (root / f"{kind}.txt").write_text("\n".join(lines))
+    assert [frame.depth_m is None for frame in open_recording(root)] == [False, False, False, True, False]
 
 
 def test_the_cameras_of_tum_are_known(tmp_path: Path):
@@ -167,6 +180,41 @@ def test_broken_files_are_named(how: str, tmp_path: Path):
     file.write_text(spoilt)
     with pytest.raises(RecordingError, match=re.escape(file.name)):
         read_recording(root)
+
+
+def test_a_camera_file_of_ones_own_overrules_every_layout(tmp_path: Path):
+    for name, (write, _) in LAYOUTS.items():
+        root = tmp_path / name
+        root.mkdir()
+        root = write(root)
+        inner = root / "EXR_RGBD" if (root / "EXR_RGBD").is_dir() else root
+        fields = {"fx": 500, "fy": 501, "cx": 320, "cy": 240, "width": WIDTH, "height": HEIGHT}
+        (inner / "camera.json").write_text(json.dumps(fields))
+        clip = read_recording(root)
+        assert (clip.camera.fx, clip.camera.fy) == (500, 501)
+        assert (clip.cam_from_world == np.eye(4)).all() == (name == "matrix"), "poses are kept"
+
+
+def test_other_files_beside_a_recording_do_not_change_what_it_is(tmp_path: Path):
+    root = open3d(tmp_path)
+    (root / "metadata.json").write_text('{"scene": "kitchen"}')
+    (root / "odometry.csv").write_text("t, x\n")
+    assert len(read_recording(root)) == FRAMES
+
+
+def test_lists_of_many_frames_are_matched_in_little_memory():
+    times = np.arange(200_000) / 30
+    np.testing.assert_array_equal(nearest(times, times + 0.01), np.arange(200_000))
+    np.testing.assert_array_equal(nearest(np.array([1.0]), np.array([0.0, 5.0])), [0, 0])
+
+
+def test_an_exr_that_claims_to_be_huge(tmp_path: Path):
+    exr(tmp_path / "d.exr", np.ones((4, 4)))
+    data = (tmp_path / "d.exr").read_bytes()
+    window = np.array([0, 0, 3, 3], "<i4").tobytes()
+    (tmp_path / "d.exr").write_bytes(data.replace(window, np.array([0, 0, 99999, 99999], "<i4").tobytes()))
+    with pytest.raises(RecordingError, match="10000000000 pixels"):
+        read_depth_file(tmp_path / "d.exr")
 
 
 def test_what_cannot_be_read_says_what_to_do(tmp_path: Path):

@@ -131,6 +131,21 @@ def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None =
     return setup if depth_scale_m is None else replace(setup, depth_scale_m=depth_scale_m)
 
 
+def completed(setup: CameraFile, own: CameraFile) -> CameraFile:
+    """A camera with the units, times, poses and depth camera that it leaves out, as the recording has them."""
+    depth = own if setup.depth_camera is None else setup
+    return replace(
+        setup,
+        depth_scale_m=own.depth_scale_m if setup.depth_scale_m is None else setup.depth_scale_m,
+        frames_per_s=own.frames_per_s if setup.frames_per_s is None else setup.frames_per_s,
+        stamp_s=own.stamp_s if setup.stamp_s is None and setup.frames_per_s is None else setup.stamp_s,
+        cam_from_world=own.cam_from_world if setup.cam_from_world is None else setup.cam_from_world,
+        depth_camera=depth.depth_camera,
+        depth_distortion=depth.depth_distortion,
+        colour_from_depth=depth.colour_from_depth,
+    )
+
+
 def find_setup(
     where: str,
     options: ReadOptions,
@@ -159,14 +174,7 @@ def find_setup(
         if options.fov_deg is not None:
             raise RecordingError(f"{where}: --fov is for recordings without a camera, and this has one; omit --fov")
         setup = read_setup(camera, options.depth_scale_m)
-        own = setup if known is None else known
-        return replace(
-            setup,
-            depth_scale_m=own.depth_scale_m if setup.depth_scale_m is None else setup.depth_scale_m,
-            frames_per_s=own.frames_per_s if setup.frames_per_s is None else setup.frames_per_s,
-            stamp_s=own.stamp_s if setup.stamp_s is None and setup.frames_per_s is None else setup.stamp_s,
-            cam_from_world=own.cam_from_world if setup.cam_from_world is None else setup.cam_from_world,
-        )
+        return setup if known is None else completed(setup, known)
     if depth and options.fov_deg is None:
         raise RecordingError(
             f"recording {where}: it has depth but no camera, and depth needs intrinsics; give a camera file such as "

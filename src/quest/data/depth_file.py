@@ -17,6 +17,7 @@ DEPTH_SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".exr", ".npy")
 _REMEDY = "the file is torn, copy or record it again"
 _CHANNELS = ("Z", "depth", "Y", "R", "RGB", "RGBA")
 """Where EXR files keep depth; Record3D in R."""
+_MOST_PIXELS = 2**26
 
 
 def read_depth_file(path: Path) -> Shaped[np.ndarray, "H W"]:
@@ -28,7 +29,8 @@ def read_depth_file(path: Path) -> Shaped[np.ndarray, "H W"]:
     require_file(path, RecordingError)
     suffix = path.suffix.lower()
     with reading(f"depth image {path}", RecordingError, _REMEDY):
-        units = _read_exr(path) if suffix == ".exr" else _read_array(path) if suffix == ".npy" else _read_image(path)
+        read = {".exr": _read_exr, ".npy": _read_array}.get(suffix, lambda path: np.asarray(open_image(path)))
+        units = read(path)
     units = units.squeeze() if units.ndim == 3 else units
     if units.ndim != 2 or not (units.dtype.kind == "f" or units.dtype in (np.uint16, np.int32, np.uint32)):
         raise RecordingError(
@@ -36,10 +38,6 @@ def read_depth_file(path: Path) -> Shaped[np.ndarray, "H W"]:
             "write depth as 16-bit PNGs (millimetres, say), not as a coloured or 8-bit picture"
         )
     return units
-
-
-def _read_image(path: Path) -> np.ndarray:
-    return np.asarray(open_image(path))
 
 
 def _read_array(path: Path) -> np.ndarray:
@@ -55,6 +53,10 @@ def _read_array(path: Path) -> np.ndarray:
 def _read_exr(path: Path) -> np.ndarray:
     import OpenEXR
 
+    corners = np.array(OpenEXR.File(str(path), header_only=True).header()["dataWindow"], np.int64)
+    pixels = int(np.prod(corners[1] - corners[0] + 1))
+    if not 0 < pixels <= _MOST_PIXELS:  # nothing is allocated for what a header claims
+        raise ValueError(f"a picture of {pixels} pixels")
     channels = OpenEXR.File(str(path)).channels()
     name = next((name for name in _CHANNELS if name in channels), None)
     if name is None:

@@ -66,7 +66,7 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     source, notes = Path(where), Notes()
     layout = find_layout(source)
     if options.depth is not None:
-        layout = replace(layout, depth_folder=options.depth, depths=tuple(list_depth(options.depth)))
+        layout = replace(layout, depth_folder=options.depth, depths=list_depth(options.depth), paired=False)
     colours, depths = _find_colours(source, layout), layout.depths
     own = layout.setup(colours.size)
     setup = find_setup(where, options, own, size=colours.size, depth=depths is not None, notes=notes)
@@ -83,12 +83,14 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     unit_m = setup.unit_m
     if depths is not None:
         if colours.video is None and layout.numbered:
-            _check_partners(layout.depth_folder, depths, colours.images)
+            if not layout.paired:
+                _check_partners(layout.depth_folder, [path for path in depths if path is not None], colours.images)
             _check_depth_number(layout.depth_folder, len(depths), len(colours.images))
         if not depths:
             _check_depth_number(layout.depth_folder, 0, colours.number or 0)
-        first = next(path for path in depths if path is not None)
-        if read_depth_file(first).dtype.kind == "f":  # which are metres, unless the user says otherwise
+        first = next((path for path in depths if path is not None), None)
+        # Floats are metres, unless the user says otherwise.
+        if first is not None and read_depth_file(first).dtype.kind == "f":
             unit_m = options.depth_scale_m or 1.0
     paired = replace(colours, paired=depths is not None)
     return FrameSource(
@@ -155,9 +157,9 @@ def _check_numbers(source: Path, setup: CameraFile, frames: int) -> None:
             raise RecordingError(f"recording {source}: {what} of the camera is for {number} frames, expected {frames}")
 
 
-def _check_partners(folder: Path, depths: Sequence[Path | None], images: Sequence[Path]) -> None:
+def _check_partners(folder: Path, depths: Sequence[Path], images: Sequence[Path]) -> None:
     """Where depth images are named as colours are, each must have its own; where none is, they go in order."""
-    depth_of, colour_of = ({path.stem for path in paths if path is not None} for paths in (depths, images))
+    depth_of, colour_of = ({path.stem for path in paths} for paths in (depths, images))
     alone = sorted(depth_of ^ colour_of)
     if alone and depth_of & colour_of:
         what = "colours" if alone[0] in depth_of else "depth"

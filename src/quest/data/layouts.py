@@ -16,18 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
+from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
-from quest.data.camera_file import CameraFile, read_camera
+from quest.data.camera_file import CameraFile, completed, read_camera
 from quest.data.depth_file import DEPTH_SUFFIXES, read_depth_file
 from quest.data.distortion import Distortion
+from quest.data.frame_source import Parts
 from quest.data.pictures import PICTURES
+from quest.data.transforms import STALE_S, Edge
 from quest.data.video import SUFFIXES
 from quest.errors import RecordingError
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.types import Camera
 from quest.untrusted import MOST_TEXT, is_inside, read_json, reading, require_file
+from quest.wording import counted
 
 Size = tuple[int, int]
 """Width and height, pixels."""
@@ -40,8 +43,6 @@ _MATRICES = (
 )
 _OPEN3D = ("intrinsic.json", "camera_intrinsic.json", "camera_primesense.json")
 _SIDE_BY_SIDE = re.compile(r"(.+[._-])colou?r\.[^.]+", re.IGNORECASE)
-_SYNC_S = 0.02
-_STALE_S = 0.5
 _GL_FROM_CV = np.diag([1.0, -1.0, -1.0, 1.0])
 _FREIBURG = {
     "1": ((517.3, 516.5, 318.6, 255.3), (0.2624, -0.9531, -0.0054, 0.0026, 1.1633)),
@@ -49,6 +50,8 @@ _FREIBURG = {
     "3": ((535.4, 539.2, 320.1, 247.6), ()),
 }
 """Intrinsics and lens of the three cameras of TUM RGB-D, pixel centres at integers."""
+_QUATERNION = ("qx", "qy", "qz", "qw")
+_PLUMB_BOB = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ class Layout:
     """One for every frame, None where a frame has none; None where there is no depth at all."""
     setup: Callable[[Size], CameraFile | None] = lambda size: None
     """What is known of the camera, for colours of a size."""
+    paired: bool = False
+    """Whether its own lists tell which depth goes with which colours; else their names or their order do."""
     numbered: bool = True
     """Whether all that goes by frames must be as many as the colours; else the shortest counts."""
     notes: tuple[str, ...] = ()
@@ -78,14 +83,33 @@ def find_layout(source: Path) -> Layout:
     if source.suffix.lower() == ".r3d":
         raise RecordingError(f"recording {source}: .r3d is compressed as LZFSE; export it from Record3D as EXR + RGB")
     if source.is_file():
-        return Layout((source,), depth := source.parent / "depth", _depths(depth), setup=_own_camera(source.parent))
-    if (source / "EXR_RGBD" / "metadata.json").is_file():
-        source = source / "EXR_RGBD"
-    makers = {"rgb.txt": _tum, "metadata.json": _record3d, "transforms.json": _nerfstudio, "odometry.csv": _stray}
-    for name, make in makers.items():
-        if (source / name).is_file():
-            return make(source)
-    return _side_by_side(source) or _folders(source)
+        root, depth = source.parent, source.parent / "depth"
+        found = Layout((source,), depth, _depths(depth), setup=_own_camera(root))
+    else:
+        root = source / "EXR_RGBD" if (source / "EXR_RGBD" / "metadata.json").is_file() else source
+        found = _of_folder(root)
+    own = root / "camera.json"
+    if not own.exists():
+        return found
+
+    def setup(size: Size) -> CameraFile:
+        camera, known = read_camera(own), found.setup(size)
+        return camera if known is None else completed(camera, known)
+
+    return replace(found, setup=setup)
+
+
+def _of_folder(root: Path) -> Layout:
+    there = {path.name for path in root.iterdir()}
+    if "rgb.txt" in there:
+        return _tum(root)
+    if "metadata.json" in there and any((root / "depth").glob("*.exr")):
+        return _record3d(root)
+    if "transforms.json" in there:
+        return _nerfstudio(root)
+    if {"odometry.csv", "camera_matrix.csv"} <= there:
+        return _stray(root)
+    return _side_by_side(root) or _folders(root)
 
 
 def is_layout(folder: Path) -> bool:
@@ -137,10 +161,10 @@ def _folders(root: Path) -> Layout:
 
 
 def _depths(folder: Path) -> tuple[Path, ...] | None:
-    return tuple(list_depth(folder)) if folder.exists() else None
+    return list_depth(folder) if folder.exists() else None
 
 
-def list_depth(folder: Path) -> list[Path]:
+def list_depth(folder: Path) -> tuple[Path, ...]:
     """Depth pictures of a folder, in order.
 
     Raises:
@@ -152,7 +176,7 @@ def list_depth(folder: Path) -> list[Path]:
     others = sorted(path.name for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
     if others and not found:
         raise RecordingError(f"depth {folder}: expected 16-bit PNG images, got files such as {others[0]}; convert them")
-    return found
+    return tuple(found)
 
 
 def _side_by_side(root: Path) -> Layout | None:
@@ -167,7 +191,7 @@ def _side_by_side(root: Path) -> Layout | None:
     ]
     poses = [there.get(f"{stem}pose.txt".lower()) for stem in colours]
     cam_from_world, notes = _poses_of_files(poses) if None not in poses else (None, ())
-    own = _own_camera(root, cam_from_world=cam_from_world)
+    own = _own_camera(root)
 
     def setup(size: Size) -> CameraFile | None:
         info = next((path for name in ("_info.txt", "info.txt") if (path := root / name).is_file()), None)
@@ -176,7 +200,7 @@ def _side_by_side(root: Path) -> Layout | None:
             known = CameraFile(Camera(585.0, 585.0, 320.0, 240.0, *size))  # as the page of 7-Scenes has it
         return known and replace(known, cam_from_world=cam_from_world)
 
-    return Layout(tuple(colours.values()), root, _some(depths), setup=setup, notes=notes)
+    return Layout(tuple(colours.values()), root, _some(depths), setup=setup, paired=True, notes=notes)
 
 
 def _tum(root: Path) -> Layout:
@@ -186,20 +210,20 @@ def _tum(root: Path) -> Layout:
     depths: list[Path | None] | None = None
     if (root / "depth.txt").is_file():
         listed = _timed_files(root, "depth.txt")
-        at_s = np.array([time for time, _ in listed])
-        near = np.abs(at_s[None] - stamp_s[:, None]).argmin(1)
+        near = nearest(np.array([time for time, _ in listed]), stamp_s)
         depths = [
-            listed[i][1] if abs(at_s[i] - time) <= _SYNC_S else None for i, time in zip(near, stamp_s, strict=True)
+            listed[i][1] if abs(listed[i][0] - time) <= Parts.sync_s else None
+            for i, time in zip(near, stamp_s, strict=True)
         ]
     poses, notes = None, list[str]()
     if (truth := root / "groundtruth.txt").is_file():
         table = _table(truth, 8)
-        poses, stale = _poses_between(table[:, 0], table[:, 1:4], table[:, 4:], stamp_s, truth)
-        notes += [f"poses end or have a gap of more than {_STALE_S:g} s: {stale} frames have the nearest"] * (stale > 0)
+        poses, stale = _poses_at(table, stamp_s, truth)
+        notes += [f"no pose within {STALE_S:g} s: the nearest is used in {counted(stale, 'frame')}"] * (stale > 0)
     camera = re.search(r"freiburg([123])", root.resolve().name)
     known = None if camera is None else _FREIBURG[camera[1]]
     own = _own_camera(root)
-    if known is None and own((640, 480)) is None:
+    if known is None and not (root / "camera.json").exists() and own((640, 480)) is None:
         notes.append("no camera file: the intrinsics are those that TUM RGB-D recommends for any of its cameras")
 
     def setup(size: Size) -> CameraFile | None:
@@ -212,7 +236,7 @@ def _tum(root: Path) -> Layout:
             found,
             depth_scale_m=found.depth_scale_m or 1 / 5000,
             stamp_s=stamp_s - stamp_s[0],
-            cam_from_world=poses if found.cam_from_world is None else found.cam_from_world,
+            cam_from_world=poses,
         )
 
     return Layout(
@@ -220,6 +244,7 @@ def _tum(root: Path) -> Layout:
         root / "depth",
         None if depths is None else _some(depths),
         setup=setup,
+        paired=True,
         notes=tuple(notes),
     )
 
@@ -297,29 +322,23 @@ def _nerfstudio(root: Path) -> Layout:
             distortion=Distortion("equidistant" if fisheye else "plumb_bob", lens if fisheye or any(lens) else ()),
         )
     notes = () if depths is not None else ("transforms.json has no depth: its poses are of unknown scale and not used",)
-    return Layout(colours, root, depths, setup=lambda size: setup, notes=notes)
-
-
-_QUATERNION = ("qx", "qy", "qz", "qw")
-_PLUMB_BOB = ("k1", "k2", "p1", "p2", "k3")
+    return Layout(colours, root, depths, setup=lambda size: setup, paired=True, notes=notes)
 
 
 # --- Cameras ----------------------------------------------------------------------------------------------------------
 
 
 def _own_camera(root: Path, *, cam_from_world: np.ndarray | None = None) -> Callable[[Size], CameraFile | None]:
-    """What a folder's own file says of the camera: ``camera.json``, Open3D's JSON, or a matrix as text."""
+    """What a folder's own file says of the camera: Open3D's JSON, or a matrix as text."""
 
     def setup(size: Size) -> CameraFile | None:
-        if (root / "camera.json").exists():
-            found = read_camera(root / "camera.json")
-        elif (open3d := next((p for name in _OPEN3D if (p := root / name).is_file()), None)) is not None:
+        if (open3d := next((p for name in _OPEN3D if (p := root / name).is_file()), None)) is not None:
             found = _open3d_camera(open3d)
         elif (matrix := next((p for name in _MATRICES if (p := root / name).is_file()), None)) is not None:
             found = _matrix_camera(matrix, size)
         else:
             return None
-        return found if found.cam_from_world is not None else replace(found, cam_from_world=cam_from_world)
+        return replace(found, cam_from_world=cam_from_world)
 
     return setup
 
@@ -405,15 +424,15 @@ def _beside(root: Path, colours: Sequence[Path]) -> tuple[np.ndarray | None, tup
 
 
 def _poses_of_files(files: Sequence[Path | None]) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """``cam_from_world`` of files with a matrix each; where the recorder lost itself, the pose before."""
+    """``cam_from_world`` of files with a matrix each; where the recorder lost itself, the nearest."""
     matrices = [_matrix(file) for file in files if file is not None]
     known = [t for t, matrix in enumerate(matrices) if matrix.shape == (4, 4) and is_rigid(matrix)]
     if not known:
         return None, ("no pose is a rigid transform: not used",)
-    nearest = [known[np.abs(np.array(known) - t).argmin()] for t in range(len(matrices))]
+    chosen = np.array(known)[nearest(np.array(known), np.arange(len(matrices)))]
     lost = len(matrices) - len(known)
-    notes = (f"no pose: {lost} frame{'s have' if lost > 1 else ' has'} that of the nearest frame",) * (lost > 0)
-    return _cam_from_world(np.stack([matrices[t] for t in nearest])), notes
+    notes = (f"no pose in {counted(lost, 'frame')}: that of the nearest frame is used",) * (lost > 0)
+    return _cam_from_world(np.stack([matrices[t] for t in chosen.tolist()])), notes
 
 
 def _cam_from_world(world_from_cam: Float[np.ndarray, "T 4 4"]) -> Float[np.ndarray, "T 4 4"]:
@@ -429,21 +448,21 @@ def _matrices(position: Float[np.ndarray, "T 3"], quaternion: Float[np.ndarray, 
     return found
 
 
-def _poses_between(
-    time_s: np.ndarray, position: np.ndarray, quaternion: np.ndarray, at_s: np.ndarray, file: Path
-) -> tuple[np.ndarray, int]:
-    """``cam_from_world`` at some times, on the line and the shortest arc; how many are far from any that is known."""
+def _poses_at(table: Float[np.ndarray, "N 8"], at_s: Float[np.ndarray, " T"], file: Path) -> tuple[np.ndarray, int]:
+    """``cam_from_world`` at some times, of rows of time, place and quaternion; how many are far from any of them."""
     with _asking(file):
-        time_s, first = np.unique(time_s, return_index=True)
-        position, quaternion = position[first], quaternion[first]
-        after = np.clip(np.searchsorted(time_s, at_s), 1, max(len(time_s) - 1, 1)) % len(time_s)
-        gap_s = np.minimum(np.abs(time_s[after] - at_s), np.abs(time_s[after - 1] - at_s))
-        inside = np.clip(at_s, time_s[0], time_s[-1])
-        places = np.stack([np.interp(inside, time_s, axis) for axis in position.T], -1)
-        turns = np.repeat(quaternion, len(at_s), axis=0)  # of one pose
-        if len(time_s) > 1:
-            turns = Slerp(time_s, Rotation.from_quat(quaternion))(inside).as_quat()
-        return _cam_from_world(_matrices(places, turns)), int((gap_s > _STALE_S).sum())
+        table = table[np.argsort(table[:, 0], kind="stable")]
+        edge = Edge("world", False, [round(1e9 * time) for time in table[:, 0]], [*table[:, 1:4]], [*table[:, 4:]])
+        at_ns = [round(1e9 * time) for time in at_s]
+        stale = sum(edge.gap(time) > STALE_S for time in at_ns)
+        return _cam_from_world(np.stack([edge.at(time) for time in at_ns])), stale
+
+
+def nearest(places: Int[np.ndarray, " N"] | Float[np.ndarray, " N"], to: np.ndarray) -> Int[np.ndarray, " T"]:
+    """Which of some places, in order, is the nearest to each of others."""
+    after = np.clip(np.searchsorted(places, to), 1, max(len(places) - 1, 1))
+    before, after = after - 1, np.minimum(after, len(places) - 1)
+    return np.where(to - places[before] <= places[after] - to, before, after)
 
 
 # --- Files ------------------------------------------------------------------------------------------------------------

@@ -20,14 +20,13 @@ from quest.data.frame_source import FrameSource, Notes, Parts, ReadOptions
 from quest.data.registration import Rig
 from quest.data.ros_images import depth_of, header_ns, rgb_of, unit_of
 from quest.data.ros_topics import Chosen, Messages, base_of, choose
-from quest.data.transforms import Transforms, frame_name
+from quest.data.transforms import STALE_S, Transforms, frame_name
 from quest.errors import InputError, RecordingError
 from quest.types import Camera, Frame
 
 _PATIENCE_NS = 500_000_000
 _SCAN_NS = 2_000_000_000
 _LATE_NS = 1_000_000_000
-_STALE_S = 0.5
 
 BAG_OPTIONS = (
     *("topic_rgb", "topic_depth", "topic_info", "topic_depth_info", "world_frame", "sync_s"),
@@ -37,7 +36,7 @@ BAG_OPTIONS = (
 
 NO_POSE = "no tf joins the camera to another frame: the world is the camera"
 NO_DEPTH = "no topic of depth: colours only"
-STALE = f"tf has nothing within {_STALE_S} s: the nearest pose is used"
+STALE = f"tf has nothing within {STALE_S} s: the nearest pose is used"
 LATE = "colours out of order: omitted"
 NO_STAMP = "headers have no time: that of logging is used"
 CAMERA_CHANGED = "camera_info changes on the way: the first is used"
@@ -330,7 +329,7 @@ class _Play:
             return setting.pose
         if setting.world is None:
             return np.eye(4)
-        if self._gap(at_ns) > _STALE_S:
+        if self._gap(at_ns) > STALE_S:
             self._notes.count(STALE, t)
         pose = self._transforms.lookup(setting.colour_frame, setting.world, at_ns)
         self._transforms.forget(at_ns)

@@ -16,12 +16,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from quest.data.ros_images import header_ns
 from quest.errors import RecordingError
 
+STALE_S = 0.5
+"""A pose from longer before or after is said to be stale."""
 _KEEP_NS = 30_000_000_000
 """How long what moved is remembered."""
 
 
 @dataclass
-class _Edge:
+class Edge:
     """One frame in another over time."""
 
     parent: str
@@ -31,6 +33,7 @@ class _Edge:
     quaternion: list[np.ndarray] = field(default_factory=list)
 
     def add(self, stamp_ns: int, position: np.ndarray, quaternion: np.ndarray) -> None:
+        """Take one more sample."""
         if self.static:
             self.stamp_ns, self.position, self.quaternion = [stamp_ns], [position], [quaternion]
             return
@@ -56,6 +59,7 @@ class _Edge:
         return 0.0 if self.static else max(self.stamp_ns[0] - stamp_ns, stamp_ns - self.stamp_ns[-1], 0) * 1e-9
 
     def forget(self, before_ns: int) -> None:
+        """Drop samples that are not needed from a time on."""
         old = bisect_left(self.stamp_ns, before_ns) - 1
         if old > 0 and not self.static:
             del self.stamp_ns[:old], self.position[:old], self.quaternion[:old]
@@ -65,7 +69,7 @@ class Transforms:
     """A tree of frames, fed as messages come; of what moves, the last half minute is kept."""
 
     def __init__(self) -> None:
-        self._edges: dict[str, _Edge] = {}
+        self._edges: dict[str, Edge] = {}
 
     def add(self, message: Any, *, static: bool, log_ns: int = 0) -> None:
         """Take the transforms of one TFMessage; those that are no transforms (a quaternion of zeros) are left out.
@@ -85,7 +89,7 @@ class Transforms:
             parent, child = frame_name(stamped.header.frame_id), frame_name(stamped.child_frame_id)
             edge = self._edges.get(child)
             if edge is None or edge.parent != parent or edge.static != static:
-                edge = self._edges[child] = _Edge(parent, static)
+                edge = self._edges[child] = Edge(parent, static)
             edge.add(header_ns(stamped) or log_ns, position, quaternion / norm)
 
     def root(self, frame: str) -> str:
