@@ -1,0 +1,149 @@
+"""What is given to others: the wheel, its content and an environment of its own, the workflows."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tarfile
+import venv
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from quest.cli.main import main
+from quest.cli.track import Track
+
+pytestmark = [pytest.mark.plain, pytest.mark.xdist_group("built")]
+
+ROOT = Path(__file__).parents[1]
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
+
+
+def test_the_demo_tracks_both_clips(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    ran = []
+    monkeypatch.setattr(Track, "run", lambda self: ran.append((self.clip, self.out)))
+    assert main(["demo", "--out", str(tmp_path / "demo")]) == 0
+    assert ran == [("sample", tmp_path / "demo"), ("sample-alarm", tmp_path / "demo-alarm")]
+    said = capsys.readouterr().out
+    assert str(tmp_path / "demo" / "overlay.mp4") in said
+    assert str(tmp_path / "demo-alarm" / "overlay.mp4") in said
+
+
+def steps(workflow: Path) -> Iterator[dict[str, Any]]:
+    for job in yaml.safe_load(workflow.read_text(encoding="utf-8"))["jobs"].values():
+        yield from job["steps"]
+
+
+def test_there_are_workflows():
+    assert {path.name for path in WORKFLOWS} == {"ci.yml", "release.yml"}
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_workflows_are_well_formed(workflow: Path):
+    read = yaml.safe_load(workflow.read_text(encoding="utf-8"))
+    assert read[True], "YAML reads the key `on` as true"
+    assert read["permissions"] == {"contents": "read"}
+    names = set(read["jobs"])
+    for job in read["jobs"].values():
+        assert job["timeout-minutes"] if "environment" not in job else True
+        assert {job["needs"]} <= names if "needs" in job else True
+    for step in steps(workflow):
+        assert ("uses" in step) != ("run" in step)
+        if "uses" in step:
+            assert re.fullmatch(r"[\w-]+/[\w-]+@(v\d+|release/v\d+)", step["uses"]), "pinned to a major version"
+
+
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_what_workflows_name_exists(workflow: Path):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    for step in steps(workflow):
+        for target in re.findall(r"\bmake ([a-z-]+)", step.get("run", "")):
+            assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
+        for file in re.findall(r"\b[\w./-]+\.(?:txt|py)\b", step.get("run", "") + str(step.get("with", ""))):
+            assert (ROOT / file).is_file(), file
+
+
+def test_the_release_tries_all_platforms_and_publishes_without_secrets():
+    text = (ROOT / ".github" / "workflows" / "release.yml").read_text(encoding="utf-8")
+    jobs = yaml.safe_load(text)["jobs"]
+    matrix = jobs["try"]["strategy"]["matrix"]
+    assert [name.partition("-")[0] for name in matrix["os"]] == ["ubuntu", "macos", "windows"]
+    assert matrix["python"] == ["3.11", "3.13"]
+    assert 'quest" demo' in text
+    assert jobs["publish"]["permissions"] == {"id-token": "write"}
+    assert jobs["publish"]["if"] == "github.ref_type == 'tag'"
+    assert "secrets." not in text
+    tag = r'grep -qx "__version__ = \"'
+    assert tag in text
+    assert re.search(r'^__version__ = "[\d.]+"$', (ROOT / "src/quest/__init__.py").read_text(), re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the project, with the wheel and the source distribution in its ``dist``, built without a network."""
+    source = tmp_path_factory.mktemp("source")
+    shutil.copytree(ROOT / "src" / "quest", source / "src" / "quest", ignore=shutil.ignore_patterns("__pycache__"))
+    for path in (*ROOT.glob("*.md"), *map(ROOT.joinpath, ("pyproject.toml", "LICENSE", "NOTICE", "MANIFEST.in"))):
+        shutil.copy(path, source)
+    (source / "tests").mkdir()
+    shutil.copy(Path(__file__), source / "tests")
+    build = "from setuptools.build_meta import *; build_sdist('dist'); build_wheel('dist')"
+    run = subprocess.run([sys.executable, "-c", build], cwd=source, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stdout[-2000:] + run.stderr[-2000:]
+    return source
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_the_package_and_nothing_else(built: Path):
+    (wheel,) = built.glob("dist/*.whl")
+    held = set(zipfile.ZipFile(wheel).namelist())
+    package = built / "src" / "quest"
+    kept = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+    assert {f"quest/{path.relative_to(package).as_posix()}" for path in kept} == {n for n in held if n[:6] == "quest/"}
+    about = {name.partition("/")[2] for name in held if not name.startswith("quest/")}
+    assert about >= {"METADATA", "RECORD", "entry_points.txt", "licenses/LICENSE", "licenses/NOTICE"}
+    assert all(name.partition("/")[0].endswith(".dist-info") for name in held if not name.startswith("quest/"))
+    assert {"quest/py.typed", "quest/assets/monitor.json", "quest/assets/sample/camera.json"} <= held
+    assert wheel.stat().st_size < 100e6, "PyPI takes no more than 100 MB"
+
+
+@pytest.mark.slow
+def test_the_source_distribution_holds_the_package_alone(built: Path):
+    (sdist,) = built.glob("dist/*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    assert {"pyproject.toml", "LICENSE", "NOTICE", "src/quest/py.typed"} <= held
+    assert {name.partition("/")[0] for name in held if "/" in name} <= {"src"}
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_wheel_works_in_an_environment_of_its_own(built: Path, tmp_path: Path):
+    """Only the dependencies are those that are installed here."""
+    (wheel,) = built.glob("dist/*.whl")
+    venv.create(tmp_path / "env", symlinks=True)
+    bin_folder = Path(sysconfig.get_path("scripts", "venv", {"base": str(tmp_path / "env")}))
+    python = next(bin_folder.glob("python*"))
+    install = [sys.executable, "-m", "pip", "--python", str(python), "install", "--quiet", "--no-deps", "--no-index"]
+    subprocess.run([*install, str(wheel)], check=True)
+    where = "import importlib.util; print(importlib.util.find_spec('quest').origin)"
+    here = subprocess.run([python, "-c", where], capture_output=True, text=True, check=True)
+    packages = Path(here.stdout.strip()).parents[1]
+    assert packages.is_relative_to(tmp_path)
+    (packages / "dependencies.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    (tmp_path / "elsewhere").mkdir()
+    quest = next(bin_folder.glob("quest*"))
+    command = [quest, "find", "sample-alarm", "--out", "found"]  # clip, weights and networks; the release runs the demo
+    ran = subprocess.run(command, cwd=tmp_path / "elsewhere", capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert {path.name for path in (tmp_path / "elsewhere" / "found").iterdir()} == {"found.png", "found.json"}
+    assert "knob" in ran.stdout
