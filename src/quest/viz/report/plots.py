@@ -1,0 +1,341 @@
+"""The plots of a report, as Plotly takes them: traces and layouts of plain values."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from quest.types import State, Tracks
+from quest.viz.joint_lines import JointLines, joint_lines
+from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, TEXT, query_colour
+from quest.viz.report.drift import Drift
+from quest.viz.report.summary import runs
+from quest.viz.report.thinning import Thinning
+
+ROW_PX = 58
+"""Height of a query's time line."""
+MOST_NAMED = 12
+"""With more lines than this a plot has no legend: a line says its name where one points at it."""
+_CODES = {State.TRACKING.value: 1, State.HELD.value: 2, State.LOST.value: 3}
+"""The larger, the worse; 0 is not bound yet."""
+_SMALLEST_BOX_M = 0.1
+_TOP, _FOOT, _STRIP = 0.32, 0.74, 0.86
+"""Where in its row P(lost) is 1 and 0, and the middle of the strip of states."""
+
+Trace = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Plot:
+    """A figure of Plotly with its text."""
+
+    id: str
+    """Of its element in the page."""
+    about: str
+    """What it shows, for those who do not see it."""
+    height: int
+    """Pixels."""
+    data: list[Trace]
+    """Traces."""
+    layout: dict[str, Any]
+    """Layout."""
+    timed: bool = True
+    """Whether x is time, so that it has a cursor."""
+
+
+def time_lines(tracks: Tracks, thinning: Thinning) -> Plot | None:
+    """A row per query: P(lost), the alarms that are open, and the state."""
+    queries = len(tracks.names)
+    if not queries:
+        return None
+    edge_s = _edges_s(tracks.stamp_s)
+    left, right = float(edge_s[0]), float(edge_s[-1])
+    rows = np.arange(queries)
+    data = [
+        {
+            **_line("scale", LINE, 1),
+            "x": [left, right, None] * 2 * queries,
+            "y": _values(np.stack([rows + _TOP] * 2 + [rows * np.nan] + [rows + _FOOT] * 2 + [rows * np.nan], 1)),
+            "hoverinfo": "skip",
+        }
+    ]
+    for k in range(queries):
+        data += [*_alarm_bars(tracks, k, thinning, edge_s), _state_bars(tracks, k, thinning, edge_s)]
+        if tracks.lost_p is not None and np.isfinite(tracks.lost_p[:, k]).any():
+            data.append(_lost_line(tracks, k, thinning))
+    labels = [
+        {"x": 0, "xref": "paper", "xanchor": "left", "y": k + 0.16, "showarrow": False, "text": _plain(name)}
+        | {"font": {"color": _css(query_colour(k)), "size": 13}}
+        for k, name in enumerate(tracks.names)
+    ]
+    height = ROW_PX * queries + 56
+    rows_axis = {
+        "range": [queries, 0],
+        "fixedrange": True,
+        "showgrid": False,
+        "zeroline": False,
+        "tickvals": [y for k in range(queries) for y in (k + _TOP, k + _FOOT)],
+        "ticktext": ["1", "0"] * queries,
+        "tickfont": {"size": 10},
+    }
+    layout = _layout(height, _seconds(left, right), yaxis=rows_axis, barmode="overlay", annotations=labels)
+    about = f"Time lines of P(lost), alarms and states of {', '.join(tracks.names)}; the tables say the same in words."
+    return Plot("time-lines", about, height, data, layout)
+
+
+def coordinates(tracks: Tracks, thinning: Thinning) -> list[Plot]:
+    """Where on their joints the queries are: degrees of those that turn, metres of those that slide."""
+    joints, plots = tracks.joints, []
+    if joints is None:
+        return []
+    for kind, factor, axis in (("revolute", 180 / np.pi, "angle, degrees"), ("prismatic", 1.0, "way, m")):
+        data = []
+        for k in [k for k, each in enumerate(joints.kind) if each == kind]:
+            values = joints.q[:, k].astype(np.float64)
+            if kind == "revolute":
+                values[np.isfinite(values)] = np.unwrap(values[np.isfinite(values)])
+            data.append(_over_time(tracks, k, values * factor, thinning))
+        if data:
+            plots.append(
+                _lines_plot(f"joint-{kind}", f"Coordinate of {kind} joints over time, {axis}", tracks, data, axis)
+            )
+    return plots
+
+
+def drift_plot(tracks: Tracks, drift: Drift, thinning: Thinning) -> Plot:
+    """Distance from the truth over time."""
+    data = [
+        _over_time(tracks, k, drift.distance[:, k], thinning)
+        for k, entity in enumerate(drift.entity)
+        if entity is not None
+    ]
+    axis = "distance, normalised"
+    plot = _lines_plot(
+        "drift", "Distance of each answer from its true entity over time, normalised units", tracks, data, axis
+    )
+    line = {"color": _css(MUTED), "dash": "dash", "width": 1}
+    gate = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": drift.gate, "y1": drift.gate, "line": line}
+    plot.layout["yaxis"] |= {"rangemode": "tozero"}
+    return replace(plot, layout=plot.layout | {"shapes": [gate]})
+
+
+def world(tracks: Tracks, thinning: Thinning) -> Plot | None:
+    """Tracks, joints and the camera's path in the world; None where nothing of them is known."""
+    frames, data = thinning.every(), []
+    lost = tracks.state == State.LOST
+    for k, (name, joint) in enumerate(zip(tracks.names, joint_lines(tracks), strict=True)):
+        known = np.isfinite(tracks.point_world[:, k]).all(axis=-1) & ~lost[:, k]
+        if not known.any():
+            continue
+        points = np.where(known[:, None], tracks.point_world[:, k].astype(np.float64), np.nan)
+        colour, last = query_colour(k), int(np.flatnonzero(known)[-1])
+        data.append(_space(name, points[np.unique([*frames, last])], colour, 4) | {"legendgroup": str(k)})
+        mark = _space(name, points[last][None], colour, 0, mode="markers")
+        data.append(mark | {"marker": {"size": 5, "color": _css(colour)}, "legendgroup": str(k), "showlegend": False})
+        data += _joint_traces(name, joint, colour, str(k))
+    poses = _known_poses(tracks)
+    if len(poses):
+        data += _camera_traces(poses[thinning.every()] if len(poses) == len(tracks) else poses)
+    if not data:
+        return None
+    layout = _layout(
+        520, {}, scene=_scene(data, poses), showlegend=_named(data), margin={"l": 0, "r": 0, "t": 0, "b": 0}
+    )
+    about = "Tracks, joints and the camera in the world, metres, all axes at one scale; the tables hold the numbers."
+    return Plot("world", about, 520, data, layout, timed=False)
+
+
+def _scene(data: list[Trace], poses: Float[np.ndarray, "N 4 4"]) -> dict[str, Any]:
+    """A box round everything, its axes at one scale, seen from the side of the first camera and upright as there."""
+    axis = {"backgroundcolor": _css(BACKGROUND), "gridcolor": _css(LINE), "zerolinecolor": _css(LINE)}
+    points = np.concatenate([np.array([trace[name] for name in "xyz"], dtype=np.float64).T for trace in data])
+    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
+    longest = max(float((high - low).max()), _SMALLEST_BOX_M)
+    half = np.maximum((high - low) * 1.1, 0.4 * longest) / 2  # a box without depth cannot be turned
+    middle, scene = (low + high) / 2, {}
+    for i, name in enumerate("xyz"):
+        around = [float(middle[i] - half[i]), float(middle[i] + half[i])]
+        scene[f"{name}axis"] = {"title": {"text": f"{name}, m"}, "range": around, "color": _css(MUTED), **axis}
+    right, down, forward = (poses[0] if len(poses) else np.eye(4))[:3, :3]
+    eye = 1.5 * (0.35 * right - 0.45 * down - forward)
+    looks = {name: dict(zip("xyz", to.tolist(), strict=True)) for name, to in (("up", -down), ("eye", eye))}
+    ratio = dict(zip("xyz", (half / half.max()).tolist(), strict=True))
+    return scene | {"aspectmode": "manual", "aspectratio": ratio, "dragmode": "orbit", "camera": looks}
+
+
+def _known_poses(tracks: Tracks) -> Float[np.ndarray, "N 4 4"]:
+    poses = np.zeros((0, 4, 4)) if tracks.cam_from_world is None else tracks.cam_from_world.astype(np.float64)
+    return poses[np.isfinite(poses).all(axis=(1, 2))]
+
+
+def _camera_traces(poses: Float[np.ndarray, "N 4 4"]) -> list[Trace]:
+    """Path of the camera's centre, and where it looks from at the end."""
+    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    path = _space("camera", centres, TEXT, 3) | {"legendgroup": "camera"}
+    end = _space("camera", centres[-1:], TEXT, 0, mode="markers")
+    mark = {"marker": {"size": 5, "color": _css(TEXT), "symbol": "diamond"}, "legendgroup": "camera"}
+    return [path | {"showlegend": False}, end | mark]
+
+
+def _joint_traces(name: str, joint: JointLines | None, colour: RGB, group: str) -> list[Trace]:
+    if joint is None:
+        return []
+    more = {"legendgroup": group, "showlegend": False}
+    traces = [_space(f"{name}: range", joint.path, colour, 9) | more | {"opacity": 0.45}]
+    if joint.axis is not None:
+        axis = _space(f"{name}: axis", joint.axis, colour, 3)
+        traces.append(axis | more | {"line": {"color": _css(colour), "width": 3, "dash": "dash"}})
+    return traces + [_space(f"{name}: range", arm, colour, 1) | more for arm in joint.arms]
+
+
+def _space(name: str, points: Float[np.ndarray, "N 3"], colour: RGB, width: int, *, mode: str = "lines") -> Trace:
+    return {
+        "type": "scatter3d",
+        "mode": mode,
+        "name": _plain(name),
+        **{axis: _values(points[:, i]) for i, axis in enumerate("xyz")},
+        "line": {"color": _css(colour), "width": width},
+        "hovertemplate": "x %{x:.3f} m<br>y %{y:.3f} m<br>z %{z:.3f} m",
+    }
+
+
+def _lost_line(tracks: Tracks, k: int, thinning: Thinning) -> Trace:
+    assert tracks.lost_p is not None
+    frames = thinning.extremes(tracks.lost_p[:, k].astype(np.float64))
+    lost_p = tracks.lost_p[frames, k].astype(np.float64)
+    return {
+        **_line(tracks.names[k], query_colour(k), 2),
+        "mode": _mode(frames),
+        "x": _values(tracks.stamp_s[frames]),
+        "y": _values(k + _FOOT + (_TOP - _FOOT) * lost_p),
+        "customdata": _values(lost_p, digits=3),
+        "hovertemplate": "P(lost) %{customdata} at %{x:.2f} s",
+    }
+
+
+def _state_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> Trace:
+    """The strip of states; of the frames in a bin it shows the worst."""
+    bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)
+    codes = sum(np.where(tracks.state[:, k] == state, code, 0) for state, code in _CODES.items())
+    worst = thinning.largest(np.where(bound, codes, 0))
+    spans = [(first, end) for first, end in runs(worst) if worst[first]]
+    colours = (TEXT, query_colour(k), HELD, LOST)
+    words = {code: state for state, code in _CODES.items()}
+    return _bars(tracks, k, spans, thinning, edge_s) | {
+        "width": 0.12,
+        "marker": {"color": [_css(colours[worst[first]]) for first, _ in spans], "line": {"width": 0}},
+        "customdata": [words[int(worst[first])] for first, _ in spans],
+        "hovertemplate": "%{customdata} from %{base:.2f} s for %{x:.2f} s",
+    }
+
+
+def _alarm_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> list[Trace]:
+    if tracks.alarm is None or not tracks.alarm[:, k].any():
+        return []
+    alarmed = thinning.largest(tracks.alarm[:, k])
+    bars = _bars(tracks, k, [(first, end) for first, end in runs(alarmed) if alarmed[first]], thinning, edge_s)
+    fill = {"color": f"rgba({LOST[0]},{LOST[1]},{LOST[2]},0.28)", "line": {"color": _css(LOST), "width": 1}}
+    y = [k + 0.62] * len(bars["y"])
+    return [bars | {"y": y, "width": 0.7, "marker": fill, "hovertemplate": "alarm from %{base:.2f} s for %{x:.2f} s"}]
+
+
+def _bars(tracks: Tracks, k: int, spans: Sequence[tuple[int, int]], thinning: Thinning, edge_s: np.ndarray) -> Trace:
+    """Bars over spans of bins."""
+    ends = np.array(spans, dtype=int).reshape(-1, 2) * thinning.width
+    from_s, until_s = edge_s[np.minimum(ends, thinning.frames)].T
+    return {
+        "type": "bar",
+        "orientation": "h",
+        "name": _plain(tracks.names[k]),
+        "base": _values(from_s),
+        "x": _values(until_s - from_s),
+        "y": [k + _STRIP] * len(spans),
+    }
+
+
+def _over_time(tracks: Tracks, k: int, values: Float[np.ndarray, " T"], thinning: Thinning) -> Trace:
+    frames = thinning.extremes(values)
+    return {
+        **_line(tracks.names[k], query_colour(k), 2),
+        "mode": _mode(frames),
+        "x": _values(tracks.stamp_s[frames]),
+        "y": _values(values[frames]),
+        "hovertemplate": "%{y} at %{x:.2f} s",
+    }
+
+
+def _lines_plot(id: str, about: str, tracks: Tracks, data: list[Trace], axis: str) -> Plot:
+    height, edge_s = 320, _edges_s(tracks.stamp_s)
+    y = {"title": {"text": axis}, "gridcolor": _css(LINE), "zerolinecolor": _css(LINE), "automargin": True}
+    x = _seconds(float(edge_s[0]), float(edge_s[-1]))
+    return Plot(id, about, height, data, _layout(height, x, yaxis=y, showlegend=_named(data)))
+
+
+def _named(data: list[Trace]) -> bool:
+    return len([trace for trace in data if trace.get("showlegend", True)]) <= MOST_NAMED
+
+
+def _mode(frames: Int[np.ndarray, " N"]) -> str:
+    return "lines" if len(frames) > 2 else "lines+markers"  # a line through one point is not seen
+
+
+def _line(name: str, colour: RGB, width: int) -> Trace:
+    return {
+        "type": "scatter",
+        "mode": "lines",
+        "name": _plain(name),
+        "line": {"color": _css(colour), "width": width},
+    }
+
+
+def _layout(height: int, xaxis: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Dark in every theme, as the video is: the queries' colours are made for it."""
+    return {
+        "height": height,
+        "margin": {"l": 26, "r": 12, "t": 8, "b": 44},
+        "paper_bgcolor": _css(BACKGROUND),
+        "plot_bgcolor": _css(BACKGROUND),
+        "font": {"color": _css(TEXT), "family": "system-ui, sans-serif", "size": 12},
+        "hovermode": "closest",
+        "hoverlabel": {"namelength": -1},
+        "legend": {"orientation": "h", "y": 1.0, "yanchor": "bottom"},
+        "showlegend": False,
+        "xaxis": xaxis,
+        **more,
+    }
+
+
+def _seconds(left: float, right: float) -> dict[str, Any]:
+    return {
+        "title": {"text": "time, s"},
+        "range": [left, right],
+        "gridcolor": _css(LINE),
+        "zeroline": False,
+    }
+
+
+def _edges_s(stamp_s: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T1"]:
+    """When each frame begins, and the last one ends: after the usual time, or a thirtieth of a second."""
+    steps = np.diff(stamp_s)
+    steps = steps[steps > 0]
+    return np.append(stamp_s, stamp_s[-1] + (float(np.median(steps)) if len(steps) else 1 / 30))
+
+
+def _values(values: np.ndarray, *, digits: int = 4) -> list[float | None]:
+    """Numbers of JSON, which has no NaN."""
+    flat = np.asarray(values, dtype=np.float64).ravel()
+    return [round(value, digits) if np.isfinite(value) else None for value in flat.tolist()]
+
+
+def _plain(text: str) -> str:
+    """A text whose marks Plotly does not read as such."""
+    return html.escape(text, quote=False)
+
+
+def _css(colour: RGB) -> str:
+    return f"rgb({colour[0]},{colour[1]},{colour[2]})"

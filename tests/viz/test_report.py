@@ -1,0 +1,340 @@
+"""The page about a run: what it says of odd runs, what it never lets through, and that a browser shows it."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quest.data.video import write_video
+from quest.errors import InputError
+from quest.types import Camera, Joints, Query, State, Tracks
+from quest.viz.palette import query_colour
+from quest.viz.report import Drift, Recorded, RunRecord, read_run, write_report, write_run
+from quest.viz.report.plots import coordinates, drift_plot, time_lines, world
+from quest.viz.report.thinning import MOST_BINS, Thinning
+
+pytest.importorskip("jinja2")
+graph_objects = pytest.importorskip("plotly.graph_objects")
+
+EVIL = (
+    "<script>alert(1)</script>",
+    "</script><img src=x onerror=alert(2)>",
+    "\"quotes' & <b>",
+    "bell\x07\u202enul\x00",
+)
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium and no google-chrome here")
+
+
+def make_tracks(*, frames: int = 20, names: tuple[str, ...] = ("door", "drawer", "side")) -> Tracks:
+    """Query 0 turns and raises an alarm, 1 slides, the others stand still; the camera moves."""
+    k, t = len(names), np.arange(frames, dtype=np.float32)
+    q = np.full((frames, k), np.nan, np.float32)
+    point = np.random.default_rng(0).uniform(-1, 1, (1, k, 3)).repeat(frames, axis=0).astype(np.float32)
+    joints = Joints.unknown(frames, k)
+    kinds = ["revolute", "prismatic", *["static"] * k][:k]
+    for i, kind in enumerate(kinds[:2]):
+        q[:, i] = t / frames
+        joints.axis[i], joints.origin[i] = (0, 0, 1), (0.5, 0, 0)
+        joints.q_min_seen[i], joints.q_max_seen[i] = 0, q[-1, i]
+        point[:, i, :2] += (
+            np.stack([np.sin(q[:, i]), np.cos(q[:, i])], axis=-1) if kind == "revolute" else q[:, i, None]
+        )
+    state = np.full((frames, k), State.TRACKING.value, dtype="<U8")
+    state[frames // 2 : frames // 2 + 2, :1] = State.LOST.value
+    lost_p = np.where(state == State.LOST.value, np.float32(0.9), np.float32(0.1))
+    poses = np.eye(4)[None].repeat(frames, axis=0)
+    poses[:, 0, 3] = t / frames
+    return Tracks(
+        names=names,
+        labels=("handle",) * k,
+        uv_px=np.full((frames, k, 2), 8, np.float32),
+        point_world=point,
+        confidence=1 - lost_p,
+        visible=state == State.TRACKING.value,
+        state=state,
+        stamp_s=np.arange(frames) / 10 + 1.7e9,
+        lost_p=lost_p,
+        alarm=state == State.LOST.value,
+        joints=replace(joints, kind=tuple(kinds), q=q),
+        cam_from_world=poses,
+    )
+
+
+def make_run(folder: Path, tracks: Tracks, *, video: bool = True) -> Path:
+    tracks.save(folder)
+    if video:
+        frames = np.random.default_rng(1).integers(0, 255, (len(tracks), 48, 64, 3), dtype=np.uint8)
+        write_video(folder / "overlay.mp4", frames, frames_per_s=10)
+    return folder
+
+
+def make_record(frames: int = 20) -> RunRecord:
+    camera = Camera(60, 60, 32, 24, 64, 48)
+    return RunRecord(
+        quest="1.2.3",
+        date="2026-01-02T03:04:05+00:00",
+        command="quest track 'my clip.mp4' --point 0,1,2",
+        recording=Recorded("my clip.mp4", 0, "my clip", frames, camera, has_depth=True, notes=("a note",)),
+        weights="quest-s16",
+        weights_hash="ab" * 32,
+        alpha=0.05,
+        alpha_frames=None,
+        device="cpu",
+        queries=(Query.point(0, 1, 2), Query.semantic("rim", intent="lift")),
+        overlay=True,
+        took_s=2.0,
+    )
+
+
+def plots_of(page: str) -> dict[str, Any]:
+    found = re.search(r'<script type="application/json" id="plots">(.*?)</script>', page, re.DOTALL)
+    assert found is not None
+    return json.loads(found[1])
+
+
+def text_of(page: str) -> str:
+    """What one reads: without scripts, styles and marks."""
+    return html.unescape(re.sub(r"<[^>]*>", "", re.sub(r"<(script|style)\b.*?</\1>", "", page, flags=re.DOTALL)))
+
+
+def read(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def test_a_record_comes_back(tmp_path: Path):
+    write_run(make_record(), tmp_path)
+    assert read_run(tmp_path) == make_record()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda value: value | {"version": 99},
+        lambda value: value | {"took_s": "long"},
+        lambda value: value | {"extra": 1},
+        lambda value: {key: each for key, each in value.items() if key != "device"},
+        lambda value: value | {"recording": value["recording"] | {"camera": {"fx": 1}}},
+        lambda value: [value],
+    ],
+)
+def test_a_damaged_record_is_refused(tmp_path: Path, damage):
+    write_run(make_record(), tmp_path)
+    path = tmp_path / "run.json"
+    path.write_text(json.dumps(damage(json.loads(path.read_text()))))
+    with pytest.raises(InputError, match=r"run\.json.*track again"):
+        read_run(tmp_path)
+
+
+def test_no_folder_and_no_tracks(tmp_path: Path):
+    with pytest.raises(InputError, match="no such folder"):
+        write_report(tmp_path / "none")
+    (tmp_path / "file").touch()
+    with pytest.raises(InputError, match="this is a file"):
+        write_report(tmp_path / "file")
+    with pytest.raises(InputError, match=r"expected tracks\.parquet"):
+        write_report(tmp_path)
+    make_run(tmp_path, make_tracks(), video=False)
+    with pytest.raises(InputError, match="this is a folder"):
+        write_report(tmp_path, tmp_path)
+
+
+def test_a_whole_run(tmp_path: Path):
+    make_run(tmp_path, make_tracks())
+    write_run(make_record(), tmp_path)
+    page = read(write_report(tmp_path))
+    text = text_of(page)
+    assert "my clip" in text
+    assert "door turned" in text
+    assert "An alarm for door opened at 1.0 s" in text
+    assert "quest track 'my clip.mp4' --point 0,1,2" in text
+    assert "Query.point(0, 1, 2" in text
+    assert "abab" in text
+    assert 'src="data:video/mp4;base64,' in page
+    assert page.count("plotly.js v") == 1, "inlined once"
+    assert not re.search(r"<(link|script|img|iframe|video)\b[^>]*(src|href)=\"(?!data:)", page), "nothing is fetched"
+    assert {plot["id"] for plot in plots_of(page)["plots"]} == {
+        "time-lines", "joint-revolute", "joint-prismatic", "world",
+    }  # fmt: skip
+    assert not list(tmp_path.glob(".*partial*"))
+
+
+def test_what_is_missing_is_said(tmp_path: Path):
+    make_run(tmp_path, make_tracks(), video=False)
+    text = text_of(read(write_report(tmp_path, tmp_path / "new" / "page.html")))
+    assert "There is no overlay.mp4" in text
+    assert "There is no run.json" in text
+    assert "Nothing was compared" in text
+
+
+def test_a_video_that_is_none_or_of_another_run(tmp_path: Path):
+    make_run(tmp_path, make_tracks(frames=30))
+    make_tracks(frames=20).save(tmp_path)
+    assert "The video has 30 frames, the tracks have 20" in text_of(read(write_report(tmp_path)))
+    write_run(replace(make_record(), overlay=False), tmp_path)
+    assert "is of an earlier run" in text_of(read(write_report(tmp_path)))
+    write_run(make_record(7), tmp_path)
+    (tmp_path / "overlay.mp4").write_bytes(b"no video")
+    text = text_of(read(write_report(tmp_path)))
+    assert "The video cannot be shown" in text
+    assert "it does not belong to these tracks" in text
+
+
+@pytest.mark.parametrize(
+    "what", ["no queries", "one frame", "no depth", "no monitor", "no joints", "unbound", "no poses"]
+)
+def test_odd_runs(tmp_path: Path, what: str):
+    tracks = make_tracks(frames=1) if what == "one frame" else make_tracks()
+    if what == "no queries":
+        tracks = make_tracks(names=())
+    elif what == "no depth":
+        tracks = replace(tracks, point_world=tracks.point_world * np.nan, joints=None, cam_from_world=None)
+    elif what == "no monitor":
+        tracks = replace(tracks, lost_p=None, alarm=None)
+    elif what == "no joints":
+        tracks = replace(tracks, joints=None)
+    elif what == "unbound":
+        tracks = replace(tracks, uv_px=tracks.uv_px * np.nan, point_world=tracks.point_world * np.nan)
+    elif what == "no poses":
+        tracks = replace(tracks, cam_from_world=np.full((len(tracks), 4, 4), np.nan))
+    text = text_of(read(write_report(make_run(tmp_path, tracks))))
+    said = {
+        "no queries": "No entity was asked for or found.",
+        "no depth": "No world point is known",
+        "no monitor": "Nothing was monitored",
+        "no joints": "No joint is known",
+        "unbound": "door was never found",
+    }
+    assert said.get(what, "Summary") in text
+
+
+def test_names_do_nothing_but_show(tmp_path: Path):
+    tracks = make_tracks(names=EVIL)
+    run = make_run(tmp_path, replace(tracks, frame_flags=(EVIL[0],), labels=EVIL))
+    record = make_record()
+    recording = replace(record.recording, name=EVIL[1], given=EVIL[0], notes=EVIL)
+    write_run(replace(record, recording=recording, command=EVIL[1], weights=EVIL[2], device=EVIL[3]), run)
+    drift = Drift(EVIL, np.full((20, 4), 0.2), np.ones(4), gate=0.1, unit_m=1.0, missing=1.0)
+    page = read(write_report(run, compare=lambda *_: drift))
+    assert "<script>alert" not in page
+    assert "<img" not in page.partition("plotly.js v")[0]
+    assert "\x07" not in page
+    assert "\u202e" not in page
+    text = text_of(page.partition("plotly.js v")[0])
+    assert EVIL[0] in text
+    assert EVIL[2] in text
+    assert r"bell\x07\u202enul\x00" in text
+    labels = [label["text"] for label in plots_of(page)["plots"][0]["layout"]["annotations"]]
+    assert labels[0] == "&lt;script&gt;alert(1)&lt;/script&gt;", "Plotly reads marks in its texts"
+    assert labels[2] == "\"quotes' &amp; &lt;b&gt;", "and no entity of quotes"
+
+
+def test_plotly_takes_the_plots():
+    tracks, thinning = make_tracks(), Thinning.of(20, 3)
+    drift = Drift(("a", None, "b"), np.full((20, 3), 0.2), np.ones(3), gate=0.1, unit_m=1.0, missing=1.0)
+    plots = [time_lines(tracks, thinning), *coordinates(tracks, thinning), world(tracks, thinning)]
+    for plot in [*plots, drift_plot(tracks, drift, thinning)]:
+        assert plot is not None
+        graph_objects.Figure(plot.data, plot.layout)  # raises on what Plotly does not know
+    colours = [
+        trace["line"]["color"] for trace in plots[0].data if trace.get("customdata") and trace["type"] == "scatter"
+    ]
+    assert colours == [f"rgb{query_colour(k)}".replace(" ", "") for k in range(3)]
+
+
+def test_the_axes_of_the_world_have_one_scale():
+    plot = world(make_tracks(), Thinning.of(20, 3))
+    assert plot is not None
+    scene = plot.layout["scene"]
+    scales = [scene["aspectratio"][name] / np.ptp(scene[f"{name}axis"]["range"]) for name in "xyz"]
+    np.testing.assert_allclose(scales, scales[0], rtol=1e-6)
+
+
+def test_thinning_keeps_peaks_and_gaps():
+    values = np.zeros(12345)
+    values[[777, 9000]] = 1, -1
+    values[:100] = np.nan
+    thinning = Thinning.of(len(values), 3)
+    frames = thinning.extremes(values)
+    assert {777, 9000} <= set(frames.tolist())
+    assert len(frames) <= 2 * MOST_BINS
+    assert frames.max() < len(values)
+    assert np.isnan(values[frames[0]])
+    assert thinning.largest(np.arange(12345))[-1] == 12344
+    np.testing.assert_array_equal(Thinning.of(30, 64).extremes(np.arange(30.0)), np.arange(30))
+
+
+@pytest.mark.slow
+def test_a_long_run_makes_a_page_of_bounded_size(tmp_path: Path):
+    tracks = make_tracks(frames=2_000, names=tuple(f"query {k}" for k in range(64)))
+    noise = np.random.default_rng(0)
+    tracks = replace(
+        tracks,
+        lost_p=noise.uniform(size=(2_000, 64)).astype(np.float32),
+        state=noise.choice([state.value for state in State], (2_000, 64)).astype("<U8"),
+        alarm=noise.uniform(size=(2_000, 64)) > 0.9,
+    )
+    page = write_report(make_run(tmp_path, tracks, video=False))
+    assert page.stat().st_size < 15 * 2**20
+    text = text_of(read(page))
+    assert "Each point stands for 2 frames" in text
+    assert "more alarms are not listed" in text
+
+
+def in_browser(page: Path) -> dict[str, Any]:
+    """What a headless browser makes of a page, after the slider went to frame 12."""
+    watch = (
+        "<script>window.failures = []; addEventListener('error', (e) => failures.push(String(e.message)), true);"
+        "addEventListener('securitypolicyviolation', (e) => failures.push(e.blockedURI));"
+        "window.alert = (x) => failures.push('alert ' + x);</script>"
+    )
+    tell = """<script>(async () => {
+      const video = document.getElementById("video"), slider = document.getElementById("seek");
+      const pause = () => new Promise((resolve) => setTimeout(resolve, 50));
+      const drawn = () => [...document.querySelectorAll(".plot")].every((each) => each.querySelector("svg.main-svg"));
+      for (let i = 0; i < 300 && !(drawn() && (!video || video.readyState > 0)); i++) await pause();
+      for (let i = 0; i < 5; i++) await pause();
+      const cursor = document.querySelector(".cursor"), before = cursor && parseFloat(cursor.style.left);
+      slider.value = 12; slider.dispatchEvent(new Event("input")); await pause();
+      const said = {failures, drawn: drawn(), plots: document.querySelectorAll(".plot").length,
+        moved: cursor && parseFloat(cursor.style.left) - before, now: document.getElementById("now").textContent,
+        ready: video && video.readyState, duration: video && video.duration, time: video && video.currentTime,
+        too_wide: document.documentElement.scrollWidth > document.documentElement.clientWidth};
+      document.body.innerHTML = ""; document.body.textContent = "SAID" + JSON.stringify(said) + "SAID";
+    })();</script>"""
+    watched = page.with_name("watched.html")
+    source = read(page).replace("<head>", "<head>" + watch, 1)
+    watched.write_text("".join((source[: source.rindex("</body>")], tell, "</body></html>")), encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--window-size=1200,800"]
+    options += [f"--user-data-dir={page.parent / 'browser'}", "--enable-logging=stderr", "--v=0"]
+    options += ["--virtual-time-budget=20000", "--dump-dom"]
+    done = subprocess.run([str(BROWSER), *options, watched.as_uri()], capture_output=True, text=True, timeout=120)
+    said = json.loads(html.unescape(done.stdout.split("SAID")[1]))
+    said["console"] = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "Error" in line]
+    return said
+
+
+@needs_browser
+@pytest.mark.slow
+def test_a_browser_shows_it(tmp_path: Path):
+    run = make_run(tmp_path / "run", make_tracks(names=EVIL))
+    said = in_browser(write_report(run))
+    assert said["failures"] == said["console"] == []
+    assert said["drawn"]
+    assert said["plots"] == 4
+    assert said["ready"] > 0
+    assert said["duration"] == pytest.approx(2.0, abs=0.01)
+    assert said["now"] == "frame 12, 1.20 s"
+    assert said["time"] == pytest.approx(1.25, abs=0.01)
+    assert said["moved"] > 50
+    assert not said["too_wide"]
