@@ -30,8 +30,8 @@ FINE_PX, COARSE_PX = 4, 16
 """Strides of the maps."""
 CONTEXT_BLOCKS = (5, 8, 11)
 """Blocks of the vision transformer whose tokens are read."""
-CONTEXT_SHARE = 0.7
-"""Size of the picture that the vision transformer sees, in parts of the one that EfficientNet sees."""
+CONTEXT_SHARE = (7, 10)
+"""Size of the picture that the vision transformer sees, as a fraction of the one that EfficientNet sees."""
 _STEPS = (1, 2, 3)
 """Dilations where the branches are joined, so that a door's middle sees its edges."""
 _GROUPS = 8
@@ -135,7 +135,8 @@ class FinderNetwork(nn.Module):
     def context_of(self, rgb: Float[Tensor, "B 3 H W"]) -> Float[Tensor, "B E r c"]:
         """What the vision transformer sees in pictures, in rows and columns."""
         patch = self.config.encoder.patch_size
-        size = [max(1, round(CONTEXT_SHARE * side / patch)) * patch for side in rgb.shape[-2:]]
+        part, whole = CONTEXT_SHARE  # in whole numbers, because an exported graph cannot round a size
+        size = [max(1, (2 * part * side + whole * patch) // (2 * whole * patch)) * patch for side in rgb.shape[-2:]]
         small = F.interpolate(rgb, size, mode="bilinear", align_corners=False, antialias=True)
         return self.encoder.depths(small, CONTEXT_BLOCKS)
 

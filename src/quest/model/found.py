@@ -19,7 +19,7 @@ from quest.types import LABELS
 LABELS_FOUND = (*LABELS, "hinge")
 """Labels of what is found; hinges are no queries."""
 
-_SIDE_PX = 32
+SIDE_PX = 32
 """Sides of what the network sees are multiples of this."""
 _LEAST = -4.0
 """Logit below which nothing is a candidate."""
@@ -28,7 +28,8 @@ _SAME_BOX = 0.5
 """Boxes that share so much of their union are one."""
 APART_PX = 12.0
 """Rims, fronts and hinges closer than this in what the network sees are one."""
-_GREY = 114
+GREY = 114
+"""Of what the network sees beside the picture."""
 
 
 @dataclass(frozen=True)
@@ -104,22 +105,30 @@ def find(
     """
     height, width = rgb.shape[:2]
     device = next(network.parameters()).device
-    scale = size_px / max(height, width)
-    inside = (max(1, round(height * scale)), max(1, round(width * scale)))
-    canvas = torch.from_numpy(_placed(rgb, inside)).to(device)
+    canvas, inside = placed(rgb, size_px)
     with torch.inference_mode():
-        maps = network(canvas.permute(2, 0, 1)[None] / 255)
+        maps = network(torch.from_numpy(canvas).to(device).permute(2, 0, 1)[None] / 255)
     found = read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
     return replace(found, logit=gain * found.logit + bias)
 
 
-def _placed(rgb: UInt8[np.ndarray, "H W 3"], inside: tuple[int, int]) -> UInt8[np.ndarray, "h w 3"]:
-    """A picture at another size, in the upper left corner of a grey one with sides in whole steps."""
-    rows, columns = inside
-    how = cv2.INTER_AREA if columns < rgb.shape[1] else cv2.INTER_LINEAR
-    canvas = np.full((-(-rows // _SIDE_PX) * _SIDE_PX, -(-columns // _SIDE_PX) * _SIDE_PX, 3), _GREY, np.uint8)
+def placed(rgb: UInt8[np.ndarray, "H W 3"], size_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
+    """A picture as the network sees it: in the upper left corner of a grey one with sides in whole steps.
+
+    Args:
+        rgb: the picture.
+        size_px: its longer side there.
+
+    Returns:
+        What the network sees, and how many of its rows and columns the picture takes.
+    """
+    height, width = rgb.shape[:2]
+    scale = size_px / max(height, width)
+    rows, columns = max(1, round(height * scale)), max(1, round(width * scale))
+    how = cv2.INTER_AREA if columns < width else cv2.INTER_LINEAR
+    canvas = np.full((-(-rows // SIDE_PX) * SIDE_PX, -(-columns // SIDE_PX) * SIDE_PX, 3), GREY, np.uint8)
     canvas[:rows, :columns] = cv2.resize(rgb, (columns, rows), interpolation=how)
-    return canvas
+    return canvas, (rows, columns)
 
 
 def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int, int]) -> Found:

@@ -20,6 +20,8 @@ from quest.errors import InputError
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import read_tensors
 
+PACKAGED = Path(str(resources.files("quest") / "assets" / "xfeat.safetensors"))
+"""File of the published weights."""
 LEAST_PX = 16
 """Shortest side of a picture, pixels."""
 _MULTIPLE = 32
@@ -52,16 +54,19 @@ class XFeat(nn.Module):
         Raises:
             WeightsError: the file is missing or torn.
         """
-        path = Path(str(resources.files("quest") / "assets" / "xfeat.safetensors"))
-        _, tensors = read_tensors(path)
+        _, tensors = read_tensors(PACKAGED)
         network = cls()
-        load_exactly(network, tensors, what=f"weights {path}")
+        load_exactly(network, tensors, what=f"weights {PACKAGED}")
         # On a processor, channels last take a seventh less time; bfloat16 takes ten times as long where it is emulated.
         network = network.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue] (documented)
         return network.eval().requires_grad_(False)
 
     def forward(self, image: Float[Tensor, "B 1 H W"]) -> tuple[Float[Tensor, "B 64 h w"], Float[Tensor, "B 1 h w"]]:
-        """Descriptors before their normalisation, and logits of reliability; sides are multiples of 32 pixels."""
+        """Descriptors of length 1, and the probability that a cell can be matched.
+
+        Args:
+            image: grey values from 0 to 1; sides are multiples of 32 pixels.
+        """
         image = F.instance_norm(image)
         quarter = self.block2(self.block1(image) + self.skip1(image))
         eighth = self.block3(quarter)
@@ -69,7 +74,7 @@ class XFeat(nn.Module):
         coarse = (sixteenth, self.block5(sixteenth))
         pyramid = [F.interpolate(level, size=eighth.shape[-2:], mode="bilinear") for level in coarse]
         fused = self.block_fusion(eighth + pyramid[0] + pyramid[1])
-        return fused, self.heatmap_head(fused)
+        return F.normalize(fused, dim=1), self.heatmap_head(fused).sigmoid()
 
     def features(self, grey: UInt8[Tensor, "H W"]) -> tuple[Float[Tensor, "64 h w"], Float[Tensor, "h w"]]:
         """Descriptors and reliability of a picture.
@@ -95,7 +100,7 @@ class XFeat(nn.Module):
         size = [max(side // _MULTIPLE, 1) * _MULTIPLE for side in grey.shape]
         image = F.interpolate(grey[None, None].float() / 255, size=size, mode="bilinear")
         descriptors, reliability = self(image)
-        return F.normalize(descriptors[0], dim=0), reliability[0, 0].sigmoid()
+        return descriptors[0], reliability[0, 0]
 
 
 def sample(

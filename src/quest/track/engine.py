@@ -1,0 +1,58 @@
+"""What runs the tracker's networks: PyTorch, or ONNX Runtime from a folder of exported networks."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from dataclasses import replace
+from pathlib import Path
+
+from huggingface_hub import cached_assets_path
+
+from quest.data.recording import read_recording
+from quest.data.sample import SAMPLES
+from quest.model.finder import FinderNetwork
+from quest.model.onnx_engine import file_sha256, read_exported
+from quest.model.onnx_export import FORMAT, MANIFEST, Difference, export_networks
+from quest.model.weights import LoadedNetwork
+from quest.model.xfeat import PACKAGED, XFeat
+from quest.track.settings import TrackerConfig
+
+_LOG = logging.getLogger(__name__)
+
+
+def networks(loaded: LoadedNetwork, engine: str | Path) -> tuple[FinderNetwork, XFeat]:
+    """The finder and the dense features, as an engine runs them.
+
+    Args:
+        loaded: the finder's weights.
+        engine: ``torch``; ``onnx``, which exports them once into a cache; or a folder of ``quest export``.
+
+    Raises:
+        WeightsError: the folder is torn, of another version, or of other weights.
+        MissingExtraError: the extra ``export`` is not installed.
+    """
+    if engine == "torch":
+        return loaded.network, XFeat.from_package()
+    return read_exported(_cached(loaded) if engine == "onnx" else Path(engine), loaded)
+
+
+def export(loaded: LoadedNetwork, out: Path) -> list[Difference]:
+    """:func:`quest.model.onnx_export.export_networks`, compared on the packaged clip; what it raises is raised."""
+    settings = TrackerConfig.from_json(loaded.settings).to_json()
+    return export_networks(replace(loaded, settings=settings), out, rgb=read_recording(SAMPLES[0]).rgb[0])
+
+
+def _cached(loaded: LoadedNetwork) -> Path:
+    """The folder of networks that were exported earlier, or now."""
+    made_of = f"{FORMAT} {loaded.sha256} {file_sha256(PACKAGED)}"
+    key = hashlib.sha256(made_of.encode()).hexdigest()
+    folder = cached_assets_path(library_name="quest", namespace="onnx", subfolder=key[:16])
+    if not (folder / MANIFEST).is_file():
+        _LOG.warning("exporting %s to ONNX once, which takes a minute or more; kept in %s", loaded.name, folder)
+        try:
+            export(loaded, folder)
+        except OSError:
+            if not (folder / MANIFEST).is_file():  # unless another process was faster
+                raise
+    return folder
