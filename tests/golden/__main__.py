@@ -104,6 +104,8 @@ class Record:
 
     only: tuple[str, ...] = ()
     """Names of clips; all of them by default."""
+    processor: str = ""
+    """Kind of processor, such as amd, whose answers are kept beside the others, because rounding leads it elsewhere."""
     figures: bool = False
     """Also write how good it is, which moves the bounds of the test."""
 
@@ -120,7 +122,8 @@ class Record:
                 rows[stride] = {name: asdict(row) for name, row in judge(tracks, truth, stride).items()}
                 sys.stdout.write(f"{golden.name} {stride} {json.dumps(rows[stride])}\n")
             golden.folder.mkdir(exist_ok=True)
-            np.savez_compressed(golden.folder / "answers.npz", **answers)
+            name = f"answers-{self.processor}.npz" if self.processor else "answers.npz"
+            np.savez_compressed(golden.folder / name, **answers)
             if self.figures:
                 (golden.folder / "figures.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
         return 0

@@ -93,7 +93,8 @@ def test_answers_are_as_good_as_they_were_and_the_same(clip: GoldenClip, stride:
     assert got.keys() == was.keys()
     kinds = dict(zip(got, truth.joint[truth.followed(tracks)].tolist(), strict=True))
     assert {name: found for name in got if (found := worse(got[name], was[name], kinds[name]))} == {}
-    assert differences(arrays_of(tracks), read_answers(clip, stride)) == []
+    apart = [differences(arrays_of(tracks), recorded) for recorded in read_answers(clip, stride)]
+    assert [] in apart, apart
 
 
 @pytest.mark.parametrize("clip", [clip for clip in CLIPS if clip.take is not None], ids=lambda clip: clip.name)
@@ -109,6 +110,6 @@ def test_a_tracker_that_becomes_worse_is_noticed():
     was = Figures(1.0, 5.0, 6.0, True, "revolute", 3.0)
     assert worse(was, was, "revolute") == []
     assert len(worse(Figures(2.0, 12.0, 30.0, False, "prismatic", None), was, "revolute")) == 5
-    answers = read_answers(CLIPS[0], CLIPS[0].strides[0])
+    answers = read_answers(CLIPS[0], CLIPS[0].strides[0])[0]
     assert differences(answers, answers) == []
     assert len(differences({**answers, "uv_px": answers["uv_px"] + 1}, answers)) == len(answers["name"])
