@@ -17,16 +17,14 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgro
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: demo test lint format types pytest fuzz soak lowest render-deps clean help
+.PHONY: demo test lint format types pytest fuzz soak lowest render-deps site dist clean help
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | lowest | render-deps | clean"
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | lowest | render-deps | site | dist | clean"
 
 demo: $(BASE)
-	$(BIN)/quest track sample --out $(DEMO_OUT)
-	$(BIN)/quest track sample-alarm --out $(DEMO_OUT)-alarm
-	@echo "Watch $(DEMO_OUT)/overlay.mp4 and $(DEMO_OUT)-alarm/overlay.mp4; tracks.parquet beside them has one row per frame and entity."
+	$(BIN)/quest demo --out $(DEMO_OUT)
 
 test: lint types pytest
 
@@ -70,6 +68,16 @@ lowest:
 	$(LOWEST)/bin/python -m pip install --quiet --no-deps --editable .
 	$(LOWEST)/bin/python -m pytest -n $(WORKERS) tests/data tests/filter tests/geometry tests/monitor tests/track tests/test_tracks.py
 
+# The documentation as a web site, in site/.
+site: $(ALL)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	@echo "open site/index.html; with search: $(BIN)/python -m http.server --directory site"
+
+# What a release is made of, in dist/, by the setuptools that is installed.
+dist: $(ALL)
+	rm -rf dist build
+	$(BIN)/python -c 'from setuptools.build_meta import build_sdist, build_wheel; build_sdist("dist"); build_wheel("dist")'
+
 render-deps: $(BASE)
 	@$(CHECK_RENDERER) 2>/dev/null || { \
 	  if ! command -v apt-get >/dev/null; then \
@@ -91,9 +99,9 @@ $(BASE): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(ALL): pyproject.toml constraints.txt $(BASE)
-	$(PIP) --no-compile --editable ".[sim,train,viz,ros,scale,text,dev]"
+	$(PIP) --no-compile --editable ".[sim,train,viz,live,ros,export,scale,text,docs,dev]"
 	@touch $@
 
 clean:
-	rm -rf build dist outputs .pytest_cache .ruff_cache .hypothesis src/*.egg-info
+	rm -rf build dist site outputs .pytest_cache .ruff_cache .hypothesis src/*.egg-info
 	find src tests -name __pycache__ -type d -exec rm -rf {} +

@@ -31,21 +31,22 @@ MEMBERS = {
     "Camera": "cx cy from_fov from_opencv fx fy height matrix width",
     "Clip": "cam_from_world camera depth_m frame from_arrays name notes rgb stamp_s",
     "Frame": "cam_from_world depth_m rgb stamp_s",
-    "Joints": "axis covariance describe kind origin q q_max_seen q_min_seen select unknown",
-    "Query": "frame intent kind label name point semantic slot text uv_px words",
+    "Joints": "axis axis_sigma_rad covariance describe kind origin origin_sigma_m q q_max_seen q_min_seen rest select "
+    "unknown",
+    "Query": "box frame intent kind label mask name point semantic slot text uv_px words",
     "State": "HELD LOST TRACKING",
-    "Stream": "add budget camera frame looking memory on_alarm rename retire step unbound",
-    "StreamState": "alarm confidence flags has_depth joint labels lost_log_odds lost_p names only point_world q "
-    "query stamp_s state uv_px visible",
+    "Stream": "add budget camera confirm frame looking memory on_alarm place rename retire step unbound",
+    "StreamState": "alarm cam_from_world confidence flags has_depth joint labels lost_log_odds lost_p names only "
+    "point_world q query stamp_s state uv_px visible",
     "Tracker": "calibrations config device features find name network noise restore save stream track weights_hash",
-    "Tracks": "alarm confidence describe frame_flags joints labels lost_p names point_world save select stamp_s state "
-    "to_pandas uv_px visible",
+    "Tracks": "alarm cam_from_world confidence describe frame_flags joints labels lost_p names point_world save "
+    "select stamp_s state to_pandas uv_px visible",
 }
 """Fields, methods and properties of the public classes."""
 
 COMMANDS = [
-    *("bench", "calibrate", "data", "doctor", "eval", "eval-monitor"),
-    *("find", "generate", "monitor", "objects", "track", "train", "weights"),
+    *("bench", "calibrate", "data", "demo", "doctor", "eval", "eval-monitor", "export"),
+    *("find", "generate", "live", "monitor", "objects", "pick", "report", "track", "train", "weights"),
 ]
 
 ERRORS = [

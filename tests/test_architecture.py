@@ -25,7 +25,8 @@ RANKS = {
     "paper": 4,
     "baselines": 5,
     **dict.fromkeys(["evaluation", "viz"], 6),
-    "cli": 7,
+    "live": 7,
+    "cli": 8,
 }
 """Rooms may import rooms of lower rank. Modules at the package's root, such as types and errors, have rank 0.
 

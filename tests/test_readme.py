@@ -28,6 +28,8 @@ NOT_RUN = {
     "owner/name": "asks the hub; tests/model/test_hub.py has one",
     "--rerun": "opens a window",
     "s3://": "asks an object store; tests/data/test_object_store.py has one",
+    "exported": "exports for minutes; tests/cli/test_export.py",
+    "--engine onnx": "the same",
     "Renderer()": "renders for a minute; tests/sim/test_generate.py",
 }
 """What stands in a command or a block that is not run, and why."""
@@ -84,6 +86,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     import quest
     from quest.data.lerobot_export import Episode, export_lerobot
     from quest.data.mcap_export import export_mcap
+    from quest.data.queries_file import write_queries
     from quest.data.recording import write_recording
     from quest.data.store import TakeStore
     from quest.model.weights import save_network
@@ -99,7 +102,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stamp_s=whole.stamp_s[rows],
         cam_from_world=whole.cam_from_world[rows],
     )
-    for name in ("sample", "path/to/recording"):
+    for name in ("sample", "path/to/recording", "left", "middle", "right"):
         write_recording(clip, folder / name)
     for name in ("drawer.mcap", "drive.mcap"):
         export_mcap(clip, folder / name)
@@ -108,11 +111,13 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for store in ("takes/try", "takes/mine"):
         take = make_take(frames=FRAMES, views=1, entities=2, name="44817-L1-s000000")
         TakeStore(folder / store).write(take)
+    TakeStore(folder / "STORE").write(make_take(frames=FRAMES, views=3, entities=2, name="NAME"))
     for run in ("runs/found", "runs/mine"):
         (folder / run).mkdir(parents=True)
         save_network(folder / run / "weights.safetensors", make_finder(), settings="{}", about="tiny")
     shutil.copy(folder / "sample" / "rgb.mp4", folder / "my.mp4")
     quest.load().track(clip, [quest.Query.semantic("handle")]).save(folder / "outputs" / "demo")
+    write_queries([quest.Query.point(1, 100, 80, name="picked")], folder / "queries.json")
     return folder
 
 

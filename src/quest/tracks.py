@@ -28,6 +28,8 @@ VERSION = 3
 JOINTS_VERSION = 1
 _SHOWN = 12
 _METADATA_KEY = b"quest-tracks"
+_POSES_KEY = b"quest-cam-from-world"
+"""Of the camera's poses: T x 4 x 4 little-endian doubles, row by row."""
 
 COLUMNS = {
     "frame": "int32",
@@ -101,6 +103,47 @@ class Joints:
             q=np.full((frames, queries), np.nan, np.float32),
             covariance=np.full((queries, 6, 6), np.nan, np.float32),
         )
+
+    @property
+    def axis_sigma_rad(self) -> Float[np.ndarray, " K"]:
+        """Standard deviation of each axis' direction about each of two perpendicular directions; NaN where none is."""
+        return np.sqrt(np.trace(self.covariance[:, :3, :3], axis1=1, axis2=2).clip(0) / 2)
+
+    @property
+    def origin_sigma_m(self) -> Float[np.ndarray, " K"]:
+        """Standard deviation of each origin along each direction in which a shift of it counts, metres."""
+        directions = np.where(np.array(self.kind, dtype=object) == "static", 3, 2)
+        return np.sqrt(np.trace(self.covariance[:, 3:, 3:], axis1=1, axis2=2).clip(0) / directions)
+
+    def rest(
+        self, point_world: Float[np.ndarray, "T K 3"], state: np.ndarray | None = None
+    ) -> Float[np.ndarray, "K 3"]:
+        """Where each entity is at q = 0, metres: the median of its points, each taken back by its q.
+
+        Args:
+            point_world: of the tracks that the joints explain.
+            state: theirs; points of lost ones are left out, but where there are no others.
+
+        Returns:
+            NaN where the joint is unknown.
+        """
+        from scipy.spatial.transform import Rotation
+
+        found = np.full((len(self), 3), np.nan)
+        for k, kind in enumerate(self.kind):
+            points, q = point_world[:, k].astype(np.float64), self.q[:, k].astype(np.float64)
+            known = np.isfinite(points).all(axis=-1) & (np.isfinite(q) | (kind == "static"))
+            sure = known if state is None else known & (state[:, k] != State.LOST)
+            which = sure if sure.any() else known
+            if kind == "unknown" or not which.any():
+                continue
+            points, q, axis, origin = points[which], q[which, None], self.axis[k], self.origin[k]
+            if kind == "prismatic":
+                points = points - q * axis
+            elif kind == "revolute":
+                points = origin + Rotation.from_rotvec(-q * axis).apply(points - origin)
+            found[k] = np.median(points, axis=0)
+        return found
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -178,6 +221,9 @@ class Tracks:
     """Whether an alarm is open; None likewise."""
     joints: Joints | None = None
     """What explains the tracks at the end; None of trackers that tell of none."""
+    cam_from_world: Float[np.ndarray, "T 4 4"] | None = None
+    """The camera's pose in the world of the points, as it was given or estimated; NaN in frames in which it was
+    unknown, None where it always was."""
 
     def __len__(self) -> int:
         return len(self.uv_px)
@@ -257,11 +303,24 @@ def write_joints(tracks: Tracks, path: str | Path) -> None:
     joints = tracks.joints
     if joints is None:
         raise InputError(f"joints {path}: these tracks have none; quest gives them")
+    rest = joints.rest(tracks.point_world, tracks.state)
     rows = [
-        {"query": k, "name": tracks.names[k], "label": tracks.labels[k], **row, "q": _plain(joints.q[:, k], digits=6)}
+        {"query": k, "name": tracks.names[k], "label": tracks.labels[k], **row}
+        | {
+            "rest_m": _plain(rest[k], digits=6),
+            "axis_sigma_rad": _plain(joints.axis_sigma_rad[k], digits=3),
+            "origin_sigma_m": _plain(joints.origin_sigma_m[k], digits=3),
+            "q": _plain(joints.q[:, k], digits=6),
+        }
         for k, row in enumerate(_joints_to_json(joints, digits=6))
     ]
-    whole = {"version": JOINTS_VERSION, "stamp_s": [float(stamp) for stamp in tracks.stamp_s], "joints": rows}
+    whole = {
+        "version": JOINTS_VERSION,
+        "frame": "world of the camera's poses; without poses the first camera: x right, y down, z forward",
+        "units": {"length": "m", "angle": "rad", "time": "s"},
+        "stamp_s": [float(stamp) for stamp in tracks.stamp_s],
+        "joints": rows,
+    }
     with whole_file(Path(path)) as partial:
         partial.write_text(json.dumps(whole, allow_nan=False) + "\n", encoding="utf-8")
 
@@ -305,6 +364,8 @@ def tracks_table(tracks: Tracks) -> pa.Table:
     }
     schema = pa.schema(list(COLUMNS.items()))
     arrays = [pa.array(columns[field.name], type=field.type, from_pandas=True) for field in schema]
+    poses = tracks.cam_from_world
+    extra = {} if poses is None else {_POSES_KEY: np.ascontiguousarray(poses, "<f8").tobytes()}
     metadata = {
         "version": VERSION,
         "names": tracks.names,
@@ -314,7 +375,8 @@ def tracks_table(tracks: Tracks) -> pa.Table:
         "watched": tracks.lost_p is not None,
         "joints": None if tracks.joints is None else _joints_to_json(tracks.joints),
     }
-    return pa.Table.from_arrays(arrays, schema=schema.with_metadata({_METADATA_KEY: json.dumps(metadata).encode()}))
+    kept = {_METADATA_KEY: json.dumps(metadata).encode(), **extra}
+    return pa.Table.from_arrays(arrays, schema=schema.with_metadata(kept))
 
 
 def read_tracks(path: str | Path) -> Tracks:
@@ -345,7 +407,11 @@ def read_tracks(path: str | Path) -> Tracks:
             "that wrote it"
         )
     with reading(f"tracks {path}", InputError, "track again"):
-        return _tracks_of(table.cast(pa.schema(list(COLUMNS.items()))), metadata)
+        tracks = _tracks_of(table.cast(pa.schema(list(COLUMNS.items()))), metadata)
+        poses = (table.schema.metadata or {}).get(_POSES_KEY)
+        if poses is None:
+            return tracks
+        return replace(tracks, cam_from_world=np.frombuffer(poses, "<f8").astype(np.float64).reshape(len(tracks), 4, 4))
 
 
 def _tracks_of(table: pa.Table, metadata: dict[str, Any]) -> Tracks:

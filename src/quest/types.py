@@ -283,7 +283,10 @@ def _camera(camera: Any, width: int, height: int, fov_deg: float | int | None, w
 
 @dataclass(frozen=True)
 class Query:
-    """What the user asks to follow. Use :meth:`slot`, :meth:`semantic`, :meth:`text` or :meth:`point`."""
+    """What the user asks to follow.
+
+    Use :meth:`slot`, :meth:`semantic`, :meth:`text`, :meth:`point`, or :meth:`box` and :meth:`mask`, which make points.
+    """
 
     kind: Literal["slot", "semantic", "text", "point"]
     """``slot`` (discover anything), ``semantic`` (a label), ``text`` (words), ``point`` (a pixel in a frame)."""
@@ -343,6 +346,52 @@ class Query:
     def point(cls, frame: int, x: float, y: float, *, name: str = "", label: str | None = None) -> Query:
         """Follow the entity at pixel ``(x, y)`` of frame ``frame``."""
         return cls("point", name, label, frame, (x, y))
+
+    @classmethod
+    def box(
+        cls,
+        frame: int,
+        x_min: float,
+        y_min: float,
+        x_max: float,
+        y_max: float,
+        *,
+        name: str = "",
+        label: str | None = None,
+    ) -> Query:
+        """Follow what a box of a detector holds, in pixels of frame ``frame``: the entity at its centre.
+
+        Raises:
+            InputError: the box is not finite, or has no area.
+        """
+        corners = (x_min, y_min, x_max, y_max)
+        if not (np.isfinite(corners).all() and x_min < x_max and y_min < y_max):
+            raise InputError(f"query {name!r}: expected a box (x_min, y_min, x_max, y_max) with an area, got {corners}")
+        return cls.point(frame, (x_min + x_max) / 2, (y_min + y_max) / 2, name=name, label=label)
+
+    @classmethod
+    def mask(cls, frame: int, mask: Any, *, name: str = "", label: str | None = None) -> Query:
+        """Follow what a mask of a segmenter shows in frame ``frame``: the entity at its pixel nearest to its centroid.
+
+        Args:
+            frame: index of the frame.
+            mask: [H, W] of the frame's size, true or positive where the entity is; an array or a tensor.
+            name: what to call it.
+            label: one of :data:`LABELS`, if known.
+
+        Raises:
+            InputError: the mask is no picture, or is empty.
+        """
+        shown = _array(mask, f"query {name!r}: mask")
+        if shown.ndim != 2 or not (shown > 0).any():
+            raise InputError(
+                f"query {name!r}: expected a mask [H, W] with at least one pixel, got shape {list(shown.shape)} with "
+                f"{int((shown > 0).sum())}"
+            )
+        row_column = np.argwhere(shown > 0)
+        apart = np.linalg.norm(row_column - row_column.mean(axis=0), axis=1)
+        row, column = row_column[apart.argmin()].tolist()
+        return cls.point(frame, column + 0.5, row + 0.5, name=name, label=label)
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,11 @@ class Group:
 COMMANDS: dict[str, Entry | Group] = {
     "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
     "find": Entry("find", "Find", "Find what can be taken hold of in a picture."),
-    "monitor": Entry("monitor", "Monitor", "Watch a recording or a take live: states, joints and alarms."),
+    "report": Entry("report", "Report", "Write a page about a run of quest track: words, plots, video, settings."),
+    "pick": Entry("pick", "Pick", "Choose what to follow in a recording, on a local page."),
+    "live": Entry("live", "Live", "Follow a camera on a local page, and correct what is followed."),
+    "monitor": Entry("monitor", "Monitor", "Watch a recording or a camera in the terminal: states, joints, alarms."),
+    "demo": Entry("demo", "Demo", "Track the packaged clips, and say which video to open."),
     "doctor": Entry("doctor", "Doctor", "Check this machine: devices, renderer, weights, extras."),
     "weights": Group(
         "List, show, share and tune weights.",
@@ -101,6 +105,7 @@ COMMANDS: dict[str, Entry | Group] = {
             "show": Entry("objects", "ObjectsShow", "Draw objects with their entities."),
         },
     ),
+    "export": Entry("export", "Export", "Write the tracker's networks as ONNX."),
     "generate": Entry("generate", "Generate", "Render simulated takes with ground truth into a take store."),
     "train": Entry("train", "Train", "Train a network on takes."),
     "eval": Entry("evaluate", "Eval", "Score trackers."),

@@ -57,13 +57,14 @@ class Monitor(Source):
         length = source.length
         queries = self.queries(source)
         tracker = self.tracker()
+        budget = self.budget(tracker, source)
         stream = tracker.stream(
             source.camera,
             queries,
-            online=self.online,
-            wait=not self.realtime,
-            alpha=self.alpha,
-            alpha_frames=self.alpha_frames,
+            online=self.online or (source.live and queries is None),
+            wait=not (self.realtime or source.live),
+            alpha=budget.alpha,
+            alpha_frames=budget.frames,
         )
         frames = "" if length is None else f"{counted(length, 'frame')}, "
         console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
@@ -72,7 +73,7 @@ class Monitor(Source):
                 "[yellow]note:[/] no calibration of the monitor: no alarms, P(lost) is unknown, and exit code 0 says "
                 "nothing; `quest calibrate` makes one"
             )
-        self.say_shortfall(tracker, console, frames=length)
+        self.say_shortfall(tracker, console, budget, frames=length)
         view = LiveView(console, name=source.name, frames=length if source.exact else None, budget=stream.budget)
         state, last = None, -1
         try:

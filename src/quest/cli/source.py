@@ -16,7 +16,7 @@ from quest.wording import counted
 
 if TYPE_CHECKING:
     from quest.data.frame_source import FrameSource
-    from quest.monitor import Inputs
+    from quest.monitor import Budget, Inputs
     from quest.track import Tracker
     from quest.types import Clip, Query
 
@@ -27,7 +27,8 @@ class Source:
 
     clip: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="RECORDING")]
     """A video, a folder of images, a recording folder, an MCAP file, a ROS bag, a LeRobot v3 dataset, a take
-    (STORE/NAME.zarr), or the word sample or sample-alarm for a clip that ships."""
+    (STORE/NAME.zarr), a live camera (camera:0, camera:rtsp://ADDRESS, realsense) for quest live and quest monitor, or
+    the word sample or sample-alarm for a clip that ships."""
     weights: str = "quest-s16"
     """Name of shipped weights or a file."""
     monitor: Path | None = None
@@ -39,6 +40,8 @@ class Source:
     rim:open; give it again for more."""
     text: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
     """An entity in words, such as "the lever of the left door"; give it again for each entity."""
+    queries_file: Annotated[Path | None, tyro.conf.arg(name="queries", metavar="FILE")] = None
+    """File of queries, as `quest pick` saves it; those that are given otherwise are added."""
     online: bool = False
     """Without queries: discover entities in later frames too, not in the first one alone."""
     depth: Path | None = None
@@ -54,10 +57,13 @@ class Source:
     """Which parts of a take, a LeRobot dataset or a bag to read."""
     device: str = "auto"
     """cpu, cuda, mps or auto."""
+    engine: str = "torch"
+    """What runs the networks: torch; onnx, which is ONNX Runtime on the processor; or a folder of quest export."""
     alpha: float = 0.05
     """Share of streams without any loss that may raise an alarm."""
     alpha_frames: int | None = None
-    """--alpha is for every so many frames instead, such as 300, so that alarms come as readily late as early."""
+    """--alpha is for every so many frames instead, such as 300, so that alarms come as readily late as early; default:
+    for the whole recording, and of a live camera for every block of the calibration."""
 
     def open(self) -> FrameSource:
         """The recording or the view of a take, to be read frame by frame.
@@ -109,11 +115,17 @@ class Source:
         Raises:
             InputError: a point or label is not written as expected, or its frame is not in the clip.
         """
+        from quest.data.queries_file import read_queries
         from quest.errors import InputError
         from quest.types import Clip, Query
 
         length = len(clip) if isinstance(clip, Clip) else clip.length
-        queries = []
+        queries = [] if self.queries_file is None else read_queries(self.queries_file)
+        for query in queries:
+            if length is not None and query.frame >= length:
+                raise InputError(
+                    f"--queries {self.queries_file}: expected frames of the clip, 0 to {length - 1}, got {query.frame}"
+                )
         for text in self.point:
             parts = text.split(",", 3)
             try:
@@ -143,20 +155,32 @@ class Source:
         if self.alpha_frames is not None and self.alpha_frames < 1:
             raise ConfigError(f"--alpha-frames {self.alpha_frames}: expected at least 1 frame, such as 300")
 
+    def budget(self, tracker: Tracker, source: FrameSource | None = None) -> Budget:
+        """How often alarms may be false; a source without an end shares alpha among its parts alike."""
+        from quest.monitor import Budget
+
+        blocks = [calibration.block_frames for calibration in tracker.calibrations.values()]
+        endless = source is not None and source.live and blocks
+        return Budget(self.alpha, max(blocks) if endless and self.alpha_frames is None else self.alpha_frames)
+
     def say_shortfall(
-        self, tracker: Tracker, console: Console, *, frames: int | None, inputs: Inputs | None = None
+        self,
+        tracker: Tracker,
+        console: Console,
+        budget: Budget,
+        *,
+        frames: int | None,
+        inputs: Inputs | None = None,
     ) -> None:
         """Print which alarms there will never be, if the monitor's calibration is too small for some.
 
         Args:
             tracker: with its calibrations.
             console: to print on.
+            budget: of :meth:`budget`.
             frames: length of the recording, if it is known.
             inputs: what its frames bring, if that is known.
         """
-        from quest.monitor import Budget
-
-        budget = Budget(self.alpha, self.alpha_frames)
         for brings, calibration in tracker.calibrations.items():
             if inputs in (None, brings) and (why := calibration.shortfall(budget, frames=frames)):
                 console.print(f"[yellow]note:[/] monitor, {brings}: {why}; `quest calibrate`")
@@ -167,10 +191,11 @@ class Source:
         Raises:
             WeightsError: no such weights or calibrations, or a file is damaged.
             ConfigError: no such device.
+            MissingExtraError: ONNX Runtime is not installed.
         """
         from quest.track import load
 
-        return load(self.weights, device=self.device, monitor=self.monitor or True)
+        return load(self.weights, device=self.device, monitor=self.monitor or True, engine=self.engine)
 
 
 def _check_memory(source: FrameSource) -> None:

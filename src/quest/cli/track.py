@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+import shlex
 import tempfile
-from dataclasses import dataclass
+import time
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, get_type_hints
 
+import tyro
 from rich.markup import escape
 from rich.table import Table
 
@@ -17,17 +20,26 @@ from quest.cli.source import Source
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from quest.types import Clip, Tracks
+    from collections.abc import Callable, Iterator
+
+    from quest.track import Tracker
+    from quest.types import Clip, Query, Tracks
 
 
 @dataclass(frozen=True)
 class Track(Source):
     """Track a recording or a take; without queries the entities are discovered."""
 
+    also: tyro.conf.UseAppendAction[tuple[str, ...]] = ()
+    """Another camera that saw the same at the same time, whose tracks are fused with these: the path of its recording,
+    or, of a take, the number of a view; give it again for each camera. Queries are asked in the first one."""
     out: Path | None = None
-    """Folder for tracks.parquet, joints.json and overlay.mp4; default: outputs/NAME, for a take with the view."""
+    """Folder for tracks.parquet, joints.json, run.json and overlay.mp4; default: outputs/NAME, for a take with the
+    view."""
     overlay: bool = True
     """Write the video."""
+    urdf: Path | None = None
+    """Also write the joints as a URDF, which planners and simulators load."""
     rrd: Path | None = None
     """Also save a Rerun recording: frames, depth as points, tracks in the image and in space, joints."""
     rerun: bool = False
@@ -38,13 +50,14 @@ class Track(Source):
         self.check_alpha()
         console = Console(highlight=False, soft_wrap=True)
         console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
+        from quest.cli.several_views import read_others, write_overlays
         from quest.viz.narrate import narrate
-        from quest.viz.overlay import write_overlay
         from quest.viz.rerun_tracks import check_viewer, open_tracks, save_tracks
 
         if self.rrd is not None or self.rerun:
             check_viewer(on_screen=self.rerun)
         clip = self.read(console)
+        others = read_others(self, self.also, console)
         queries = self.queries(clip)
         console.print(f"loading weights {escape(self.weights)}")
         tracker = self.tracker()
@@ -52,14 +65,16 @@ class Track(Source):
         depth = "" if clip.depth_m is None else " with depth"
         size = f"{clip.camera.width} x {clip.camera.height}"
         console.print(f"tracking {counted(len(clip), 'frame')} of {size}{depth} on {tracker.device}")
+        began_s = time.monotonic()
         with counting(console, "tracking", len(clip)) as report:
-            tracks = tracker.track(
-                clip, queries, online=self.online, alpha=self.alpha, alpha_frames=self.alpha_frames, report=report
-            )
+            tracks, drawn = self._track(tracker, [clip, *others], queries, report)
+        took_s = time.monotonic() - began_s
         tracks.save(out)
+        self._record(out, clip, queries, tracker, took_s)
         console.print(_summary(clip, tracks))
         console.print("\n".join(map(escape, narrate(tracks))))
-        self.say_shortfall(tracker, console, frames=len(clip), inputs="colours" if clip.depth_m is None else "depth")
+        brings = "colours" if clip.depth_m is None else "depth"
+        self.say_shortfall(tracker, console, self.budget(tracker), frames=len(clip), inputs=brings)
         for flag in tracks.frame_flags[len(clip.notes) :]:  # those of the clip were said when it was read
             console.print(f"[yellow]note:[/] {escape(flag)}")
         console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")
@@ -67,14 +82,68 @@ class Track(Source):
             console.print(f"joints: {escape(str(out / 'joints.json'))}")
         if self.overlay:
             with console.status("drawing"):
-                write_overlay(clip, tracks, out / "overlay.mp4")
-            console.print(f"video:  {escape(str(out / 'overlay.mp4'))}")
+                videos = list(write_overlays(drawn, out))
+            console.print("\n".join(f"video:  {escape(str(path))}" for path in videos))
+        if self.urdf is not None:
+            self._write_urdf(tracks, self.urdf, console)
         if self.rrd is not None:
             save_tracks(clip, tracks, self.rrd)
             console.print(f"rerun:  {escape(str(self.rrd))}; open it with: rerun {escape(str(self.rrd))}")
         if self.rerun:
             open_tracks(clip, tracks)
         return 0
+
+    def _track(
+        self, tracker: Tracker, clips: list[Clip], queries: list[Query] | None, report: Callable[[int], object]
+    ) -> tuple[Tracks, list[tuple[Clip, Tracks]]]:
+        """The tracks, and the same as each clip sees them."""
+        from quest.track.views import track_views
+
+        budget = {"alpha": self.alpha, "alpha_frames": self.alpha_frames}
+        if len(clips) == 1:
+            tracks = tracker.track(clips[0], queries, online=self.online, **budget, report=report)
+            return tracks, [(clips[0], tracks)]
+        fused = track_views(tracker, clips, queries, online=self.online, **budget, report=report)
+        return fused.whole, [(clip, fused.seen_from(v, clip)) for v, clip in enumerate(clips)]
+
+    def _write_urdf(self, tracks: Tracks, path: Path, console: Console) -> None:
+        from quest.data.urdf_export import write_urdf
+
+        names = write_urdf(tracks, path)
+        console.print(f"urdf:   {escape(str(path))}")
+        if names.left_out:
+            left = ", ".join(names.left_out)
+            console.print(f"[yellow]note:[/] {escape(str(path))} lacks what has no known joint: {escape(left)}")
+
+    @property
+    def command(self) -> str:
+        """The command that does the same again, in a shell's words."""
+        return shlex.join(["quest", "track", *_words(self)])
+
+    def _record(self, out: Path, clip: Clip, queries: list[Query] | None, tracker: Tracker, took_s: float) -> None:
+        """Write how the run was made, for `quest report` and for whoever finds the folder."""
+        from datetime import datetime
+
+        from quest import __version__
+        from quest.viz.report import Recorded, RunRecord, write_run
+
+        depth, view = clip.depth_m is not None, self.parts.view
+        recording = Recorded(self.clip, view, clip.name, len(clip), clip.camera, depth, clip.notes)
+        run = RunRecord(
+            quest=__version__,
+            date=datetime.now().astimezone().isoformat(timespec="seconds"),
+            command=self.command,
+            recording=recording,
+            weights=self.weights,
+            weights_hash=tracker.weights_hash,
+            alpha=self.alpha,
+            alpha_frames=self.alpha_frames,
+            device=str(tracker.device),
+            queries=None if queries is None else tuple(queries),
+            overlay=self.overlay,
+            took_s=round(took_s, 3),
+        )
+        write_run(run, out)
 
     def _make_folder(self, clip: Clip) -> Path:
         """The folder to write to, which is tried before the work."""
@@ -95,6 +164,24 @@ class Track(Source):
         take = self.clip.rstrip("/\\")
         name = f"{Path(take).stem}-view{self.parts.view}" if take.endswith(".zarr") else clip.name
         return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
+
+
+def _words(settings: Any) -> Iterator[str]:
+    """The arguments that give a command's dataclass again: what has no default as it is, then what is not as usual."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    for field in fields(settings):
+        named = [about.name for about in getattr(hints[field.name], "__metadata__", ()) if getattr(about, "name", None)]
+        value, flag = getattr(settings, field.name), "--" + (*named, field.name)[0].replace("_", "-")
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if default is MISSING:
+            yield str(value)
+        elif is_dataclass(value):
+            yield from _words(value)
+        elif isinstance(value, bool):
+            yield from [] if value == default else [flag if value else flag.replace("--", "--no-", 1)]
+        elif value != default:
+            for each in map(str, value if isinstance(value, tuple) else (value,)):
+                yield from [f"{flag}={each}"] if each.startswith("-") else [flag, each]
 
 
 def _summary(clip: Clip, tracks: Tracks) -> Table:

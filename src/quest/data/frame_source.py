@@ -124,6 +124,8 @@ class FrameSource:
     """Degradations; complete when the last frame has come."""
     units: tuple[str, float] = ("the recording", 1.0)
     """Where the depth comes from and metres per unit of it, for the message about wrong units."""
+    live: bool = False
+    """Whether frames come at a camera's pace and without an end; those that come meanwhile are dropped."""
 
     @property
     def flags(self) -> tuple[str, ...]:
@@ -176,8 +178,10 @@ class FrameSource:
             report: called after every frame with the number of frames that are read.
 
         Raises:
-            RecordingError: as in reading frame by frame, or every pixel of the depth is missing.
+            RecordingError: as in reading frame by frame, every pixel of the depth is missing, or it is a live camera.
         """
+        if self.live:
+            raise RecordingError(f"recording {self.name}: a live camera has no end; use quest live or quest monitor")
         frames: list[Frame] = []
         for frame in self:
             frames.append(frame)

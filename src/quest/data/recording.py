@@ -42,7 +42,7 @@ __all__ = [
     "write_recording",
 ]
 
-_READERS = ("sample", "take_reader", "lerobot", "mcap_file", "rosbag", "folder")
+_READERS = ("live_camera", "realsense", "sample", "take_reader", "lerobot", "mcap_file", "rosbag", "folder")
 """Modules of this room with a ``READER``; the first that accepts a path reads it. A new reader is a line here."""
 
 
@@ -65,7 +65,8 @@ def open_recording(
     Args:
         path: a recording folder, one of another recorder, a folder of images, a video, a LeRobot v3 dataset, an MCAP
             file, a ROS bag (the folder of a ROS 2 bag, its ``.db3``, or a ROS 1 ``.bag``), a take (``STORE/NAME.zarr``,
-            also as a URL), or the word ``sample`` or ``sample-alarm`` for a packaged clip.
+            also as a URL), the word ``sample`` or ``sample-alarm`` for a packaged clip, or a live camera
+            (``camera:0``, ``camera:rtsp://…``, ``realsense``), which has no end.
         depth: folder of 16-bit depth images, one per frame, of folders and videos alone; by default ``depth`` in the
             recording folder (or beside a video), where there is one. Without it there are colours only.
         camera: camera file, or the intrinsics themselves; by default those that the recording has, such as

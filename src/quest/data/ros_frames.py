@@ -151,7 +151,7 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
             "--camera FILE"
         )
     else:
-        camera, lens = _camera_of(chosen.first[chosen.info], chosen.rgb, rgb_size, where)
+        camera, lens = camera_of(chosen.first[chosen.info], chosen.rgb, rgb_size, where)
     if (camera.height, camera.width) != rgb_size:
         raise RecordingError(
             f"{where}: {chosen.rgb} is {rgb_size[1]} x {rgb_size[0]} but its camera is for {camera.width} x "
@@ -173,7 +173,7 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
             f"{where}: no camera_info for {chosen.depth}; name its topic with --topic-depth-info, give depth_camera in "
             "--camera FILE, or omit the depth with --topic-depth none"
         )
-    depth_camera, depth_lens = _camera_of(chosen.first[chosen.depth_info], chosen.depth, depth_size, where)
+    depth_camera, depth_lens = camera_of(chosen.first[chosen.depth_info], chosen.depth, depth_size, where)
     colour_from_depth = transforms.lookup(rgb_frame, depth_frame, now_ns)
     if colour_from_depth is None:
         raise RecordingError(
@@ -202,7 +202,7 @@ def _is_rectified(topic: str) -> bool:
     return "rect" in base_of(topic).rpartition("/")[2]
 
 
-def _camera_of(info: Any, topic: str, size: tuple[int, ...], where: str) -> tuple[Camera, Distortion]:
+def camera_of(info: Any, topic: str, size: tuple[int, ...], where: str) -> tuple[Camera, Distortion]:
     """Intrinsics and lens of a CameraInfo; of the rectified camera where the topic says that its images are."""
     (k, d, p), rectified = _numbers(info), _is_rectified(topic)
     matrix = p.reshape(3, 4)[:, :3] if rectified and p.size == 12 and p[0] > 0 else k.reshape(3, 3)

@@ -98,6 +98,16 @@ class Queries:
         """These and others."""
         return Queries(**{name: np.concatenate([value, getattr(other, name)]) for name, value in vars(self).items()})
 
+    def there(self, row: int) -> Queries:
+        """The same, where one of them is where it is followed without doubt."""
+        at = np.arange(len(self)) == row
+        return replace(
+            self,
+            lost_log_odds=np.where(at, -SURE, self.lost_log_odds),
+            unseen_s=np.where(at, 0.0, self.unseen_s),
+            rival_log_odds=np.where(at, -SURE, self.rival_log_odds),
+        )
+
     @property
     def known(self) -> Bool[np.ndarray, " K"]:
         """Whether its place is."""

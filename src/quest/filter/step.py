@@ -106,6 +106,11 @@ def keep(state: FilterState, rows: Sequence[int]) -> FilterState:
     return replace(state, queries=state.queries.only(np.array(rows, dtype=np.int64)))
 
 
+def confirm(state: FilterState, row: int) -> FilterState:
+    """One query is where it is followed, as somebody says who knows."""
+    return replace(state, queries=state.queries.there(row))
+
+
 def carry(
     old: FilterState, new: FilterState, warp: Float[np.ndarray, "3 3"], uv_px: Float[np.ndarray, "N 2"]
 ) -> Float[np.ndarray, "N 2"]:

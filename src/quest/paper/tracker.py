@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from quest.errors import InputError
+from quest.errors import ConfigError, InputError
 from quest.geometry import invert, transform
 from quest.geometry.letterbox import Letterbox
 from quest.model.precision import fast_bfloat16
@@ -169,7 +169,11 @@ class _Choice:
 
 
 def load(
-    name: str | Path = "quest-s16", *, device: str = "auto", monitor: bool | str | Path = True
+    name: str | Path = "quest-s16",
+    *,
+    device: str = "auto",
+    monitor: bool | str | Path = True,
+    engine: str | Path = "torch",
 ) -> Tracker | PaperTracker:
     """The tracker of any weights: ours (see :func:`quest.track.load`), or the published one where they are its.
 
@@ -177,14 +181,17 @@ def load(
         name: as for :func:`quest.track.load`.
         device: as for :func:`quest.track.load`.
         monitor: as for :func:`quest.track.load`.
+        engine: as for :func:`quest.track.load`; PyTorch alone runs the published network.
 
     Raises:
         WeightsError: no such weights, or they cannot be read.
-        ConfigError: no such device.
+        ConfigError: no such device, or another engine for the published network.
     """
     path = find_weights(name)
     if not is_paper(path):
-        return load_tracker(name, device=device, monitor=monitor)
+        return load_tracker(name, device=device, monitor=monitor, engine=engine)
+    if engine != "torch":
+        raise ConfigError(f"engine {str(engine)!r}: PyTorch alone runs the published network; leave it out")
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
     return PaperTracker(read_paper(path).network, device=pick_device(device), weights_hash=sha256)
 

@@ -147,6 +147,18 @@ class StreamQueries:
             replace(w, query=replace(w.query, name=name)) if w.number == number else w for w in state.waiting
         ]
 
+    def row(self, number: int) -> int | None:
+        """Which of those that are followed a query is; None of one that waits."""
+        return next((i for i, f in enumerate(self.state.following) if f.number == number), None)
+
+    def begin(self, number: int) -> int:
+        """A query has found its entity, or has found it already; returns its row among those that are followed."""
+        for waiting in [w for w in self.state.waiting if w.number == number]:
+            self.state.following.append(self._bound(waiting))
+        row = self.row(number)
+        assert row is not None, "a query is followed or waits"
+        return row
+
     def retire(self, number: int) -> list[int]:
         """Follow a query no longer; returns the rows of the others among those that were followed."""
         state = self.state
@@ -183,9 +195,8 @@ class StreamQueries:
         looking = [w for w in state.waiting if w.until_s is not None and w.until_s > now_s]
         found, pixels = self._among(looking, at_px, see()) if looking or state.discover else ([], [])
         for waiting in [w for w in state.waiting if w.query.kind == "point" and w.frame <= frame]:
-            query = waiting.query
-            found.append(self._begin(waiting, query.name or f"point {waiting.number}", query.label, query.intent))
-            pixels.append(np.array(query.uv_px, np.float64))
+            found.append(self._bound(waiting))
+            pixels.append(np.array(waiting.query.uv_px, np.float64))
         state.following += found
         return np.array(pixels, np.float64).reshape(-1, 2)
 
@@ -216,6 +227,11 @@ class StreamQueries:
     def _next_number(self) -> int:
         self.state.numbered += 1
         return self.state.numbered - 1
+
+    def _bound(self, waiting: Waiting) -> Following:
+        """A query whose place is told, not found."""
+        query = waiting.query
+        return self._begin(waiting, query.name or f"point {waiting.number}", query.label, query.intent)
 
     def _begin(self, waiting: Waiting, name: str, label: str | None, intent: str | None) -> Following:
         self.state.waiting = [w for w in self.state.waiting if w is not waiting]

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float, Float32
 
 from quest.filter.joints import Joint
 from quest.monitor import Alarm
@@ -48,13 +48,17 @@ class StreamState:
     """The same as a calibrated probability; NaN where nothing is watched."""
     alarm: tuple[Alarm | None, ...]
     """The open alarm of each query, or None."""
+    cam_from_world: Float[np.ndarray, "4 4"] | None = None
+    """The camera's pose in the world of the points: the one that was given, or else estimated. None as long as neither
+    poses nor depth tell how the camera moves."""
     flags: tuple[str, ...] = ()
     """Degradations of this frame in words, such as missing depth; a late or duplicate frame repeats the answer
     before."""
 
     def only(self, rows: Sequence[int]) -> StreamState:
         """Some of the queries."""
-        each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in ("stamp_s", "has_depth", "flags")}
+        of_frame = ("stamp_s", "has_depth", "cam_from_world", "flags")
+        each = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in of_frame}
         return replace(
             self,
             **{

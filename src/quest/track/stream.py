@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from scipy.special import logit
 
+from quest.errors import InputError
 from quest.filter import step as filtering
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
@@ -184,6 +185,63 @@ class Stream:
         if self._monitor is not None and any(f.number == number for f in self._queries.state.following):
             self._monitor.rename(number, name)
 
+    def place(self, query: int | str, x: float | int, y: float | int) -> None:
+        """Say where the entity of a query is in the newest frame: it is followed from there, whatever was believed.
+
+        What it looks like there is what it is known by from now on. An open alarm ends, as the monitor's promise counts
+        it (:meth:`quest.monitor.Monitor.clear`). The other queries are not touched.
+
+        Args:
+            query: number or name.
+            x: pixel of the newest frame that showed anything.
+            y: likewise.
+
+        Raises:
+            InputError: no such query, the pixel lies outside the image, or no frame has come.
+        """
+        number, state, size = self._queries.find(query), self._memory.filter, (self.camera.width, self.camera.height)
+        at_px = np.array([[x, y]], np.float64)
+        if state is None:
+            raise InputError(f"query {query!r}: expected a frame first, which the pixel is of, got none")
+        if not in_image(at_px, size).all():
+            raise InputError(f"query {query!r}: expected a pixel within {size[0]} x {size[1]}, got ({x:.1f}, {y:.1f})")
+        row, count = self._queries.begin(number), len(state.queries)
+        others = [i for i in range(count) if i != row]
+        order = [*range(row), len(others), *range(row, len(others))]
+        self._memory.filter = filtering.keep(filtering.ask(filtering.keep(state, others), at_px, self._noise), order)
+        self._watch_new()
+        self._clear(number)
+
+    def confirm(self, query: int | str) -> None:
+        """Say that the newest answer to a query is right; an open alarm ends, as in :meth:`place`.
+
+        Where it is seen, what it looks like is taken anew; where it is occluded, it is believed to be there.
+
+        Raises:
+            InputError: no such query, or it has not found its entity.
+        """
+        number, memory = self._queries.find(query), self._memory
+        row = self._queries.row(number)
+        if row is None or memory.filter is None:
+            raise InputError(f"query {query!r}: expected one that has found its entity, got one that waits")
+        answer = filtering.read_off(memory.filter, self._noise)
+        if answer.visible[row]:
+            self.place(number, *answer.uv_px[row].tolist())
+        else:
+            memory.filter = filtering.confirm(memory.filter, row)
+            self._clear(number)
+
+    def _clear(self, number: int) -> None:
+        if self._monitor is not None:
+            self._monitor.clear(number)
+
+    def _watch_new(self) -> None:
+        """The monitor watches what is followed from now on."""
+        if self._monitor is not None:
+            for following in self._queries.state.following:
+                if following.number not in self._monitor.state.name:
+                    self._monitor.watch(following.number, following.name)
+
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
         """Call a function with every alarm at the end of the step that raises it; it may save the stream.
 
@@ -231,10 +289,7 @@ class Stream:
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
         if memory.finding is not None:
             memory.filter = self._find(memory.finding, memory.filter, rgb)
-        if self._monitor is not None:
-            for following in self._queries.state.following:
-                if following.number not in self._monitor.state.name:
-                    self._monitor.watch(following.number, following.name)
+        self._watch_new()
         memory.answer, raised = self._answer(memory.filter)
         for alarm in raised:
             for callback in self._callbacks:
@@ -328,9 +383,17 @@ class Stream:
             lost_log_odds=answer.lost_log_odds.astype(np.float32),
             lost_p=lost_p.astype(np.float32),
             alarm=alarms,
+            cam_from_world=self._camera_pose(state),
             flags=memory.flags,
         )
         return told, raised
+
+    def _camera_pose(self, state: FilterState) -> Float[np.ndarray, "4 4"] | None:
+        """``cam_from_world``; None where nothing tells how the camera moves."""
+        told = self._preprocessor.state
+        if not (told.posed or told.has_depth):
+            return None
+        return state.view.cam_from_world @ np.linalg.inv(self._memory.world_from_filter)
 
     def _watch(
         self, numbers: list[int], answer: Answer, state: FilterState

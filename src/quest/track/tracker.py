@@ -21,6 +21,7 @@ from quest.model.found import Found, find
 from quest.model.weights import load_network
 from quest.model.xfeat import XFeat
 from quest.monitor import Budget, Calibration, Inputs, read_calibrations
+from quest.track.engine import networks
 from quest.track.finding import Finding
 from quest.track.preprocess import NO_DEPTH_FLAG
 from quest.track.saving import load as restored
@@ -68,6 +69,7 @@ class Tracker:
         weights_hash: SHA-256 of the file that the network came from, for result files and saved streams.
         calibrations: of the monitor, by what frames bring; without any there are no alarms.
         noise: parameters of the filter.
+        features: dense features, by which the filter finds again what it follows; by default the packaged ones.
     """
 
     name = "quest"
@@ -81,6 +83,7 @@ class Tracker:
         weights_hash: str | None = None,
         calibrations: Mapping[Inputs, Calibration] | None = None,
         noise: Noise | None = None,
+        features: XFeat | None = None,
     ) -> None:
         self.network = network.to(device).eval()
         self.config = config
@@ -88,7 +91,7 @@ class Tracker:
         self.weights_hash = weights_hash
         self.calibrations: dict[Inputs, Calibration] = dict(calibrations or {})
         self.noise = Noise() if noise is None else noise
-        self.features = XFeat.from_package().to(device)
+        self.features = (XFeat.from_package() if features is None else features).to(device)
 
     def __repr__(self) -> str:
         weights = "unnamed weights" if self.weights_hash is None else f"weights {self.weights_hash[:8]}"
@@ -230,7 +233,13 @@ class Tracker:
         return Maker(self.weights_hash, self.config, self.noise, REVISION, monitor, camera)
 
 
-def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: bool | str | Path = True) -> Tracker:
+def load(
+    name: str | Path = DEFAULT_WEIGHTS,
+    *,
+    device: str = "auto",
+    monitor: bool | str | Path = True,
+    engine: str | Path = "torch",
+) -> Tracker:
     """A tracker from shipped weights, from a file, or from the Hugging Face hub.
 
     Args:
@@ -239,13 +248,19 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: b
         device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto``: CUDA if there is any, else the CPU.
         monitor: whether to read the packaged calibrations of the monitor, without which there are no alarms; or the
             file of others that ``quest calibrate`` made.
+        engine: what runs the networks: ``torch``; ``onnx``, which is ONNX Runtime on the processor; or the same from
+            the path of a folder that ``quest export`` wrote.
 
     Raises:
         WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or a
-            file is torn, foreign, or of another shape.
-        ConfigError: no such device.
+            file is torn, foreign, or of another shape; or the folder was exported from other weights.
+        ConfigError: no such device, or ONNX Runtime is to run elsewhere than on the processor.
+        MissingExtraError: ONNX Runtime is not installed.
     """
+    if engine != "torch" and device not in ("auto", "cpu"):
+        raise ConfigError(f"device {device!r}: ONNX Runtime runs on the processor; leave it out, or the engine")
     loaded = load_network(name)
+    network, features = networks(loaded, engine)
     calibrations = {} if monitor is False else read_calibrations(None if monitor is True else Path(monitor))
     for inputs, calibration in calibrations.items():
         if calibration.revision != REVISION:
@@ -254,11 +269,12 @@ def load(name: str | Path = DEFAULT_WEIGHTS, *, device: str = "auto", monitor: b
                 f"{REVISION}) and would promise nothing; run `quest calibrate`, or load without it"
             )
     return Tracker(
-        loaded.network,
+        network,
         TrackerConfig.from_json(loaded.settings),
-        device=pick_device(device),
+        device=pick_device(device if engine == "torch" else "cpu"),
         weights_hash=loaded.sha256,
         calibrations=calibrations,
+        features=features,
     )
 
 
@@ -315,6 +331,8 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
     )
     flags += [f"{what}: {count} of {t} frames" for what, count in told.items()]
     stamps = np.array([s.stamp_s for s in states])
+    nowhere = np.full((4, 4), np.nan)
+    poses = np.stack([nowhere if s.cam_from_world is None else s.cam_from_world for s in states])
     return Tracks(
         names=tuple(names),
         labels=tuple(labels),
@@ -328,6 +346,7 @@ def collect(states: Sequence[StreamState], queries: Sequence[Query] | None) -> T
         lost_p=lost_p,
         alarm=alarm,
         joints=_joints(dict(zip(last.query, last.joint, strict=True)), point),
+        cam_from_world=poses if np.isfinite(poses).any() else None,
     )
 
 

@@ -1,0 +1,146 @@
+"""Live sources: frames come at their own pace, and whoever is busy gets the newest one.
+
+A camera is ``camera:0`` (the system's first), ``camera:/dev/video2``, or the address of a stream: ``camera:rtsp://…``.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from quest.data.camera_file import CameraFile, read_setup
+from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
+from quest.errors import RecordingError
+from quest.types import GUESSED_CAMERA, Camera, Frame
+
+DROPPED = "frames dropped because the one before took too long"
+_PREFIX = "camera:"
+_PATIENCE_S = 5.0
+"""For how long a camera may send nothing."""
+
+
+def newest(frames: Callable[[], Iterator[Frame]], notes: Notes) -> Generator[Frame]:
+    """Frames of a thread that reads as fast as they come; those that nobody takes in time are dropped and counted.
+
+    Args:
+        frames: begins to read; called in the thread.
+        notes: where dropped frames are counted.
+
+    Raises:
+        Exception: whatever reading raises, after the frames before it.
+    """
+    ready, over = threading.Condition(), threading.Event()
+    slot: list[Frame] = []
+    failed: list[Exception] = []
+
+    def read() -> None:
+        try:
+            for number, frame in enumerate(frames()):
+                with ready:
+                    if slot:
+                        notes.count(DROPPED, number)
+                    slot[:] = [frame]
+                    ready.notify()
+                if over.is_set():
+                    return
+        except Exception as error:  # of the camera: raised where frames are asked for
+            failed.append(error)
+        finally:
+            over.set()
+            with ready:
+                ready.notify()
+
+    thread = threading.Thread(target=read, name="camera", daemon=True)
+    thread.start()
+    try:
+        while True:
+            with ready:
+                ready.wait_for(lambda: slot or over.is_set())
+                if not slot:
+                    break
+                frame = slot.pop()
+            yield frame
+        if failed:
+            raise failed[0]
+    finally:
+        over.set()
+        thread.join(_PATIENCE_S)
+
+
+def as_live(source: FrameSource) -> FrameSource:
+    """A recording played at its own pace, as a camera would send it; frames that come meanwhile are dropped."""
+    if source.live:
+        return source
+
+    def play() -> Iterator[Frame]:
+        begun_s = None
+        for frame in source:
+            begun_s = time.monotonic() - frame.stamp_s if begun_s is None else begun_s
+            time.sleep(max(0.0, begun_s + frame.stamp_s - time.monotonic()))
+            yield frame
+
+    return replace(source, frames=lambda: newest(play, source.notes), length=None, live=True)
+
+
+def _accepts(where: str) -> bool:
+    return where.startswith(_PREFIX)
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    device = where.removeprefix(_PREFIX)
+    with closing(_Grabber(device)) as grabber:
+        height, width = grabber.read().shape[:2]
+    notes = Notes()
+    if options.camera is None and options.fov_deg is None:
+        notes.say(GUESSED_CAMERA)
+    setup = read_setup(options.camera or Camera.from_fov(width, height, options.fov_deg))
+    camera = setup.camera
+    if (camera.width, camera.height) != (width, height):
+        raise RecordingError(
+            f"camera {device}: it sends {width} x {height} pixels, and the intrinsics are for {camera.width} x "
+            f"{camera.height}; give those of this size"
+        )
+    return FrameSource(where, camera, lambda: newest(lambda: _grab(device, setup), notes), notes=notes, live=True)
+
+
+class _Grabber:
+    """A camera that is open."""
+
+    def __init__(self, device: str) -> None:
+        self._device = device
+        said = cv2.utils.logging.getLogLevel()
+        cv2.utils.logging.setLogLevel(0)  # what cannot be opened is told below, in one line
+        self._capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
+        cv2.utils.logging.setLogLevel(said)
+        if not self._capture.isOpened():
+            raise RecordingError(
+                f"camera {device}: cannot be opened; check its number or address, that nothing else uses it, and that "
+                "this program may use cameras"
+            )
+
+    def read(self) -> np.ndarray:
+        """The next picture, sRGB."""
+        there, picture = self._capture.read()
+        if not there:
+            raise RecordingError(f"camera {self._device}: it sends no pictures any more; connect it again")
+        return np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+    def close(self) -> None:
+        self._capture.release()
+
+
+def _grab(device: str, setup: CameraFile) -> Iterator[Frame]:
+    begun_s = time.monotonic()
+    with closing(_Grabber(device)) as grabber:
+        while True:
+            rgb = setup.rig.rgb(grabber.read())
+            yield Frame(rgb, None, time.monotonic() - begun_s)
+
+
+READER = Reader("a live camera", "camera:0, or camera: and an address", _accepts, _open, ("camera", "fov_deg"))

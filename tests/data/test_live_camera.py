@@ -1,0 +1,196 @@
+"""Live sources: the newest frame counts, others are dropped and counted, and what fails is told."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from quest.data.camera_file import CameraFile, write_camera
+from quest.data.frame_source import Notes, source_of_clip
+from quest.data.live_camera import DROPPED, as_live, newest
+from quest.data.recording import open_recording
+from quest.errors import RecordingError
+from quest.types import GUESSED_CAMERA, Camera, Frame
+from tests.track.clips import make_clip
+
+
+def numbered(count: int) -> list[Frame]:
+    return [Frame(np.full((4, 6, 3), t % 256, np.uint8), None, float(t)) for t in range(count)]
+
+
+def test_whoever_is_busy_gets_the_newest():
+    turn, done, notes = threading.Semaphore(0), threading.Semaphore(0), Notes()
+
+    def camera() -> Iterator[Frame]:
+        for frame in numbered(6):
+            turn.acquire()
+            yield frame
+            done.release()
+
+    frames = newest(camera, notes)
+    turn.release()
+    assert next(frames).stamp_s == 0
+    for _ in range(4):
+        turn.release()
+    for _ in range(4):
+        done.acquire()
+    turn.release()
+    assert [frame.stamp_s for frame in frames][-1] == 5
+    assert any(words.startswith(DROPPED) for words in notes.words)
+
+
+def test_what_a_camera_raises_comes_after_its_frames():
+    def camera() -> Iterator[Frame]:
+        yield numbered(1)[0]
+        time.sleep(0.05)
+        raise RecordingError("unplugged")
+
+    frames = newest(camera, Notes())
+    assert next(frames).stamp_s == 0
+    with pytest.raises(RecordingError, match="unplugged"):
+        next(frames)
+
+
+def test_the_thread_ends_with_whoever_reads():
+    before = threading.active_count()
+    frames = newest(lambda: iter(numbered(1000)), Notes())
+    next(frames)
+    frames.close()
+    assert threading.active_count() == before
+
+
+def test_a_recording_plays_at_its_own_pace():
+    clip = make_clip(frames=4)
+    source = as_live(source_of_clip(clip))
+    assert (source.live, source.length, as_live(source)) == (True, None, source)
+    begun_s = time.monotonic()
+    stamps = [frame.stamp_s for frame in source]
+    assert stamps[-1] == clip.stamp_s[-1]
+    assert time.monotonic() - begun_s > stamps[-1] - stamps[0] - 0.01
+    with pytest.raises(RecordingError, match="has no end"):
+        source.clip()
+
+
+class FakeCapture:
+    """As OpenCV's: pictures of one colour, blue first; then none."""
+
+    def __init__(self, device: int | str) -> None:
+        self.left = {0: 3, "rtsp://there": 3}.get(device, 0)
+
+    def isOpened(self) -> bool:  # noqa: N802
+        return self.left > 0
+
+    def read(self) -> tuple[bool, np.ndarray | None]:
+        self.left -= 1
+        return (True, np.full((6, 8, 3), (255, 0, 0), np.uint8)) if self.left >= 0 else (False, None)
+
+    def release(self) -> None:
+        self.left = 0
+
+
+@pytest.fixture
+def _camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
+
+
+@pytest.mark.usefixtures("_camera")
+@pytest.mark.parametrize("name", ["camera:0", "camera:rtsp://there"])
+def test_a_webcam(name: str):
+    source = open_recording(name)
+    assert (source.live, source.camera.width, source.camera.height, source.flags) == (True, 8, 6, (GUESSED_CAMERA,))
+    frames = iter(source)
+    first = next(frames)
+    assert first.rgb[0, 0].tolist() == [0, 0, 255]
+    with pytest.raises(RecordingError, match="no pictures any more"):
+        list(frames)
+
+
+@pytest.mark.usefixtures("_camera")
+def test_intrinsics_of_a_webcam(tmp_path: Path):
+    assert open_recording("camera:0", fov_deg=90).camera == Camera.from_fov(8, 6, 90)
+    camera = Camera(9, 9, 4, 3, 8, 6)
+    write_camera(CameraFile(camera), tmp_path / "camera.json")
+    assert open_recording("camera:0", camera=tmp_path / "camera.json").camera == camera
+    with pytest.raises(RecordingError, match="8 x 6"):
+        open_recording("camera:0", camera=Camera(9, 9, 4, 3, 8, 8))
+    with pytest.raises(RecordingError, match="cannot be opened"):
+        open_recording("camera:7")
+    with pytest.raises(RecordingError, match="--depth-scale-m"):
+        open_recording("camera:0", depth_scale_m=0.001)
+
+
+class FakeFrame:
+    def __init__(self, data: np.ndarray) -> None:
+        self.data = data
+
+    def get_data(self) -> np.ndarray:
+        return self.data
+
+    def get_timestamp(self) -> float:
+        return 1500.0
+
+
+class FakePipeline:
+    """As librealsense's, as far as it is used; it sends two frames."""
+
+    running: ClassVar[set[int]] = set()
+
+    def __init__(self) -> None:
+        self.sent = 0
+
+    def start(self, config: Any) -> Any:
+        if config.serial not in (None, "123"):
+            raise RuntimeError("No device connected")
+        self.running.add(id(self))
+        lens = SimpleNamespace(fx=600.0, fy=601.0, ppx=320.0, ppy=240.0, width=640, height=480, coeffs=[0.0] * 5)
+        stream = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
+        sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
+        device = SimpleNamespace(first_depth_sensor=lambda: sensor)
+        return SimpleNamespace(get_stream=lambda kind: stream, get_device=lambda: device)
+
+    def wait_for_frames(self) -> Any:
+        self.sent += 1
+        if self.sent > 2:
+            raise RuntimeError("Frame didn't arrive within 5000")
+        colour, depth = np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 1250, np.uint16)
+        return SimpleNamespace(get_color_frame=lambda: FakeFrame(colour), get_depth_frame=lambda: FakeFrame(depth))
+
+    def stop(self) -> None:
+        self.running.discard(id(self))
+
+
+class FakeConfig:
+    serial: str | None = None
+
+    def enable_device(self, serial: str) -> None:
+        self.serial = serial
+
+    def enable_stream(self, *_: Any) -> None:
+        pass
+
+
+def test_a_realsense(monkeypatch: pytest.MonkeyPatch):
+    names = SimpleNamespace(color="color", depth="depth", rgb8="rgb8", z16="z16")
+    align = lambda kind: SimpleNamespace(process=lambda frames: frames)  # noqa: E731
+    fake = SimpleNamespace(pipeline=FakePipeline, config=FakeConfig, stream=names, format=names, align=align)
+    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    source = open_recording("realsense:123")
+    assert source.camera == Camera(600, 601, 320.5, 240.5, 640, 480)
+    frames = iter(source)
+    frame = next(frames)
+    assert frame.depth_m is not None
+    assert (float(frame.depth_m[0, 0]), frame.stamp_s) == (1.25, 1.5)
+    with pytest.raises(RecordingError, match="sends no frames any more"):
+        list(frames)
+    with pytest.raises(RecordingError, match="No device connected"):
+        open_recording("realsense:9")
+    assert not FakePipeline.running
