@@ -183,6 +183,14 @@ RESULTS = Page(
             OBJECTS + "joint = kind | when = moment | objects/answers = objects/answers | kind right % = %kind_right | "
             "axis error, degrees = axis_error_deg | 90 % within = axis_p90_deg",
         ),
+        Table(
+            "several_views.json",
+            "Several cameras",
+            "tracks = source | of = reading | objects/tracks = objects/tracks | median error = error_median | "
+            "median, cm = error_median_cm | right identity % = %right_identity | "
+            "wrong frames called lost % = %loss_said | right frames called lost % = %false_loss",
+            about="Simulated objects that nothing was trained on, three still cameras. Errors are in half diagonals.",
+        ),
         per_frame("monitor/test.json", "The monitor beside plainer rules, per frame"),
         alarms("monitor/test.json", "Alarms per stream, at equal false alarms"),
         per_frame("monitor/colours.json", "The same by colours alone, per frame"),

@@ -92,11 +92,12 @@ def browse(
 ) -> list[str]:
     """Open a page, go through a script, and give the errors of its console."""
     assert CHROMIUM is not None
-    with tempfile.TemporaryDirectory() as profile:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
         flags = [
             "--headless",
             "--no-sandbox",
             "--disable-gpu",
+            "--enable-unsafe-swiftshader",
             "--remote-debugging-port=0",
             f"--user-data-dir={profile}",
         ]

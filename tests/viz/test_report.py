@@ -5,8 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +19,7 @@ from quest.viz.palette import query_colour
 from quest.viz.report import Drift, Recorded, RunRecord, read_run, write_report, write_run
 from quest.viz.report.plots import coordinates, drift_plot, time_lines, world
 from quest.viz.report.thinning import MOST_BINS, Thinning
+from tests.browser import Page, browse, needs_browser
 
 pytest.importorskip("jinja2")
 graph_objects = pytest.importorskip("plotly.graph_objects")
@@ -31,8 +30,6 @@ EVIL = (
     "\"quotes' & <b>",
     "bell\x07\u202enul\x00",
 )
-BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
-needs_browser = pytest.mark.skipif(BROWSER is None, reason="no chromium and no google-chrome here")
 
 
 def make_tracks(*, frames: int = 20, names: tuple[str, ...] = ("door", "drawer", "side")) -> Tracks:
@@ -291,50 +288,22 @@ def test_a_long_run_makes_a_page_of_bounded_size(tmp_path: Path):
     assert "more alarms are not listed" in text
 
 
-def in_browser(page: Path) -> dict[str, Any]:
-    """What a headless browser makes of a page, after the slider went to frame 12."""
-    watch = (
-        "<script>window.failures = []; addEventListener('error', (e) => failures.push(String(e.message)), true);"
-        "addEventListener('securitypolicyviolation', (e) => failures.push(e.blockedURI));"
-        "window.alert = (x) => failures.push('alert ' + x);</script>"
-    )
-    tell = """<script>(async () => {
-      const video = document.getElementById("video"), slider = document.getElementById("seek");
-      const pause = () => new Promise((resolve) => setTimeout(resolve, 50));
-      const drawn = () => [...document.querySelectorAll(".plot")].every((each) => each.querySelector("svg.main-svg"));
-      for (let i = 0; i < 300 && !(drawn() && (!video || video.readyState > 0)); i++) await pause();
-      for (let i = 0; i < 5; i++) await pause();
-      const cursor = document.querySelector(".cursor"), before = cursor && parseFloat(cursor.style.left);
-      slider.value = 12; slider.dispatchEvent(new Event("input")); await pause();
-      const said = {failures, drawn: drawn(), plots: document.querySelectorAll(".plot").length,
-        moved: cursor && parseFloat(cursor.style.left) - before, now: document.getElementById("now").textContent,
-        ready: video && video.readyState, duration: video && video.duration, time: video && video.currentTime,
-        too_wide: document.documentElement.scrollWidth > document.documentElement.clientWidth};
-      document.body.innerHTML = ""; document.body.textContent = "SAID" + JSON.stringify(said) + "SAID";
-    })();</script>"""
-    watched = page.with_name("watched.html")
-    source = read(page).replace("<head>", "<head>" + watch, 1)
-    watched.write_text("".join((source[: source.rindex("</body>")], tell, "</body></html>")), encoding="utf-8")
-    options = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--window-size=1200,800"]
-    options += [f"--user-data-dir={page.parent / 'browser'}", "--enable-logging=stderr", "--v=0"]
-    options += ["--virtual-time-budget=20000", "--dump-dom"]
-    done = subprocess.run([str(BROWSER), *options, watched.as_uri()], capture_output=True, text=True, timeout=120)
-    said = json.loads(html.unescape(done.stdout.split("SAID")[1]))
-    said["console"] = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "Error" in line]
-    return said
-
-
 @needs_browser
 @pytest.mark.slow
 def test_a_browser_shows_it(tmp_path: Path):
+    async def script(page: Page) -> None:
+        await page.until("[...document.querySelectorAll('.plot')].every((each) => each.querySelector('svg.main-svg'))")
+        await page.until("document.getElementById('video').readyState > 0")
+        assert await page.run("document.querySelectorAll('.plot').length") == 4
+        assert await page.run("document.getElementById('video').duration") == pytest.approx(2.0, abs=0.01)
+        left = "parseFloat(document.querySelector('.cursor').style.left)"
+        before = await page.run(left)
+        await page.run("document.getElementById('seek').value = 12")
+        await page.run("document.getElementById('seek').dispatchEvent(new Event('input'))")
+        await page.until("Math.abs(document.getElementById('video').currentTime - 1.25) < 0.01")
+        assert await page.run("document.getElementById('now').textContent") == "frame 12, 1.20 s"
+        assert await page.run(left) - before > 50
+        assert await page.run("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+
     run = make_run(tmp_path / "run", make_tracks(names=EVIL))
-    said = in_browser(write_report(run))
-    assert said["failures"] == said["console"] == []
-    assert said["drawn"]
-    assert said["plots"] == 4
-    assert said["ready"] > 0
-    assert said["duration"] == pytest.approx(2.0, abs=0.01)
-    assert said["now"] == "frame 12, 1.20 s"
-    assert said["time"] == pytest.approx(1.25, abs=0.01)
-    assert said["moved"] > 50
-    assert not said["too_wide"]
+    assert browse(write_report(run).as_uri(), script) == []
