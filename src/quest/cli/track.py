@@ -187,7 +187,7 @@ def _words(settings: Any) -> Iterator[str]:
 def _summary(clip: Clip, tracks: Tracks) -> Table:
     import numpy as np
 
-    from quest.types import State
+    from quest.viz.report.summary import summarise
 
     table = Table(
         title=escape(
@@ -202,15 +202,8 @@ def _summary(clip: Clip, tracks: Tracks) -> Table:
     for column in ("entity", "label", "seen", "moved", "joint", "conf.", "at the end"):
         left = column in ("entity", "label", "joint")
         table.add_column(column, justify="left" if left else "right", no_wrap=column == "joint")
-    for k, (name, label) in enumerate(zip(tracks.names, tracks.labels, strict=True)):
+    for k, row in enumerate(summarise(tracks, [])):
         bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
-        if not bound.any():
-            table.add_row(escape(name), label or "", "", "", "", "", "not found")
-            continue
-        points = tracks.point_world[:, k]
-        points = points[np.isfinite(points).all(axis=-1) & (tracks.state[:, k] != State.LOST)]
-        moved = f"{np.linalg.norm(points - points[0], axis=-1).max():.3f} m" if len(points) else "unknown"
-        joint = "unknown" if tracks.joints is None else tracks.joints.describe(k)
-        seen, sure = tracks.visible[bound, k].mean(), tracks.confidence[bound, k].mean()
-        table.add_row(escape(name), label or "", f"{seen:.0%}", moved, joint, f"{sure:.2f}", str(tracks.state[-1, k]))
+        sure = f"{tracks.confidence[bound, k].mean():.2f}" if bound.any() else ""
+        table.add_row(escape(row.name), row.label, row.seen, row.moved, row.joint, sure, row.end)
     return table

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -19,6 +20,8 @@ from quest.types import LABELS, Clip, Query
 
 if TYPE_CHECKING:
     from aiohttp import web
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -153,7 +156,8 @@ class Picking:
             try:
                 for _ in session.run():
                     pass
-            except Exception as error:  # of the tracker or the disk: the page says so, and goes on
+            except Exception as error:  # of the program: the page says so and goes on, and the log has it whole
+                _LOG.exception("the preview failed")
                 words = str(error)
             self._feed.end(words)
 
