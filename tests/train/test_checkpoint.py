@@ -62,6 +62,17 @@ def test_the_encoder_is_left_out(tmp_path: Path):
     assert all((t == encoder[name]).all() for name, t in other.encoder.state_dict().items())
 
 
+def test_blocks_of_the_encoder_that_learn_are_kept(tmp_path: Path):
+    network, optimizer = trained()
+    block = network.encoder.blocks[-1].requires_grad_()
+    save_checkpoint(tmp_path / "last", network, optimizer, PROGRESS)
+    other = make_paper(seed=1)
+    other.encoder.blocks[-1].requires_grad_()
+    load_checkpoint(tmp_path / "last", other, None)
+    for name, tensor in block.state_dict().items():
+        assert torch.equal(other.encoder.blocks[-1].state_dict()[name], tensor), name
+
+
 def test_replacing_leaves_one_checkpoint(tmp_path: Path):
     saved(tmp_path / "last")
     save_checkpoint(tmp_path / "last", *trained(seed=1), replace(PROGRESS, step=8))
@@ -107,11 +118,6 @@ def test_a_checkpoint_that_cannot_be_written(tmp_path: Path, monkeypatch: pytest
         saved(tmp_path / "last")
 
 
-def test_a_missing_checkpoint(tmp_path: Path):
-    with pytest.raises(WeightsError, match="missing"):
-        load_checkpoint(tmp_path / "last", make_paper(), None)
-
-
 @pytest.mark.parametrize("text", ["[]", "{}", '{"progress": {}}', json.dumps({"progress": {"step": 1}, "groups": []})])
 def test_a_foreign_progress_file(tmp_path: Path, text: str):
     (saved(tmp_path / "last") / "progress.json").write_text(text)
@@ -126,18 +132,16 @@ def test_a_foreign_optimiser_state(tmp_path: Path):
         load_checkpoint(folder, *trained(seed=1))
 
 
-def test_another_network_is_refused(tmp_path: Path):
+def test_another_run_is_refused(tmp_path: Path):
     folder = saved(tmp_path / "last")
     with pytest.raises(WeightsError, match="do not fit"):
         load_checkpoint(folder, make_paper(width=64), None)
     check_same_run(PROGRESS, PAPER, "stage-1", "abc", folder)
     with pytest.raises(WeightsError, match="another network"):
         check_same_run(PROGRESS, replace(PAPER, slots=7), "stage-1", "abc", folder)
-
-
-def test_other_starting_weights_are_refused(tmp_path: Path):
-    """What a stage does not train is in its checkpoints too, and would replace that of the new weights."""
-    begun = replace(PROGRESS, begun="abc")
-    check_same_run(begun, PAPER, "stage-1", "abc", tmp_path)
+    begun = replace(PROGRESS, begun="abc")  # what a stage does not train would replace that of the new weights
+    check_same_run(begun, PAPER, "stage-1", "abc", folder)
     with pytest.raises(WeightsError, match="began with other weights"):
-        check_same_run(begun, PAPER, "stage-1", "def", tmp_path)
+        check_same_run(begun, PAPER, "stage-1", "def", folder)
+    with pytest.raises(WeightsError, match="missing"):
+        load_checkpoint(tmp_path / "none", make_paper(), None)

@@ -85,6 +85,7 @@ def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
     opening = torch.nn.functional.one_hot(truth["opening"].clamp(min=0), len(OPENINGS)).permute(0, 3, 1, 2).float()
     return FinderMaps(
         logit("place"), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
+        logit("longer")[:, 0], truth["longer_extent"], logit("longest")[:, 0], truth["longest_extent"],
         logit("panel"), truth["panel_extent"], 10 * opening,
     )  # fmt: skip
 
@@ -95,18 +96,21 @@ def test_what_is_not_labelled_costs_nothing() -> None:
     assert float(_focal(logit, nothing, nothing, torch.tensor([[True, False]]))) > 1
 
 
-def test_any_place_on_the_inner_half_of_a_long_bar_is_right_and_bars_count_as_much_as_knobs() -> None:
-    bar, knob = np.array([20.0, 96, 220, 112]), np.array([120.0, 200, 132, 212])
-    marks = replace(make_marks(), kind=np.zeros(2, int), box_px=np.stack((bar, knob)),
-                    point_px=np.array([[120.0, 104], [126, 206]]), knob=np.zeros(2, int), lift=np.zeros(2, int),
-                    opening=np.full(2, UNKNOWN))  # fmt: skip
+def test_any_place_on_the_inner_half_of_a_bar_is_right_on_the_level_of_its_length() -> None:
+    box = np.array(
+        [[20.0, 96, 220, 112], [120, 200, 132, 212], [140, 150, 180, 158]]
+    )  # a long bar, a knob, both levels
+    middle = (box[:, :2] + box[:, 2:]) / 2
+    marks = replace(make_marks(), kind=np.zeros(3, int), box_px=box, point_px=middle, knob=np.zeros(3, int),
+                    lift=np.zeros(3, int), opening=np.full(3, UNKNOWN))  # fmt: skip
     maps = targets(marks, 256)
-    row = maps["place"][0, 104 // 4]
-    assert (row[80 // 4 : 160 // 4] == 1).all()
-    assert row[4 // 4] < 0.3
-    share = maps["place_share"][0]
-    assert share[: 150 // 4].sum() == pytest.approx(1)
-    assert share[150 // 4 :].sum() == pytest.approx(1)
+    row = maps["longest"][0, 104 // 16]
+    assert (row[80 // 16 : 160 // 16] == 1).all()
+    assert row[0] < 0.3
+    for name, count in (("place", 2), ("longer", 1), ("longest", 1)):
+        assert maps[f"{name}_share"][0].sum() == pytest.approx(count)
+    assert maps["place"][0, 104 // 4].max() == 0  # half as long again is no excuse for a short handle
+    assert maps["longer"][0, 11:15].max() == 1  # nobody minds a bar a little longer
 
 
 def test_extents_of_the_same_box_cost_nothing_and_others_more() -> None:

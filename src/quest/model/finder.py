@@ -26,14 +26,16 @@ PANELS = ("cabinet", "door", "refrigerator")
 """What the coarse map finds: doors and drawer fronts of furniture, doors of rooms, doors of refrigerators."""
 OPENINGS = ("slides", "left", "right", "top", "bottom")
 """How a panel opens: it slides out, or turns about one of its edges."""
-FINE_PX, COARSE_PX = 4, 16
+FINE_PX, MIDDLE_PX, COARSE_PX = 4, 8, 16
 """Strides of the maps."""
 CONTEXT_BLOCKS = (5, 8, 11)
 """Blocks of the vision transformer whose tokens are read."""
 CONTEXT_SHARE = (7, 10)
 """Size of the picture that the vision transformer sees, as a fraction of the one that EfficientNet sees."""
 _STEPS = (1, 2, 3)
-"""Dilations where the branches are joined, so that a door's middle sees its edges."""
+"""Dilations where the branches are joined, so that a door's middle sees its edges ..."""
+_MIDDLE_STEPS = (1, 2, 4)
+"""... and between, so that a handle's middle sees its ends."""
 _GROUPS = 8
 _RARE = -4.6
 """Logit of a place before anything is learned: one in a hundred."""
@@ -61,6 +63,14 @@ class FinderMaps:
     """Logit that one takes hold of it to lift the whole thing."""
     extent: Float[Tensor, "B 4 h w"]
     """From a cell's centre to the left, upper, right and lower edges of the grip there, pixels."""
+    longer: Float[Tensor, "B m n"]
+    """Logit of longer grips at a stride of :data:`MIDDLE_PX`."""
+    longer_extent: Float[Tensor, "B 4 m n"]
+    """As ``extent``, of longer grips; negative where the cell's centre lies beside a thin one."""
+    longest: Float[Tensor, "B H W"]
+    """Logit of the longest grips at a stride of :data:`COARSE_PX`."""
+    longest_extent: Float[Tensor, "B 4 H W"]
+    """As ``longer_extent``."""
     panel: Float[Tensor, "B Q H W"]
     """Logits of :data:`PANELS` at a stride of :data:`COARSE_PX`."""
     panel_extent: Float[Tensor, "B 4 H W"]
@@ -103,6 +113,19 @@ class _Head(nn.Module):
         return self.score(x).float(), self.stride * self.extent(x).float().clamp(-3, 6).exp()
 
 
+class _LongHead(_Head):
+    """A map of one score, and extents by the place and size of the box."""
+
+    def __init__(self, width: int, *, stride: int) -> None:
+        super().__init__(width, 1, rare=1, stride=stride)
+
+    def forward(self, x: Float[Tensor, "B C H W"]) -> tuple[Float[Tensor, "B S H W"], Float[Tensor, "B 4 H W"]]:
+        x = self.mix(x)
+        shift, half = self.extent(x).float().chunk(2, dim=1)
+        half = half.clamp(-3, 6).exp()
+        return self.score(x).float(), self.stride * torch.cat((half - shift, half + shift), dim=1)
+
+
 class FinderNetwork(nn.Module):
     """Pictures to maps of what is found.
 
@@ -123,8 +146,10 @@ class FinderNetwork(nn.Module):
         self.deep = nn.ModuleList(_Mix(deep, deep, step=step) for step in _STEPS)
         self.down = nn.Conv2d(deep, width, 1)
         self.mix = nn.ModuleList(_Mix(width, width) for _ in range(2))
+        self.around = nn.ModuleList(_Mix(width, width, step=step) for step in _MIDDLE_STEPS)
         self.fine = _Head(width, len(PLACES) + 2, rare=len(PLACES), stride=FINE_PX)
         self.coarse = _Head(deep, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
+        self.longer, self.longest = _LongHead(width, stride=MIDDLE_PX), _LongHead(deep, stride=COARSE_PX)
         self.dropout = nn.Dropout2d(0.1)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on processors
 
@@ -154,9 +179,15 @@ class FinderNetwork(nn.Module):
         for mix in self.deep:
             deep = deep + mix(deep)
         middle = self.mix[0](middle + _onto(middle, self.down(deep)))
+        for mix in self.around:
+            middle = middle + mix(middle)
         fine = self.mix[1](fine + _onto(fine, middle))
         place, extent = self.fine(fine)
+        (longer, longer_extent), (longest, longest_extent) = self.longer(middle), self.longest(deep)
         panel, panel_extent = self.coarse(deep)
         places, knob, lift = place.split((len(PLACES), 1, 1), dim=1)
         panels, opening = panel.split((len(PANELS), len(OPENINGS)), dim=1)
-        return FinderMaps(places, knob[:, 0], lift[:, 0], extent, panels, panel_extent, opening)
+        return FinderMaps(
+            places, knob[:, 0], lift[:, 0], extent, longer[:, 0], longer_extent, longest[:, 0], longest_extent, panels,
+            panel_extent, opening,
+        )  # fmt: skip

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from scipy.special import expit
 from torch import Tensor
 
-from quest.model.finder import COARSE_PX, FINE_PX, PLACES, FinderMaps, FinderNetwork
+from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
 from quest.types import LABELS
 
 LABELS_FOUND = (*LABELS, "hinge")
@@ -142,9 +142,15 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
     two = np.tile(scale, 2)
     end = np.array(size, np.float64)
     panels = _panels(maps, two, np.tile(end, 2))
-    cell, place, logit = _highest(maps.place[0], around=1)
-    uv = (cell + _within(maps.place[0], place, cell)) * FINE_PX
-    column, row = cell.T
+    levels = (
+        _level(maps.place[0], maps.extent[0], FINE_PX),
+        _level(maps.longer, maps.longer_extent[0], MIDDLE_PX),
+        _level(maps.longest, maps.longest_extent[0], COARSE_PX),
+    )
+    uv, box, place, logit = (np.concatenate(parts) for parts in zip(*levels, strict=True))
+    order = np.argsort(-logit, kind="stable")
+    uv, box, place, logit = uv[order], box[order], place[order], logit[order]
+    column, row = np.minimum((uv / FINE_PX).astype(int), np.array(maps.knob.shape[:0:-1]) - 1).T
     knob, lift = (m[0].sigmoid().double().cpu().numpy()[row, column] for m in (maps.knob, maps.lift))
     label_p = np.zeros((len(logit), len(LABELS_FOUND)))
     for k, name in enumerate(PLACES):
@@ -155,10 +161,24 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
             )  # fmt: skip
         else:
             label_p[own, LABELS_FOUND.index(name)] = 1
-    box = np.where((place == PLACES.index("grip"))[:, None], _boxes(maps.extent[0], cell, FINE_PX), np.nan)
     keep = _apart(uv, box, place)
     uv, box = np.clip(uv[keep] / scale, 0, end), np.clip(box[keep] / two, 0, np.tile(end, 2))
     return Found(uv, logit[keep], label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
+
+
+def _level(
+    logits: Float[Tensor, "P h w"], extent: Float[Tensor, "4 h w"], stride: int
+) -> tuple[Float[np.ndarray, "N 2"], Float[np.ndarray, "N 4"], Int[np.ndarray, " N"], Float[np.ndarray, " N"]]:
+    """Point, box (NaN of what is no grip), place and logit of the candidates of a level; its first place is a grip."""
+    cell, place, logit = _highest(logits, around=1)
+    uv = (cell + _within(logits, place, cell)) * stride
+    box = _boxes(extent, cell, stride)
+    grip = place == PLACES.index("grip")
+    # A bar may be thinner than a cell: its point lies on the inner half of its box.
+    quarter = (box[:, 2:] - box[:, :2]) / 4
+    uv = np.where(grip[:, None], np.clip(uv, box[:, :2] + quarter, box[:, 2:] - quarter), uv)
+    box[~grip] = np.nan
+    return uv, box, place, logit
 
 
 def _highest(

@@ -31,7 +31,7 @@ from quest.model.found import GREY, SIDE_PX, placed
 from quest.model.weights import LoadedNetwork
 from quest.model.xfeat import PACKAGED, XFeat
 
-FORMAT = "quest-onnx-1"
+FORMAT = "quest-onnx-2"
 """Changes when the graphs or the manifest do, so that none of before is taken for them."""
 MANIFEST = "manifest.json"
 OPSET = 18
@@ -108,7 +108,7 @@ class Difference:
     size: tuple[int, int]
     """Width and height of the picture that the network saw, pixels."""
     largest: float
-    """Over all elements: absolute, of extents relative to the extent."""
+    """Over all elements: absolute, of extents relative to the sides of the box."""
 
 
 _RGB = TensorInfo("rgb", (1, 3, "H", "W"), "float32", "1", "red, green, blue from 0 to 1")
@@ -120,6 +120,10 @@ _MAPS = (
     TensorInfo("knob", (1, *_FINE), "float32", "log odds", "a grip there is a knob, no handle"),
     TensorInfo("lift", (1, *_FINE), "float32", "log odds", "it is there to lift the whole thing"),
     TensorInfo("extent", (1, 4, *_FINE), "float32", "pixels of rgb", _EXTENT),
+    TensorInfo("longer", (1, *_EIGHTH), "float32", "log odds", "a longer grip"),
+    TensorInfo("longer_extent", (1, 4, *_EIGHTH), "float32", "pixels of rgb", _EXTENT),
+    TensorInfo("longest", (1, *_COARSE), "float32", "log odds", "a grip of the longest"),
+    TensorInfo("longest_extent", (1, 4, *_COARSE), "float32", "pixels of rgb", _EXTENT),
     TensorInfo("panel", (1, len(PANELS), *_COARSE), "float32", "log odds", ", ".join(PANELS)),
     TensorInfo("panel_extent", (1, 4, *_COARSE), "float32", "pixels of rgb", _EXTENT),
     TensorInfo("opening", (1, len(OPENINGS), *_COARSE), "float32", "logits of a softmax", ", ".join(OPENINGS)),
@@ -307,7 +311,8 @@ def _compare(
             with torch.inference_mode():
                 expected = network(seen)
             for info, ours, theirs in zip(outputs, expected, run(seen), strict=True):
-                difference = (ours - theirs).abs() / (ours if info.content == _EXTENT else 1)
+                sides = (ours[:, :2] + ours[:, 2:]).repeat(1, 2, 1, 1) if info.content == _EXTENT else 1
+                difference = (ours - theirs).abs() / sides
                 size = (seen.shape[-1], seen.shape[-2])
                 found.append(Difference(name, info.name, size, float(difference.max())))
     if wrong := [difference for difference in found if not difference.largest <= TOLERANCE]:

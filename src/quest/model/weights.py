@@ -19,7 +19,7 @@ from quest.model.finder import FinderConfig, FinderNetwork
 from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
 from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 
-FORMAT = "quest-finder-1"
+FORMAT = "quest-finder-2"
 
 DEFAULTS = {"quest-s16": "quest-s16-apache"}
 """Names that leave the licence open, and which of the weights that ship they stand for."""
@@ -58,12 +58,7 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
     _hub_mixin_config = {"format": FORMAT}  # noqa: RUF012
 
     def save(self, path: Path, *, beside: Path | None = None) -> None:
-        """Write everything to a file, atomically; use :func:`dataclasses.replace` to change something first.
-
-        Args:
-            path: file to write.
-            beside: as for :func:`save_network`.
-        """
+        """Write everything to a file, as :func:`save_network`; :func:`dataclasses.replace` changes something first."""
         save_network(
             path,
             self.network,
@@ -132,11 +127,7 @@ class LoadedNetwork(PyTorchModelHubMixin, library_name=LIBRARY, tags=list(TAGS),
             return super().push_to_hub(repo_id, **arguments)
 
     def generate_model_card(self, *, repo_id: str | None = None) -> ModelCard:
-        """The card: the text beside the file if there is one (the same name, ending in ``.md``), else what it holds.
-
-        Args:
-            repo_id: repository on the hub that the card is for.
-        """
+        """The card: the text beside the file if there is one (the same name, ending in ``.md``), else what it holds."""
         beside = self.path.with_suffix(".md")
         return model_card(
             self._hub_mixin_info.model_card_data.to_dict(),
@@ -246,11 +237,7 @@ def find_weights(name: str | Path) -> Path:
 
 
 def read_network(path: Path, *, name: str) -> LoadedNetwork:
-    """Read a network from a file.
-
-    Args:
-        path: the file.
-        name: what it was asked for by.
+    """Read a network from a file that was asked for by a name.
 
     Raises:
         WeightsError: the file is torn, foreign, or of another shape, or shares parts with one that is not there.
@@ -271,13 +258,5 @@ def read_network(path: Path, *, name: str) -> LoadedNetwork:
     network = read_into(lambda: FinderNetwork(config), state, what=f"weights {path}")
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
-    return LoadedNetwork(
-        name=name,
-        path=path,
-        network=network.eval(),
-        settings=metadata.get("settings", "{}"),
-        about=metadata.get("about", ""),
-        sha256=sha256,
-        licence=metadata.get("licence", ""),
-        version=metadata.get("version", ""),
-    )
+    settings, about, licence, version = (metadata.get(key, "") for key in ("settings", "about", "licence", "version"))
+    return LoadedNetwork(name, path, network.eval(), settings or "{}", about, sha256, licence, version)

@@ -54,14 +54,9 @@ def save_checkpoint(
     progress: Progress,
     generators: Mapping[str, UInt8[torch.Tensor, "R N"]] | None = None,
 ) -> None:
-    """Write or replace a checkpoint.
+    """Write or replace a checkpoint; what of the encoder does not learn is left out.
 
-    Args:
-        folder: where.
-        network: what is trained; its encoder is left out.
-        optimizer: its state is needed to go on.
-        progress: where the run stands.
-        generators: states of torch's generators, by the kind of device, one row per process.
+    States of torch's generators are by the kind of device, one row per process.
 
     Raises:
         WeightsError: it cannot be written; the one before stays.
@@ -69,7 +64,9 @@ def save_checkpoint(
     partial = folder.with_name(f".partial-{folder.name}")
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
-    save_tensors(_trained(network), partial / "weights.safetensors")
+    frozen = _frozen(network)
+    weights = {name: tensor.contiguous() for name, tensor in network.state_dict().items() if name not in frozen}
+    save_tensors(weights, partial / "weights.safetensors")
     state = optimizer.state_dict()
     tensors = {f"{i}.{key}": value.contiguous() for i, entry in state["state"].items() for key, value in entry.items()}
     tensors |= {f"{_GENERATOR}{kind}": rows.contiguous() for kind, rows in (generators or {}).items()}
@@ -99,7 +96,8 @@ def load_checkpoint(folder: Path, network: nn.Module, optimizer: torch.optim.Opt
         tensors = load_file(folder / "optimizer.safetensors")
     except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
         raise WeightsError(f"{asked}: checkpoint is missing or torn ({error}); remove it to start anew") from error
-    own = {name: tensor for name, tensor in network.state_dict().items() if name.startswith("encoder.")}
+    frozen = _frozen(network)
+    own = {name: tensor for name, tensor in network.state_dict().items() if name in frozen}
     load_exactly(network, {**own, **weights}, what=f"checkpoint {folder}")
     if optimizer is not None:
         state = {name: tensor for name, tensor in tensors.items() if not name.startswith(_GENERATOR)}
@@ -152,7 +150,6 @@ def check_same_run(progress: Progress, config: NetworkConfig, objective: str, be
         raise WeightsError(f"{folder}: this run began with other weights; use another --out, or the weights of then")
 
 
-def _trained(network: nn.Module) -> dict[str, torch.Tensor]:
-    """Everything but the frozen encoder, which has its own file."""
-    state = network.state_dict()
-    return {name: tensor.contiguous() for name, tensor in state.items() if not name.startswith("encoder.")}
+def _frozen(network: nn.Module) -> set[str]:
+    """Tensors of the encoder that do not learn: it has its own file."""
+    return {name for name, p in network.named_parameters() if name.startswith("encoder.") and not p.requires_grad}

@@ -27,7 +27,7 @@ class TrainingConfig:
     """Peak of the schedule (linear warm-up, then cosine to a twentieth)."""
     refined_rate: float = 0.1
     """Learning rate of what was trained before on much more than is learned from here, such as the blocks of the
-    vision transformer, as a share of that of all else."""
+    vision transformer, as a share of that of all else; 0 leaves it as it is."""
     weight_decay: float = 0.01
     """A step takes this times the learning rate off every weight, as a share of it."""
     warmup_steps: int = 100
@@ -69,10 +69,10 @@ class TrainingConfig:
         for name in counts:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: expected {name} to be at least 1, got {getattr(self, name)}")
-        for name in ("learning_rate", "refined_rate", "clip_norm"):
+        for name in ("learning_rate", "clip_norm"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ConfigError(f"training: expected {name} above 0, got {getattr(self, name)}")
-        for name in ("weight_decay", "warmup_steps", "readers", "seed"):
+        for name in ("refined_rate", "weight_decay", "warmup_steps", "readers", "seed"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"training: expected {name} to be at least 0, got {getattr(self, name)}")
         if self.seed >= _SEEDS:

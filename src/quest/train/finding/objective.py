@@ -25,7 +25,10 @@ from quest.train.finding.settings import VIEW_PX
 from quest.train.losses import changed, masked_mean
 from quest.train.pooling import pooled
 
-WEIGHTS = {"place": 1.0, "panel": 0.5, "extent": 1.0, "panel_extent": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1}
+WEIGHTS = {
+    "place": 1.0, "longer": 0.5, "longest": 0.5, "panel": 0.5, "extent": 1.0, "longer_extent": 0.5,
+    "longest_extent": 0.5, "panel_extent": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1,
+}  # fmt: skip
 """How much every loss counts."""
 _FIRST = ("detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
 """What stays as it was if the transformer does: edges and textures, which ImageNet has taught, and which cost most of a
@@ -89,11 +92,16 @@ class StageFind:
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
         """Every loss, unweighted."""
         maps = self.network(frames.rgb.float() / 255, context=frames.context)
-        places = len(PLACES)
+        places, grip = len(PLACES), PLACES.index("grip")
+        grips = truth.known[:, grip : grip + 1]
         return {
             "place": _focal(maps.place, truth.place, truth.place_share, truth.known[:, :places]),
+            "longer": _focal(maps.longer[:, None], truth.longer, truth.longer_share, grips),
+            "longest": _focal(maps.longest[:, None], truth.longest, truth.longest_share, grips),
             "panel": _focal(maps.panel, truth.panel, truth.panel_share, truth.known[:, places:]),
             "extent": _giou(maps.extent, truth.extent, truth.weight),
+            "longer_extent": _giou(maps.longer_extent, truth.longer_extent, truth.longer_share[:, 0]),
+            "longest_extent": _giou(maps.longest_extent, truth.longest_extent, truth.longest_share[:, 0]),
             "panel_extent": _giou(maps.panel_extent, truth.panel_extent, truth.panel_weight),
             "knob": _binary(maps.knob, truth.knob),
             "lift": _binary(maps.lift, truth.lift),
@@ -149,7 +157,7 @@ def _giou(
     """One minus the generalised intersection over union of boxes around the same cells."""
     (left, up, right, down), (left_t, up_t, right_t, down_t) = out.unbind(1), true.unbind(1)
     shared, hull = (
-        (pick(left, left_t) + pick(right, right_t)) * (pick(up, up_t) + pick(down, down_t))
+        (pick(left, left_t) + pick(right, right_t)).clamp(min=0) * (pick(up, up_t) + pick(down, down_t)).clamp(min=0)
         for pick in (torch.minimum, torch.maximum)
     )
     union = (left + right) * (up + down) + (left_t + right_t) * (up_t + down_t) - shared

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int, Int8, UInt8
 from torch import Tensor
 
 from quest.errors import ConfigError
-from quest.model.finder import COARSE_PX, FINE_PX, PANELS, PLACES
+from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, PANELS, PLACES
 from quest.train.finding.marks import UNKNOWN, Marks
 from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
 from quest.train.finding.views import View, draw_view, read_view, read_whole
@@ -27,6 +27,10 @@ _SPREAD = 4.0
 """... and of larger ones, as a part of their side."""
 _ON = 0.5
 """A cell is a right answer where its mark is at least this high: anywhere on the inner half of a long bar."""
+_LONG = {FINE_PX: (0.0, 40.0), MIDDLE_PX: (32.0, 112.0), COARSE_PX: (90.0, np.inf)}
+"""Longer sides of the grips that each level finds, pixels of the cut ..."""
+_UNSURE = 2.0
+"""... and up to which factor beyond them a level may find them as well."""
 _ZOOM = (0.67, 1.5)
 """How much larger than the view a cut shows it."""
 
@@ -53,6 +57,18 @@ class FinderTruth:
     """1 on a place, falling off around it."""
     place_share: Float[Tensor, "B P h w"]
     """What each cell counts of its place; the cells of one sum to 1."""
+    longer: Float[Tensor, "B 1 m n"]
+    """As ``place``, of longer grips."""
+    longer_share: Float[Tensor, "B 1 m n"]
+    """As ``place_share``, of longer grips."""
+    longer_extent: Float[Tensor, "B 4 m n"]
+    """Pixels to the edges of the longer grip that a cell belongs to."""
+    longest: Float[Tensor, "B 1 H W"]
+    """As ``longer``, of the longest."""
+    longest_share: Float[Tensor, "B 1 H W"]
+    """As ``longer_share``, of the longest."""
+    longest_extent: Float[Tensor, "B 4 H W"]
+    """As ``longer_extent``, of the longest."""
     panel: Float[Tensor, "B Q H W"]
     """As ``place``, of panels."""
     panel_share: Float[Tensor, "B Q H W"]
@@ -203,46 +219,86 @@ def _context(
     return F.grid_sample(seen[None], grid[None], padding_mode="border", align_corners=False)[0]
 
 
+class _Targets:
+    """What one level should answer.
+
+    Args:
+        kinds: how many kinds of marks it has.
+        size: side of the cut, pixels.
+        stride: of its cells, pixels.
+    """
+
+    def __init__(self, kinds: int, size: int, stride: int) -> None:
+        self.cells, self.stride = size // stride, stride
+        self.near, self.share = np.zeros((2, kinds, self.cells, self.cells), np.float32)
+        self.extent = np.ones((4, self.cells, self.cells), np.float32)
+        self.weight = np.zeros((self.cells, self.cells), np.float32)
+
+    def bump(self, box: Float[np.ndarray, "4"], point: Float[np.ndarray, "2"]) -> Float[np.ndarray, "h w"]:
+        """1 at a mark's point, falling off with its sides."""
+        middle = np.clip(np.round(point / self.stride - 0.5), 0, self.cells - 1)
+        spread = np.maximum((box[2:] - box[:2]) / self.stride / _SPREAD, _LEAST_CELLS)
+        step = np.arange(self.cells)
+        across, down = (np.exp(-np.square(step - middle[k]) / (2 * spread[k] ** 2)) for k in (0, 1))
+        return (down[:, None] * across).astype(np.float32)
+
+    def excuse(self, kind: int, bump: Float[np.ndarray, "h w"]) -> None:
+        """An answer near a mark is not wrong."""
+        self.near[kind] = np.maximum(self.near[kind], np.minimum(bump / _ON, 1))
+
+    def mark(self, kind: int, bump: Float[np.ndarray, "h w"]) -> None:
+        """An answer on a mark is right."""
+        self.excuse(kind, bump)
+        own = bump >= _ON
+        self.share[kind][own] = bump[own] / bump[own].sum()
+
+    def outline(self, kind: int, bump: Float[np.ndarray, "h w"], box: Float[np.ndarray, "4"], *, around: bool) -> None:
+        """The box of a mark; ``around`` if only cells whose centres it contains can answer."""
+        centre = (np.arange(self.cells) + 0.5) * self.stride
+        edges = np.stack(np.broadcast_arrays(centre - box[0], (centre - box[1])[:, None], box[2] - centre,
+                                             (box[3] - centre)[:, None]))  # fmt: skip
+        own = (bump >= _ON) & ((edges > 0).all(axis=0) | (not around))
+        self.extent[:, own], self.weight[own] = edges[:, own], self.share[kind][own]
+
+
 def targets(marks: Marks, size: int) -> dict[str, np.ndarray]:
     """The maps that a cut should give, by their names in :class:`FinderTruth`."""
-    fine, coarse = size // FINE_PX, size // COARSE_PX
-    place, place_share = np.zeros((2, len(PLACES), fine, fine), np.float32)
-    panel, panel_share = np.zeros((2, len(PANELS), coarse, coarse), np.float32)
-    extents = {FINE_PX: np.ones((4, fine, fine), np.float32), COARSE_PX: np.ones((4, coarse, coarse), np.float32)}
-    weights = {FINE_PX: np.zeros((fine, fine), np.float32), COARSE_PX: np.zeros((coarse, coarse), np.float32)}
-    knob, lift = (np.full((fine, fine), UNKNOWN, np.int8) for _ in range(2))
-    opening = np.full((coarse, coarse), UNKNOWN)
+    grip = PLACES.index("grip")
+    fine, panels = _Targets(len(PLACES), size, FINE_PX), _Targets(len(PANELS), size, COARSE_PX)
+    long = _Targets(1, size, MIDDLE_PX), _Targets(1, size, COARSE_PX)
+    knob, lift = (np.full((fine.cells, fine.cells), UNKNOWN, np.int8) for _ in range(2))
+    opening = np.full((panels.cells, panels.cells), UNKNOWN)
     # Larger panels first, so that of two that overlap the smaller one is learned.
     area = (marks.box_px[:, 2:] - marks.box_px[:, :2]).prod(axis=1)
     for i in np.argsort(-area, kind="stable"):
         kind, box = int(marks.kind[i]), marks.box_px[i].clip(0, size)  # as people draw what is cut off
-        on_panel = kind >= len(PLACES)
-        stride = COARSE_PX if on_panel else FINE_PX
-        maps, shares = (panel, panel_share) if on_panel else (place, place_share)
-        index, cells = kind - len(PLACES) if on_panel else kind, maps.shape[-1]
-        point = (box[:2] + box[2:]) / 2 if on_panel else marks.point_px[i]
-        middle = np.clip(np.round(point / stride - 0.5), 0, cells - 1)
-        spread = np.maximum((box[2:] - box[:2]) / stride / _SPREAD, _LEAST_CELLS)
-        step = np.arange(cells)
-        across, down = (np.exp(-np.square(step - middle[k]) / (2 * spread[k] ** 2)) for k in (0, 1))
-        bump = (down[:, None] * across).astype(np.float32)
-        own = bump >= _ON
-        maps[index] = np.maximum(maps[index], np.minimum(bump / _ON, 1))
-        shares[index][own] = bump[own] / bump[own].sum()
-        if on_panel:
-            opening[own] = marks.opening[i]
-        else:
-            lift[own] = marks.lift[i]
-        if on_panel or index == PLACES.index("grip"):
-            centre = (step + 0.5) * stride
-            edges = np.stack(np.broadcast_arrays(centre - box[0], (centre - box[1])[:, None], box[2] - centre,
-                                                 (box[3] - centre)[:, None]))  # fmt: skip
-            own = own & (edges > 0).all(axis=0)
-            extents[stride][:, own], weights[stride][own] = edges[:, own], shares[index][own]
-            if not on_panel:
-                knob[own] = marks.knob[i]
+        if kind >= len(PLACES):
+            bump = panels.bump(box, (box[:2] + box[2:]) / 2)
+            panels.mark(kind - len(PLACES), bump)
+            panels.outline(kind - len(PLACES), bump, box, around=True)
+            opening[bump >= _ON] = marks.opening[i]
+            continue
+        point = marks.point_px[i]
+        on = fine.bump(box, point) >= _ON
+        lift[on] = marks.lift[i]
+        if kind != grip:
+            fine.mark(kind, fine.bump(box, point))
+            continue
+        knob[on] = marks.knob[i]
+        side = float((box[2:] - box[:2]).max())
+        for level in (fine, *long):
+            least, most = _LONG[level.stride]
+            bump = level.bump(box, point)
+            if least < side <= most:
+                level.mark(0, bump)
+                level.outline(0, bump, box, around=level is fine)
+            elif least / _UNSURE < side <= most * _UNSURE:
+                level.excuse(0, bump)
+    maps = {"place": fine, "longer": long[0], "longest": long[1], "panel": panels}
     return {
-        "place": place, "place_share": place_share, "panel": panel, "panel_share": panel_share, "known": marks.known,
-        "extent": extents[FINE_PX], "weight": weights[FINE_PX], "panel_extent": extents[COARSE_PX],
-        "panel_weight": weights[COARSE_PX], "knob": knob, "lift": lift, "opening": opening,
+        **{name: level.near for name, level in maps.items()},
+        **{f"{name}_share": level.share for name, level in maps.items()},
+        "extent": fine.extent, "weight": fine.weight, "panel_extent": panels.extent, "panel_weight": panels.weight,
+        "longer_extent": long[0].extent, "longest_extent": long[1].extent,
+        "knob": knob, "lift": lift, "opening": opening, "known": marks.known,
     }  # fmt: skip
