@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,6 +28,16 @@ def cabinet(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
     from tests.sim.small_objects import write_cabinet
 
     return load_object(write_cabinet(Path(tmp_path_factory.mktemp("objects")) / "cabinet"))
+
+
+@pytest.fixture(scope="session")
+def chest(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
+    """Two drawers with handles."""
+    from quest.sim.objects import load_object
+    from tests.sim.small_objects import CARCASS, DRAWER, write_object
+
+    lower = replace(DRAWER, name="lower", origin=(0.02, 0, 0.25))
+    return load_object(write_object(Path(tmp_path_factory.mktemp("objects")) / "chest", CARCASS, DRAWER, lower))
 
 
 @pytest.fixture(scope="session")

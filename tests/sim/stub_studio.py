@@ -25,37 +25,23 @@ from tests.synthetic import make_take
 
 @dataclass(frozen=True)
 class StubStudio:
-    """Opens and is a studio.
+    """Opens and is a studio."""
 
-    Attributes:
-        frames: of every take.
-        size: of its images, pixels.
-        seconds: that a take takes at least.
-        impossible: names of takes that cannot be made.
-        deadly: names of takes that kill the process that makes them.
-        notes: folder for what tests want to know: who made what, who was closed.
-        broken: whether no studio can be opened.
-    """
-
-    frames: int = 12
-    size: int = 32
     seconds: float = 0.0
+    """How long a take takes at least."""
     impossible: tuple[str, ...] = ()
+    """Names of takes that cannot be made."""
     deadly: tuple[str, ...] = ()
+    """Names of takes that kill the process that makes them."""
     notes: Path | None = None
+    """Folder for what tests want to know: who made what."""
     broken: bool = False
+    """Whether no studio can be opened."""
 
     def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> Self:
         if self.broken:
             raise RendererError("no device can render")
         return self
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        if self.notes is not None:
-            (self.notes / f"closed-{os.getpid()}").touch()
 
     def describe(self) -> dict[str, Any]:
         return {"renderer": "stub"}
@@ -68,8 +54,7 @@ class StubStudio:
             (self.notes / f"made-{spec.name}-{os.getpid()}").touch()
         if spec.name in self.deadly:
             os.kill(os.getpid(), signal.SIGKILL)
-        size = (self.size, self.size)
-        take = make_take(frames=self.frames, views=1, entities=2, size=size, seed=spec.seed, name=spec.name)
+        take = make_take(frames=12, views=1, entities=2, size=(32, 32), seed=spec.seed, name=spec.name)
         return replace(take, info=replace(take.info, provenance={"maker": os.getpid()})), ("wobbly",)
 
 

@@ -14,7 +14,7 @@ import trimesh
 from quest.data.split import split_of
 from quest.errors import ObjectError
 from quest.sim.articulation import apply
-from quest.sim.description import CORRECTIONS, read_description
+from quest.sim.description import read_description
 from quest.sim.objects import SimObject, find_objects, find_urdf, load_object
 from quest.types import Joint, TakeInfo
 from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Box, Link, write_cabinet, write_object
@@ -36,10 +36,6 @@ def entities(thing: SimObject) -> list[tuple[str, str]]:
     return [(e.name, e.label) for e in thing.entities if e.label != "hinge"]
 
 
-def extent(thing: SimObject) -> np.ndarray:
-    return np.ptp(thing.articulation.world_points(thing.articulation.rest), axis=0)
-
-
 def renamed(folder: Path, name: str) -> Path:
     """The folder's URDF under another name."""
     return (folder / "mobility.urdf").rename(folder / name)
@@ -51,7 +47,7 @@ def test_urdf_of_any_name_is_the_users_own_and_in_metres(tmp_path: Path) -> None
     by_folder, by_file = load_object(folder), load_object(urdf)
     assert by_folder.source == by_file.source == "own"
     assert (by_folder.object_id, by_file.object_id) == ("cabinet", "kitchen_unit")
-    assert extent(by_folder)[2] == pytest.approx(1.0)
+    assert by_folder.articulation.extent_m[2] == pytest.approx(1.0)
     assert by_folder.warnings == ()
     assert find_objects(tmp_path) == [folder]
 
@@ -93,18 +89,23 @@ def test_description_names_size_front_and_visuals(tmp_path: Path) -> None:
         )
     )
     assert (thing.source, thing.category) == ("own", "Sideboard")
-    assert extent(thing)[2] == pytest.approx(0.6)
-    assert extent(thing)[0] == pytest.approx(0.6 * 0.6)  # what looked along +y looks along +x
+    assert thing.articulation.extent_m[2] == pytest.approx(0.6)
+    assert thing.articulation.extent_m[0] == pytest.approx(0.6 * 0.6)  # what looked along +y looks along +x
     assert entities(thing) == [("drawer/handle", "handle"), ("door/rim", "rim")]  # the door keeps what it had
     assert thing.entities[0].parts
     assert load_object(described(tmp_path / "long", size_m=2.0)).scale == pytest.approx(2.0)
 
 
-def test_visuals_have_names_of_their_own_on_links_called_handle(tmp_path: Path) -> None:
+def test_descriptions_of_parts_on_a_link_called_handle_and_of_links_alone(tmp_path: Path) -> None:
     door = replace(DOOR, name="door_with_handle", boxes=(replace(DOOR.boxes[0], name="panel"), DOOR_GRIP))
-    folder = described(tmp_path / "mine", CARCASS, door, entities=[{"visual": "grip", "label": "handle"}])
-    (found,) = [e for e in load_object(folder).entities if e.label == "handle"]
-    assert len(found.parts) == 1
+    mount = Box("grip_b", (0.02, 0.02, 0.02), (0.24, 0.05, 0))
+    drawer = replace(NAMELESS, boxes=(*NAMELESS.boxes, mount))  # two boxes near each other are one handle
+    wanted = [{"visual": "grip*", "label": "handle"}]
+    thing = load_object(described(tmp_path / "a", CARCASS, drawer, door, entities=wanted))
+    assert [len(e.parts) for e in thing.entities if e.label == "handle"] == [2, 1]
+    wanted = [{"link": "drawer", "label": "front"}, {"link": "door", "label": "rim"}]
+    thing = load_object(described(tmp_path / "b", entities=wanted))
+    assert entities(thing) == [("drawer/front", "front"), ("door/rim", "rim")]
 
 
 def test_lid_tells_where_the_front_is(tmp_path: Path) -> None:
@@ -140,12 +141,6 @@ def test_entity_fixed_in_the_base_is_for_lifting(tmp_path: Path) -> None:
     assert labels == ["front", "rim", "rim", "hinge"]  # moving ones, then what is fixed, then hinges
     world = apply(thing.articulation.poses(thing.articulation.rest)[0], rim.point)
     assert world[2] == pytest.approx(0.99, abs=0.02)
-
-
-def test_link_alone_takes_the_rim_or_front_that_is_found(tmp_path: Path) -> None:
-    wanted = [{"link": "drawer", "label": "front"}, {"link": "door", "label": "rim"}]
-    thing = load_object(described(tmp_path / "mine", entities=wanted))
-    assert entities(thing) == [("drawer/front", "front"), ("door/rim", "rim")]
 
 
 @pytest.mark.parametrize(
@@ -207,11 +202,6 @@ def test_own_objects_are_in_no_part_of_the_split() -> None:
         split_of(info)
 
 
-def test_corrections_name_labels_and_patterns() -> None:
-    for description in CORRECTIONS.values():
-        assert all(entry.visual and entry.label == "handle" for entry in description.entities)
-
-
 def test_example_in_the_documentation_is_a_valid_description(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "objects.md").read_text(encoding="utf-8")
     blocks = [block.split("```")[0] for block in text.split("```json\n")[1:]]
@@ -220,10 +210,3 @@ def test_example_in_the_documentation_is_a_valid_description(tmp_path: Path) -> 
         path = tmp_path / f"{number}.json"
         path.write_text(block)
         assert read_description(path).entities
-
-
-def test_extra_boxes_of_a_handle_are_one_entity(tmp_path: Path) -> None:
-    mount = Box("grip_b", (0.02, 0.02, 0.02), (0.24, 0.05, 0))
-    drawer = replace(NAMELESS, boxes=(*NAMELESS.boxes, mount))
-    thing = load_object(described(tmp_path / "a", CARCASS, drawer, entities=[{"visual": "grip_*", "label": "handle"}]))
-    assert [len(e.parts) for e in thing.entities] == [2]

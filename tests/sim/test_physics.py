@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ import trimesh
 
 from quest.errors import InputError
 from quest.sim.articulation import Part
-from quest.sim.motion import HOLD_FRAMES, MotionStyle, long_script, motion_script
+from quest.sim.motion import HOLD_FRAMES, MotionStyle, motion_script
 from quest.sim.objects import SimObject, load_object
 from quest.sim.physics import Heft, JointFeel, play_physically
 from quest.sim.procedural import make_object
@@ -56,16 +55,9 @@ def off(sim_object: SimObject, script: np.ndarray, played: np.ndarray) -> np.nda
     return np.abs(played - script) / travel
 
 
-@pytest.mark.parametrize("category", ["base_cabinet", "laptop", "french_refrigerator", "trunk", "microwave", "desk"])
-def test_procedural_objects_at_their_highest_level(category: str, tmp_path: Path) -> None:
-    thing = load_object(make_object(category, 3, tmp_path / category))
-    moved = thing.movable[:4]
-    script = motion_script(thing.articulation, moved, np.random.default_rng(1), style=MotionStyle("mixed", overlap=0.3))
-    played = play_physically(thing, script, np.random.default_rng(2), substeps=8)
-    assert_possible(thing, script, played)
-    distance = off(thing, script, played)[:, list(moved)]
-    assert 1e-4 < distance.mean() < 0.05
-    assert distance.max() < 0.25
+@pytest.mark.parametrize("category", ["base_cabinet", "laptop", "french_refrigerator", "microwave"])
+def test_procedural_objects_at_their_highest_level(category: str) -> None:
+    play_at_the_highest_level(make_object(category, 3))
 
 
 @pytest.mark.partnet
@@ -73,9 +65,12 @@ def test_procedural_objects_at_their_highest_level(category: str, tmp_path: Path
 def test_partnet_objects_at_their_highest_level(object_id: str) -> None:
     if not (PARTNET / object_id).is_dir():
         pytest.skip(f"no PartNet-Mobility object {object_id}")
-    thing = load_object(PARTNET / object_id)
+    play_at_the_highest_level(load_object(PARTNET / object_id))
+
+
+def play_at_the_highest_level(thing: SimObject) -> None:
     moved = thing.movable[:4]
-    script = motion_script(thing.articulation, moved, np.random.default_rng(1), style=MotionStyle("mixed"))
+    script = motion_script(thing.articulation, moved, np.random.default_rng(1), style=MotionStyle("mixed", overlap=0.3))
     played = play_physically(thing, script, np.random.default_rng(2), substeps=8)
     assert_possible(thing, script, played)
     distance = off(thing, script, played)[:, list(moved)]
@@ -123,20 +118,9 @@ def test_stops_stop(cabinet: SimObject) -> None:
     np.testing.assert_allclose(played[-1], upper, rtol=0.05)
 
 
-def test_many_frames(cabinet: SimObject) -> None:
-    script = long_script(cabinet.articulation, (0, 1), np.random.default_rng(0), frames=600)
-    played = play_physically(cabinet, script, np.random.default_rng(0), substeps=8)
-    assert_possible(cabinet, script, played)
-    assert off(cabinet, script, played).mean() < 0.05
-
-
-def test_nothing_to_play(cabinet: SimObject) -> None:
-    script = np.tile(cabinet.articulation.rest, (5, 1))
-    np.testing.assert_array_equal(play_physically(cabinet, script, np.random.default_rng(0)), script)
-
-
 def test_scripts_that_cannot_be_played(cabinet: SimObject) -> None:
     rest = np.zeros((20, 2))
+    np.testing.assert_array_equal(play_physically(cabinet, rest, np.random.default_rng(0)), rest)
     moving, outside, broken = rest.copy(), rest.copy(), rest.copy()
     moving[3:] = 0.1
     outside[10:, 0] = 5
@@ -155,15 +139,12 @@ def test_scripts_that_cannot_be_played(cabinet: SimObject) -> None:
         play_physically(cabinet, rest, rng, substeps=4)
 
 
-def test_what_a_board_weighs() -> None:
+def test_what_bodies_weigh() -> None:
     board = Heft.of([part((0.6, 0.4, 0.02), (1, 0, 0))], 650)
     assert board.mass_kg == pytest.approx(650 * 0.6 * 0.4 * 0.02)
     np.testing.assert_allclose(board.centre, [1, 0, 0], atol=1e-12)
     expected = board.mass_kg / 12 * np.array([0.4**2 + 0.02**2, 0.6**2 + 0.02**2, 0.6**2 + 0.4**2])
     np.testing.assert_allclose(board.inertia, np.diag(expected), rtol=1e-9)
-
-
-def test_two_halves_weigh_what_the_whole_weighs() -> None:
     whole = Heft.of([part((0.02, 0.4, 0.3))], 500)
     halves = Heft.of([part((0.02, 0.2, 0.3), (0, y, 0)) for y in (-0.1, 0.1)], 500)
     assert halves.mass_kg == pytest.approx(whole.mass_kg)
@@ -174,10 +155,3 @@ def test_what_is_thick_is_hollow_and_what_is_empty_weighs_a_gram() -> None:
     assert Heft.of([part((1, 1, 1))], 1000).mass_kg == pytest.approx(1000 * 6 / 2 * 0.02)
     assert Heft.of([], 1000).mass_kg == 1e-3
     assert (np.linalg.eigvalsh(Heft.of([], 1000).inertia) > 0).all()
-
-
-def test_categories_weigh_differently(cabinet: SimObject) -> None:
-    script = motion_script(cabinet.articulation, (1,), np.random.default_rng(0))
-    steel = replace(cabinet, category="Safe")
-    a, b = (play_physically(thing, script, np.random.default_rng(0)) for thing in (cabinet, steel))
-    np.testing.assert_allclose(a, b, atol=0.02)  # the drive is as firm as the link is heavy

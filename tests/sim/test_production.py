@@ -1,4 +1,4 @@
-"""A production in one process: events, resuming, failures, and kill -9 at twenty random moments."""
+"""A production in one process: events, resuming, failures, and kill -9 at random moments."""
 
 from __future__ import annotations
 
@@ -63,14 +63,7 @@ def test_takes_are_reported_in_order_when_they_are_there(store: TakeStore) -> No
     assert isinstance(skipped, TakeSkipped)
     assert (made.frames, made.warnings, made.node) == (12, ("wobbly",), "")
     assert "impossible" in skipped.reason
-    assert missing_takes(specs, store) == [specs[1]]
-
-
-def test_missing_takes_come_once() -> None:
-    store = TakeStore("memory://missing-takes")
-    specs = plan(3)
-    produce(specs[1:2], store, StubStudio(), report=lambda event: None)
-    assert missing_takes([*specs, *specs], store) == [specs[0], specs[2]]
+    assert missing_takes([*specs, *specs], store) == [specs[1]]  # once
 
 
 def test_takes_made_with_other_settings_do_not_count() -> None:
@@ -207,7 +200,7 @@ def test_killed_at_random_moments(place: str) -> None:
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["tests.sim.stub_studio"])
     store, specs, seen = TakeStore(place), plan(count), 0
-    kills = 20 if store.is_folder else 4  # seconds each where a server answers
+    kills = 8 if store.is_folder else 3  # seconds each where a server answers
     for _ in range(kills):
         running = processes.Process(target=produce_missing, args=(place, count, dict(os.environ)))
         running.start()

@@ -8,8 +8,10 @@ import pytest
 from quest.sim.annotate import project_points
 from quest.sim.articulation import apply
 from quest.sim.cameras import PosedCamera
+from quest.sim.generate import generate_take
 from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Picture, Renderer
+from quest.sim.settings import TakeSettings
 from quest.types import Camera
 from tests.sim.small_objects import write_cabinet
 
@@ -52,17 +54,11 @@ def test_depth_labels_and_pixels(renderer: Renderer, cabinet: SimObject) -> None
             assert (np.abs([x.max() + 1, y.max() + 1] - outer.max(axis=0)) <= 1).all()
 
 
-def test_nothing_is_zero(renderer: Renderer, cabinet: SimObject) -> None:
-    taken = picture(renderer, cabinet, (0, 0))
-    corner = (slice(0, 4), slice(0, 4))
-    assert not taken.depth_m[corner].any()
-    assert not taken.body[corner].any()
-    assert not taken.entity[corner].any()
-    assert taken.rgb.dtype == np.uint8
-
-
-def test_bodies_move(renderer: Renderer, cabinet: SimObject) -> None:
+def test_bodies_move_before_nothing(renderer: Renderer, cabinet: SimObject) -> None:
     closed, opened = picture(renderer, cabinet, (0, 0)), picture(renderer, cabinet, (0.2, 0))
+    assert closed.rgb.dtype == np.uint8
+    for corner in (closed.depth_m[:4, :4], closed.body[:4, :4], closed.entity[:4, :4]):
+        assert not corner.any()
     handle = closed.entity == 1
     assert np.median(closed.depth_m[handle]) - np.median(opened.depth_m[opened.entity == 1]) == pytest.approx(
         0.2, abs=1e-3
@@ -88,3 +84,13 @@ def test_mirrored_meshes_show_their_outside_in_their_own_colour(renderer: Render
     assert np.median(np.abs(mirrored.depth_m - plain.depth_m)[door]) < 1e-3
     reds = mirrored.rgb[door].astype(float).mean(axis=0)
     assert reds[0] > 2 * max(reds[1:])
+
+
+def test_shapes_without_meshes_take_materials_in_every_scene(renderer: Renderer) -> None:
+    settings = TakeSettings(views=1, size=64, every=8, broad_materials=True)
+    toolbox = load_object(Path(__file__).parents[2] / "examples" / "toolbox")
+    pictures = [
+        generate_take(toolbox, 1, seed, renderer=renderer, settings=settings).views[0].clip.rgb[0] for seed in range(4)
+    ]
+    assert len({picture.tobytes() for picture in pictures}) == 4
+    assert all(np.ptp(picture) > 50 for picture in pictures)

@@ -14,14 +14,9 @@ from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Renderer
 from quest.sim.settings import TakeSettings
 from quest.sim.stretch import draw_stretch, stretched
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Link, write_cabinet, write_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Link, write_object
 
 FACTORS = np.array([0.8, 1.5, 1.1])
-
-
-@pytest.fixture(scope="module")
-def cabinet(tmp_path_factory: pytest.TempPathFactory) -> SimObject:
-    return load_object(write_cabinet(tmp_path_factory.mktemp("objects") / "cabinet"))
 
 
 def test_closed_and_along_slides_everything_is_where_the_factors_put_it(cabinet: SimObject) -> None:
@@ -59,8 +54,7 @@ def test_entities_and_sizes_go_with_the_object(cabinet: SimObject) -> None:
         np.testing.assert_allclose(now, FACTORS * was, atol=1e-9)
         assert (new.name, new.parts) == (old.name, old.parts)
     assert after.entities[0].travel_m == pytest.approx(FACTORS[0] * cabinet.entities[0].travel_m)
-    extent = np.ptp(cabinet.articulation.world_points(cabinet.articulation.rest), axis=0)
-    assert after.half_diagonal_m == pytest.approx(np.linalg.norm(FACTORS * extent) / 2)
+    assert after.half_diagonal_m == pytest.approx(np.linalg.norm(FACTORS * cabinet.articulation.extent_m) / 2)
 
 
 def test_meshes_are_drawn_with_the_scale_that_their_surface_has(cabinet: SimObject) -> None:

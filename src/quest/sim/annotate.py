@@ -41,12 +41,7 @@ def visible_entities(
     The neighbours count because a rim lies on the very edge of its body, where the pixel that holds it may
     already show what is behind.
 
-    Args:
-        picture: what the camera sees.
-        uv_px: pixels of the entities.
-        depth_m: their depths along +z.
-        body: index of the body of each.
-        half_diagonal_m: length of a normalised unit.
+    ``depth_m`` are the entities' depths along +z, ``body`` the bodies that carry them.
     """
     height, width = picture.depth_m.shape
     visible = np.zeros(len(uv_px), dtype=bool)

@@ -1,31 +1,36 @@
 """How a scene looks, drawn at random and put into a SAPIEN scene: light, surroundings, distractors, materials.
 
-::
-
-    appearance = sample_appearance(rng, randomize_materials=True)
-    region = Region.around(swept_points)                # world points that the object reaches while it moves
-    add_lights(scene, appearance, region)
-    add_surroundings(scene, appearance, region)         # floor, wall, distractors
-    paint_object(appearance, render_bodies, procedural=True)
-
-or, in one call, :func:`apply_appearance`. The world is z up with the object's front towards +x. Nothing that is
-added can come between the object and a camera whose azimuth is at most :data:`CAMERA_AZIMUTH_DEG` off the front.
+The world is z up with the object's front towards +x. Nothing that is added can come between the object and a camera
+whose azimuth is at most :data:`CAMERA_AZIMUTH_DEG` off the front.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim import surfaces
 from quest.sim.cameras import CAMERA_AZIMUTH_DEG
 from quest.sim.entities import NAMED
-from quest.sim.surfaces import TILE_M, Colour, Surface, TextureKind, make_material, sample_surface, triple
+from quest.sim.surfaces import (
+    TILE_M,
+    Colour,
+    Surface,
+    Texture,
+    TextureKind,
+    ensure_uv,
+    make_material,
+    make_texture,
+    sample_glass_surface,
+    sample_handle_surface,
+    sample_surface,
+    triple,
+    wear,
+)
 
 _FLOORS: tuple[TextureKind, ...] = ("noise", "checker", "planks", "tiles", "speckle", "stripes")
 _WALLS: tuple[TextureKind, ...] = ("noise", "stripes", "tiles", "planks", "speckle")
@@ -38,7 +43,6 @@ class Light:
     """One light."""
 
     kind: Literal["directional", "point"]
-    """``directional`` or ``point``."""
     towards_light: tuple[float, float, float]
     """Unit vector from the object to the light, z up, front +x."""
     distance: float
@@ -52,7 +56,6 @@ class Distractor:
     """A thing that has nothing to do with the object."""
 
     kind: Literal["box", "sphere", "cylinder"]
-    """Its shape."""
     size: tuple[float, float, float]
     """Half extents in half diagonals of the region (sphere: the first; cylinder: the first two)."""
     side: int
@@ -62,9 +65,7 @@ class Distractor:
     behind: float
     """Gap to that line, in half diagonals."""
     turn_rad: float
-    """Turn about the vertical."""
     surface: Surface
-    """Its material."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +77,10 @@ class ObjectLook:
     surfaces: tuple[Surface, ...]
     """Materials that parts which are no handles choose from; the first one is the body's."""
     handle: Surface
-    """Material of handles and knobs."""
     per_link: bool
     """Whether every link chooses for itself rather than every kind of part."""
     seed: int
-    """Seed of who wears what."""
+    """Of who wears what."""
 
 
 @dataclass(frozen=True)
@@ -94,13 +94,11 @@ class Appearance:
     shadows: bool
     """Whether the first directional light casts shadows."""
     floor: Surface
-    """Material of the floor."""
     wall: Surface | None
-    """Material of the wall behind the object, or None for no wall."""
+    """Of the wall behind the object, or None for no wall."""
     wall_gap: float
     """Its distance behind the distractors, in half diagonals."""
     distractors: tuple[Distractor, ...]
-    """Things around."""
     look: ObjectLook | None
     """Materials of the object; None leaves every material as it came."""
 
@@ -133,11 +131,8 @@ class Region:
 def sample_appearance(rng: np.random.Generator, *, randomize_materials: bool, broad: bool = False) -> Appearance:
     """Draw how a scene looks.
 
-    Args:
-        rng: source of randomness.
-        randomize_materials: whether the object gets new materials: always if it is procedural, in four of ten
-            takes if it has its own (see :attr:`ObjectLook.repaint_original`).
-        broad: whether textures are drawn from all there are rather than from the usual ones.
+    With ``randomize_materials`` the object gets new ones: always if it is procedural, in four of ten takes if it has
+    its own (:attr:`ObjectLook.repaint_original`). ``broad`` draws from all textures rather than the usual ones.
     """
     look = _sample_look(rng, _MORE_FOR_OBJECTS if broad else ()) if randomize_materials else None
     level = float(rng.uniform(0.22, 0.5))
@@ -179,7 +174,7 @@ def _sample_look(rng: np.random.Generator, more: tuple[TextureKind, ...]) -> Obj
     return ObjectLook(
         repaint_original=bool(rng.random() < 0.4),
         surfaces=(main,) if alike else (main, *others),
-        handle=surfaces.sample_handle_surface(rng),
+        handle=sample_handle_surface(rng),
         per_link=bool(rng.random() < 0.15),
         seed=int(rng.integers(2**31)),
     )
@@ -200,36 +195,46 @@ def _sample_distractor(rng: np.random.Generator) -> Distractor:
     )
 
 
-_ROLE = re.compile(r"^(.*?)-?\d*$")
-_PANE = re.compile(r"(?:glass|window)(?:-|$)")
+_ODD_KINDS: tuple[TextureKind, ...] = ("checker", "stripes", "tiles", "speckle", "noise")
+
+
+def odd_appearance(appearance: Appearance, rng: np.random.Generator) -> Appearance:
+    """The same scene in materials that no room has: strong colours, coarse patterns, on everything, the object too."""
+    distractors = tuple(replace(d, surface=_odd(rng)) for d in appearance.distractors)
+    look = ObjectLook(True, tuple(_odd(rng) for _ in range(3)), _odd(rng), bool(rng.random() < 0.5), 0)
+    wall = None if appearance.wall is None else _odd(rng)
+    return replace(appearance, floor=_odd(rng), wall=wall, distractors=distractors, look=look)
+
+
+def _odd(rng: np.random.Generator) -> Surface:
+    first = triple(rng.uniform(0.0, 1.0, 3) ** 0.5)
+    second = triple(rng.uniform(0.0, 1.0, 3) ** 2)
+    kind = _ODD_KINDS[int(rng.integers(len(_ODD_KINDS)))]
+    texture = Texture(kind, first, second, int(rng.integers(1, 5)), int(rng.integers(2**31)))
+    return Surface(first, float(rng.uniform(0.2, 1.0)), 0.0, float(rng.uniform(0.0, 0.6)), texture)
 
 
 def apply_appearance(
     scene: Any, appearance: Appearance, region: Region, bodies: Sequence[Any], *, procedural: bool, wide: bool = False
 ) -> None:
-    """Lights, surroundings and materials in one call.
+    """Puts lights, floor, wall and distractors into a scene, and gives the object its materials.
 
     Args:
         scene: a ``sapien.Scene`` in which the object stands with its front towards +x.
         appearance: how it shall look.
-        region: what the object sweeps.
-        bodies: the object's ``RenderBodyComponent``s; see :func:`paint_object`.
+        region: what the object sweeps; the floor lies under it, all else keeps off it.
+        bodies: the object's ``RenderBodyComponent``s, always in the same order; their shapes have the names of the
+            URDF's visuals (``handle-3``, ``drawer_front-1``), which tell parts apart.
         procedural: whether the object came without materials worth keeping.
-        wide: see :func:`add_surroundings`.
+        wide: whether floor and wall reach far, for cameras that turn.
     """
-    add_lights(scene, appearance, region)
-    add_surroundings(scene, appearance, region, wide=wide)
-    paint_object(appearance, bodies, procedural=procedural)
+    _light(scene, appearance, region)
+    _surround(scene, appearance, region, wide)
+    if appearance.look is not None and (procedural or appearance.look.repaint_original):
+        _paint(appearance.look, bodies)
 
 
-def add_lights(scene: Any, appearance: Appearance, region: Region) -> None:
-    """Put the lights into a scene.
-
-    Args:
-        scene: a ``sapien.Scene``.
-        appearance: how it shall look.
-        region: what the object sweeps; point lights keep off it.
-    """
+def _light(scene: Any, appearance: Appearance, region: Region) -> None:
     scene.set_ambient_light(list(appearance.ambient))
     size = region.half_diagonal_m
     for index, light in enumerate(appearance.lights):
@@ -247,34 +252,21 @@ def add_lights(scene: Any, appearance: Appearance, region: Region) -> None:
             scene.add_point_light((region.centre + reach * towards).tolist(), power.tolist(), shadow=False)
 
 
-def add_surroundings(scene: Any, appearance: Appearance, region: Region, *, wide: bool = False) -> list[Any]:
-    """Put floor, wall and distractors into a scene.
-
-    Args:
-        scene: a ``sapien.Scene``.
-        appearance: how it shall look.
-        region: what the object sweeps; the floor lies under it, the wall and the distractors stand behind it.
-        wide: whether floor and wall reach far, for cameras that turn.
-
-    Returns:
-        The entities that were added.
-    """
+def _surround(scene: Any, appearance: Appearance, region: Region, wide: bool) -> None:
     size, ground = region.half_diagonal_m, float(region.low[2]) - 1e-3
-    added = []
     back = float(region.low[0])
     for distractor in appearance.distractors:
         centre, reach = distractor_place(distractor, region)
         back = min(back, float(centre[0]) - reach)
-        added.append(_add_distractor(scene, distractor, centre, size))
+        _add_distractor(scene, distractor, centre, size)
     extent = (80 if wide else 14) * size
     square = extent * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]], dtype=float)
     floor = square + region.centre[:2]
-    added.append(_add_quad(scene, np.column_stack([floor, np.full(4, ground)]), floor, appearance.floor))
+    _add_quad(scene, np.column_stack([floor, np.full(4, ground)]), floor, appearance.floor)
     if appearance.wall is not None:
         x = back - appearance.wall_gap * size
         wall = square + np.array([region.centre[1], ground + extent])
-        added.append(_add_quad(scene, np.column_stack([np.full(4, x), wall]), wall, appearance.wall))
-    return added
+        _add_quad(scene, np.column_stack([np.full(4, x), wall]), wall, appearance.wall)
 
 
 def distractor_place(distractor: Distractor, region: Region) -> tuple[Float[np.ndarray, "3"], float]:
@@ -302,7 +294,7 @@ def distractor_place(distractor: Distractor, region: Region) -> tuple[Float[np.n
     return np.array([place[0], place[1], region.low[2] + height]), reach
 
 
-def _add_distractor(scene: Any, distractor: Distractor, centre: Float[np.ndarray, "3"], size: float) -> Any:
+def _add_distractor(scene: Any, distractor: Distractor, centre: Float[np.ndarray, "3"], size: float) -> None:
     import sapien
 
     half = np.asarray(distractor.size, dtype=np.float32) * size
@@ -315,12 +307,12 @@ def _add_distractor(scene: Any, distractor: Distractor, centre: Float[np.ndarray
     else:
         shape = sapien.render.RenderShapeCylinder(float(half[0]), float(half[1]), material)
         turn = [0.5**0.5, 0.0, -(0.5**0.5), 0.0]  # SAPIEN's cylinders lie along x
-    return _add_shape(scene, shape, sapien.Pose(centre.tolist(), turn))
+    add_shape(scene, shape, sapien.Pose(centre.tolist(), turn))
 
 
 def _add_quad(
     scene: Any, corners: Float[np.ndarray, "4 3"], plane_m: Float[np.ndarray, "4 2"], surface: Surface
-) -> Any:
+) -> None:
     """A rectangle with its corners counter-clockwise as seen; textures repeat every :data:`TILE_M` metres."""
     import sapien
 
@@ -330,58 +322,45 @@ def _add_quad(
     shape = sapien.render.RenderShapeTriangleMesh(
         corners.astype(np.float32), faces, normals, (plane_m / TILE_M).astype(np.float32), make_material(surface)
     )
-    return _add_shape(scene, shape, sapien.Pose())
+    add_shape(scene, shape)
 
 
-def _add_shape(scene: Any, shape: Any, pose: Any) -> Any:
+def add_shape(scene: Any, shape: Any, pose: Any = None) -> Any:
+    """A SAPIEN entity of its own for a shape."""
     import sapien
 
     component = sapien.render.RenderBodyComponent()
     component.attach(shape)
     entity = sapien.Entity()
     entity.add_component(component)
-    entity.set_pose(pose)
     scene.add_entity(entity)
+    if pose is not None:
+        entity.set_pose(pose)
     return entity
 
 
-def paint_object(appearance: Appearance, bodies: Sequence[Any], *, procedural: bool) -> None:
-    """Give the object its materials.
-
-    Parts are told apart by the names of their shapes (``shape.name``), which should be the names of the URDF's visuals
-    (``handle-3``, ``drawer_front-1``); parts of one kind look alike unless the appearance says that links differ.
-    Does nothing if the appearance has no look, or if the object has materials of its own and keeps them.
-
-    Args:
-        appearance: how it shall look.
-        bodies: the object's ``RenderBodyComponent``s, always in the same order.
-        procedural: whether the object came without materials worth keeping.
-    """
-    look = appearance.look
-    if look is None or not (procedural or look.repaint_original):
-        return
-    textures = {surface: surfaces.make_texture(surface) for surface in {*look.surfaces, look.handle}}
+def _paint(look: ObjectLook, bodies: Sequence[Any]) -> None:
+    """Parts of one kind look alike unless the look says that links differ."""
+    textures = {surface: make_texture(surface) for surface in {*look.surfaces, look.handle}}
     for index, body in enumerate(bodies):
         for shape in body.render_shapes:
             surface = choose_surface(look, shape.name, index)
             for part in shape.parts:
                 if surface.texture is not None:
-                    surfaces.ensure_uv(part, np.asarray(getattr(shape, "scale", np.ones(3))))
-                surfaces.wear(part.material, surface, textures.get(surface))
+                    ensure_uv(part, np.asarray(getattr(shape, "scale", np.ones(3))))
+                wear(part.material, surface, textures.get(surface))
+
+
+_ROLE = re.compile(r"^(.*?)-?\d*$")
+_PANE = re.compile(r"(?:glass|window)(?:-|$)")
 
 
 def choose_surface(look: ObjectLook, name: str, link: int) -> Surface:
-    """The material of a part: handles have theirs, every other kind of part (or link) draws one from the look's.
-
-    Args:
-        look: materials to choose from.
-        name: name of the part's visual, such as ``drawer_front-3``.
-        link: index of the link.
-    """
+    """The material of a part by its name: handles have theirs, every other kind of part (or link) draws one."""
     if NAMED.search(name):
         return look.handle
     if _PANE.match(name):
-        return surfaces.sample_glass_surface(np.random.default_rng(look.seed))
+        return sample_glass_surface(np.random.default_rng(look.seed))
     match = _ROLE.match(name)
     role = match.group(1) if match else name
     key = f"link {link}" if look.per_link else role

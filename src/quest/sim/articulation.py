@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
+from quest.sim.urdf import MeshData
 from quest.types import Joint
 
 if TYPE_CHECKING:
@@ -32,13 +33,12 @@ class Part:
     visual: str
     """Name that the URDF gives the visual itself; empty if none."""
     body: int
-    """Index of the body that it belongs to."""
     body_from_part: Float[np.ndarray, "4 4"]
     """Pose in the body, metres."""
-    mesh: Path | None
-    """Mesh file, or None for a primitive."""
+    mesh: Path | MeshData | None
+    """Mesh file or mesh, or None for a primitive."""
     scale: tuple[float, float, float]
-    """Factors from the mesh file's units to metres, per axis."""
+    """Factors from the mesh's units to metres, per axis."""
     uv_scale: tuple[float, float, float]
     """The same before the object was stretched: for texture coordinates, which takes of one object share."""
     shape: str
@@ -56,7 +56,6 @@ class ArticulatedJoint:
     joint: Joint
     """Name, kind and limits (radians or metres)."""
     parent: int
-    """Index of the parent body."""
     parent_from_joint: Float[np.ndarray, "4 4"]
     """Pose of the joint frame in the parent body, metres."""
     axis: Float[np.ndarray, "3"]
@@ -74,16 +73,17 @@ class ArticulatedJoint:
         below, above = self.travel()
         return above if above >= below else -below
 
-    def motion(self, position: float) -> Float[np.ndarray, "4 4"]:
-        """Displacement of the joint's child at a position, in the joint frame."""
-        matrix = np.eye(4)
+    def motion(self, position: Float[np.ndarray, "*T"]) -> Float[np.ndarray, "*T 4 4"]:
+        """Displacement of the joint's child at some positions, in the joint frame."""
+        matrix = np.tile(np.eye(4), (*position.shape, 1, 1))
         if self.joint.kind == "prismatic":
-            matrix[:3, 3] = position * self.axis
+            matrix[..., :3, 3] = position[..., None] * self.axis
             return matrix
         # Rodrigues' formula.
         x, y, z = self.axis
         cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        matrix[:3, :3] += np.sin(position) * cross + (1 - np.cos(position)) * cross @ cross
+        sin, cos = np.sin(position)[..., None, None], np.cos(position)[..., None, None]
+        matrix[..., :3, :3] += sin * cross + (1 - cos) * cross @ cross
         return matrix
 
 
@@ -105,19 +105,22 @@ class Articulation:
         """Position of every joint when closed."""
         return np.array([j.rest for j in self.joints])
 
-    def poses(self, position: Float[np.ndarray, " J"]) -> Float[np.ndarray, "B 4 4"]:
+    def poses(self, position: Float[np.ndarray, "*T J"]) -> Float[np.ndarray, "*T B 4 4"]:
         """``world_from_body`` of every body at given joint positions."""
-        poses = np.empty((1 + len(self.joints), 4, 4))
-        poses[0] = self.world_from_root
+        poses = np.empty((*position.shape[:-1], 1 + len(self.joints), 4, 4))
+        poses[..., 0, :, :] = self.world_from_root
         for j, joint in enumerate(self.joints):
-            poses[1 + j] = poses[joint.parent] @ joint.parent_from_joint @ joint.motion(position[j])
+            parent = poses[..., joint.parent, :, :] @ joint.parent_from_joint
+            poses[..., 1 + j, :, :] = parent @ joint.motion(position[..., j])
         return poses
 
-    def axes(self, poses: Float[np.ndarray, "B 4 4"]) -> Float[np.ndarray, "J 6"]:
+    def axes(self, poses: Float[np.ndarray, "*T B 4 4"]) -> Float[np.ndarray, "*T J 6"]:
         """Origin and unit direction of every joint's axis in the world, given the bodies' poses."""
-        frames = [poses[j.parent] @ j.parent_from_joint for j in self.joints]
-        lines = [(*f[:3, 3], *(f[:3, :3] @ j.axis)) for f, j in zip(frames, self.joints, strict=True)]
-        return np.array(lines).reshape(-1, 6)
+        lines = np.empty((*poses.shape[:-3], len(self.joints), 6))
+        for j, joint in enumerate(self.joints):
+            frame = poses[..., joint.parent, :, :] @ joint.parent_from_joint
+            lines[..., j, :3], lines[..., j, 3:] = frame[..., :3, 3], frame[..., :3, :3] @ joint.axis
+        return lines
 
     def body_parts(self, body: int) -> list[int]:
         """Indices of the parts of a body."""
@@ -149,12 +152,15 @@ class Articulation:
         poses = self.poses(position)
         return np.concatenate([apply(pose, points) for pose, points in zip(poses, self.body_points, strict=True)])
 
+    @property
+    def extent_m(self) -> Float[np.ndarray, "3"]:
+        """Depth, width and height in the world at rest."""
+        return np.ptp(self.world_points(self.rest), axis=0)
+
     def travel_m(self, joint: int, point: Float[np.ndarray, "3"]) -> float:
         """How far a point of a joint's body gets from its place at rest when only that joint moves.
 
-        Args:
-            joint: index of the joint; -1 for the base, which never moves.
-            point: where it is in the body, metres.
+        The point is in the body's frame, metres; joint -1 stands for the base, which never moves.
         """
         if joint < 0:
             return 0.0

@@ -88,11 +88,6 @@ def fixations(targets: Float[np.ndarray, "N 2"], frames: int, rng: np.random.Gen
 
     The head rests on each for 0.3 to 2 s and goes to the next by a minimum-jerk movement of 15 to 60 degrees/s on
     average; both angles start and stop together. It starts at (0, 0).
-
-    Args:
-        targets: pan and tilt that are drawn from.
-        frames: length of the take.
-        rng: what order and times are drawn from.
     """
     angles = np.empty((frames, 2))
     now, t = np.zeros(2), 0
@@ -254,21 +249,44 @@ class PathRequest:
     direction: Float[np.ndarray, "3"]
     """Unit vector from the object to the camera at the first frame."""
     frames: int
-    """How many frames the path has."""
     rng: np.random.Generator
-    """What the path is drawn from."""
     style: CameraStyle
-    """The style of all cameras."""
     width: int
-    """Image width, pixels."""
     height: int
-    """Image height, pixels."""
 
-    def aimed(self, fill_range: tuple[float, float]) -> PosedCamera:
+    def camera(self, focal_px: float) -> Camera:
+        """Its intrinsics."""
+        return Camera(focal_px, focal_px, self.width / 2, self.height / 2, self.width, self.height)
+
+    def aimed(self, fill_range: tuple[float, float] = _FILL) -> PosedCamera:
         """A camera that sees all points, which fill so much of the image."""
-        return _aimed(
-            self.points, self.direction, self.rng, width=self.width, height=self.height, fill_range=fill_range
-        )
+        fov = self.rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG))
+        fill = self.rng.uniform(*fill_range)
+        roll = self.rng.normal(0.0, np.deg2rad(1.5))
+        focal = max(self.width, self.height) / 2 / np.tan(fov / 2)
+        forward = -self.direction
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        down = np.cross(forward, right)
+        right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
+        rotation = np.stack((right, down, forward))
+        local = self.points @ rotation.T
+        slope = fill * np.array([self.width, self.height]) / 2 / focal
+        # Smallest camera distance at which both sides of the image still hold every point, per image axis:
+        # (x - cx) <= slope (z + d) for all points, and the mirrored inequality, solved for the centre cx and d.
+        centre, distance = np.zeros(2), 0.0
+        for axis in range(2):
+            upper = (local[:, axis] - slope[axis] * local[:, 2]).max()
+            lower = (local[:, axis] + slope[axis] * local[:, 2]).min()
+            centre[axis] = (upper + lower) / 2
+            distance = max(distance, (upper - lower) / 2 / slope[axis])
+        eye_local = np.array([centre[0], centre[1], -distance])
+        # Off-centre by part of the room that the fill factor leaves.
+        eye_local[:2] += self.rng.uniform(-0.5, 0.5, size=2) * (1 - fill) * distance * slope
+        cam_from_world = np.eye(4)
+        cam_from_world[:3, :3] = rotation
+        cam_from_world[:3, 3] = -eye_local
+        return PosedCamera(self.camera(focal), cam_from_world)
 
 
 def _elevation_range(points: Float[np.ndarray, "N 3"], style: CameraStyle) -> tuple[float, float]:
@@ -299,72 +317,34 @@ def _directions(
     return directions
 
 
-def _aimed(
-    points: Float[np.ndarray, "N 3"],
-    direction: Float[np.ndarray, "3"],
-    rng: np.random.Generator,
-    *,
-    width: int,
-    height: int,
-    fill_range: tuple[float, float] = _FILL,
-) -> PosedCamera:
-    fov = rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG))
-    fill = rng.uniform(*fill_range)
-    roll = rng.normal(0.0, np.deg2rad(1.5))
-    focal = max(width, height) / 2 / np.tan(fov / 2)
-    forward = -direction
-    right = np.cross(forward, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
-    down = np.cross(forward, right)
-    right, down = np.cos(roll) * right + np.sin(roll) * down, np.cos(roll) * down - np.sin(roll) * right
-    rotation = np.stack((right, down, forward))
-    local = points @ rotation.T
-    slope = fill * np.array([width, height]) / 2 / focal
-    # Smallest camera distance at which both sides of the image still hold every point, per image axis:
-    # (x - cx) <= slope (z + d) for all points, and the mirrored inequality, solved for the centre cx and d.
-    centre, distance = np.zeros(2), 0.0
-    for axis in range(2):
-        upper = (local[:, axis] - slope[axis] * local[:, 2]).max()
-        lower = (local[:, axis] + slope[axis] * local[:, 2]).min()
-        centre[axis] = (upper + lower) / 2
-        distance = max(distance, (upper - lower) / 2 / slope[axis])
-    eye_local = np.array([centre[0], centre[1], -distance])
-    # Off-centre by part of the room that the fill factor leaves.
-    eye_local[:2] += rng.uniform(-0.5, 0.5, size=2) * (1 - fill) * distance * slope
-    cam_from_world = np.eye(4)
-    cam_from_world[:3, :3] = rotation
-    cam_from_world[:3, 3] = -eye_local
-    return PosedCamera(Camera(focal, focal, width / 2, height / 2, width, height), cam_from_world)
-
-
 def _static(request: PathRequest) -> CameraPath:
     """The camera stands still."""
-    return CameraPath.standing(request.aimed(_FILL), request.frames)
+    return CameraPath.standing(request.aimed(), request.frames)
 
 
 def _orbit(request: PathRequest) -> CameraPath:
     """The camera turns about the middle of all points, eased, at a distance at which all stay in the image."""
-    points, rng, width, height = request.points, request.rng, request.width, request.height
+    points, rng = request.points, request.rng
     (from_azimuth, to_azimuth), (from_elevation, to_elevation) = _orbit_ends(request)
+    width, height = request.width, request.height
     focal = max(width, height) / 2 / np.tan(rng.uniform(*np.deg2rad(FIELD_OF_VIEW_DEG)) / 2)
     slope = rng.uniform(*_ORBIT_FILL) * np.array([width, height]) / 2 / focal
     low, high = points.min(axis=0), points.max(axis=0)
     aim = (low + high) / 2 + rng.uniform(-0.05, 0.05, size=3) * (high - low)
+
+    def looks(share: Float[np.ndarray, " S"]) -> tuple[np.ndarray, np.ndarray]:
+        return look(
+            from_azimuth + share * (to_azimuth - from_azimuth), from_elevation + share * (to_elevation - from_elevation)
+        )
+
     # The path is gone at different speeds, also twice: its shape alone tells how far away it must stay.
-    along = np.linspace(0.0, 1.0, 181)
     distance = 0.0
-    for rotation in look(
-        from_azimuth + along * (to_azimuth - from_azimuth), from_elevation + along * (to_elevation - from_elevation)
-    )[1]:
+    for rotation in looks(np.linspace(0.0, 1.0, 181))[1]:
         local = (points - aim) @ rotation.T
         distance = max(distance, float((np.abs(local[:, :2]) / slope - local[:, 2:]).max()), float(-local[:, 2].min()))
-    progress = there_and_back(request.frames, rng)
-    towards, rotation = look(
-        from_azimuth + progress * (to_azimuth - from_azimuth),
-        from_elevation + progress * (to_elevation - from_elevation),
-    )
+    towards, rotation = looks(there_and_back(request.frames, rng))
     eye = aim + 1.01 * distance * towards  # between two of the directions tried, a little more may be needed
-    return CameraPath(Camera(focal, focal, width / 2, height / 2, width, height), _poses(rotation, eye))
+    return CameraPath(request.camera(focal), _poses(rotation, eye))
 
 
 def _orbit_ends(request: PathRequest) -> tuple[tuple[float, float], tuple[float, float]]:
@@ -458,16 +438,10 @@ def sample_cameras(
 ) -> list[PosedCamera]:
     """Cameras, by default in the front hemisphere (+x), that see all ``points``, about 18 degrees apart or more.
 
-    Args:
-        points: world points that must stay inside the image: the object on the origin, in all its joint states.
-        count: how many cameras.
-        rng: what they are drawn from.
-        width: image width, pixels.
-        height: image height, pixels.
-        style: where they stand; how they move does not matter here.
+    The points lie around the origin: the object in all its joint states. How the style moves does not matter here.
     """
     directions = _directions(points, count, rng, style)
-    return [_aimed(points, d, rng, width=width, height=height) for d in directions]
+    return [PathRequest(points, d, 1, rng, style, width, height).aimed() for d in directions]
 
 
 def sample_camera_paths(
@@ -486,15 +460,6 @@ def sample_camera_paths(
     handheld camera may cut a little off at the image's borders. A head that pans keeps the centre of the points in the
     image, and most of them. No azimuth goes beyond 70 degrees, up to which distractors hide nothing, except where the
     style asks for it.
-
-    Args:
-        points: world points that must stay inside the image: the object on the origin, in all its joint states.
-        count: how many cameras.
-        frames: how many frames each path has.
-        rng: what they are drawn from.
-        style: where they stand and how they move.
-        width: image width, pixels.
-        height: image height, pixels.
 
     Raises:
         ConfigError: there is no frame.
@@ -517,11 +482,6 @@ def bump(path: CameraPath, frame: int, rng: np.random.Generator) -> CameraPath:
     """The same camera, knocked at a frame: within three frames it has turned by 2 to 4 degrees and shifted a little.
 
     It rings for a moment and stays displaced. What was close to the image's border may leave the image.
-
-    Args:
-        path: a camera at every frame.
-        frame: the first frame that is displaced.
-        rng: what the displacement is drawn from.
 
     Raises:
         ConfigError: the frame is not one of the path's, or its first.

@@ -13,14 +13,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, QuestError, RendererError
 from quest.extras import require
-from quest.sim.production import Event, Notice, Report, Studio, StudioOpener, TakeMade, TakeSkipped, write_once
+from quest.sim.production import Event, Notice, Report, StudioOpener, TakeMade, TakeSkipped, write_once
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -34,7 +34,7 @@ _ATTEMPTS = 4
 _FAILED_OPENINGS = 3
 """How many workers in a row may die before they have made anything."""
 _PATIENCE_S = 60.0
-_GOODBYE_S = 10.0
+_CONNECT_S = 10.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def _connected(ray: ModuleType, cluster: ClusterSettings) -> Iterator[None]:
     host, colon, port = cluster.address.rpartition(":")
     if colon and port.isdecimal() and "/" not in host:  # Ray itself would try for half a minute
         try:
-            socket.create_connection((host, int(port)), timeout=_GOODBYE_S).close()
+            socket.create_connection((host, int(port)), timeout=_CONNECT_S).close()
         except OSError as error:
             raise _unreachable(cluster, error) from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # Ray would report to its makers
@@ -125,7 +125,6 @@ class Worker:
         self._node = f"{socket.gethostname()}/{require('ray').get_runtime_context().get_node_id()[:8]}"
         self._store, self._opener, self._specs = store, opener, specs
         self._making = ThreadPoolExecutor(1, thread_name_prefix="quest-make")
-        self._open = ExitStack()
 
     def open(self) -> tuple[str, dict[str, Any]]:
         """Sets the studio up; the node, and what takes made here depend on.
@@ -133,13 +132,9 @@ class Worker:
         Raises:
             QuestError: it cannot be set up; the message names the node.
         """
-
-        def enter() -> Studio:
-            return self._open.enter_context(self._opener.open(self._specs, complete=True))
-
         with _named(self._node):
             self._takes = TakeStore(self._store)
-            self._studio = self._making.submit(enter).result()
+            self._studio = self._making.submit(self._opener.open, self._specs, complete=True).result()
             return self._node, self._studio.describe()
 
     def make(self, spec: TakeSpec) -> Event:
@@ -160,10 +155,6 @@ class Worker:
             made = TakeMade(spec, len(take) * len(take.views), time.perf_counter() - start, warnings, self._node)
             write_once(self._takes, take)
             return made
-
-    def close(self) -> None:
-        """Ends the studio."""
-        self._making.submit(self._open.close).result()
 
 
 @contextmanager
@@ -226,10 +217,7 @@ class _Crew:
         return sum(spec is not None for hand in self._hands for spec in hand.specs.values())
 
     def dismiss(self) -> None:
-        """Ends all workers, those that are idle in good order."""
-        idle = [hand.actor.close.remote() for hand in self._hands if hand.ready and not hand.specs]
-        if idle:
-            self._ray.wait(idle, num_returns=len(idle), timeout=_GOODBYE_S)
+        """Ends all workers."""
         for hand in self._hands:
             self._ray.kill(hand.actor)
 

@@ -44,7 +44,6 @@ class DescribedEntity:
     where: str
     """File and entry, for messages."""
     label: str
-    """One of :data:`quest.types.LABELS`."""
     link: str | None
     """Name of the URDF's link, or None."""
     visual: str | None
@@ -68,6 +67,8 @@ class Description:
     entities: tuple[DescribedEntity, ...] = ()
     """What can be followed."""
 
+
+NOTHING_SAID = Description()
 
 CORRECTIONS = {
     "01909": Description(entities=(DescribedEntity("01909", "handle", None, "original-56", None),)),
@@ -150,11 +151,8 @@ def place(
 ) -> tuple[PlacedEntity, ...]:
     """A description's entities as bodies and parts of the object.
 
-    Args:
-        description: what the user says.
-        articulation: the object in metres.
-        body_of_link: body that each URDF link belongs to, and the link's pose in it in the URDF's units.
-        scale: metres per unit of the URDF.
+    ``body_of_link`` has the body that each URDF link belongs to, and the link's pose in it in the URDF's units, one of
+    which is ``scale`` metres.
 
     Raises:
         ObjectError: a link or a visual is not in the URDF, or a rim or front is asked of a link without the joint
@@ -164,7 +162,7 @@ def place(
 
 
 def _file_name(part: Part) -> str:
-    return part.mesh.stem if part.mesh else ""
+    return part.mesh.stem if isinstance(part.mesh, Path) else ""
 
 
 def _placed(

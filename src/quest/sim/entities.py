@@ -120,8 +120,8 @@ def find_entities(
     Raises:
         ObjectError: an entity was placed away from the surface of its body.
     """
-    surfaces = _Surfaces(articulation, half_diagonal_m)
-    named = [e for place in placed for e in _placed(articulation, place, surfaces, half_diagonal_m)]
+    finder = _Finder(articulation, half_diagonal_m)
+    named = [e for place in placed for e in finder.placed(place)]
     taken = {e.body for e in named}
     unnamed: list[SimEntity] = []
     hinges: list[SimEntity] = []
@@ -129,120 +129,24 @@ def find_entities(
         parts = articulation.body_parts(1 + j)
         if not parts:
             continue
-        if joint.joint.kind == "revolute":
-            hinges.append(_entity(articulation, j, "hinge", surfaces.hinge_point(j), False, ()))
+        turns = joint.joint.kind == "revolute"
+        if turns:
+            hinges.append(finder.entity(j, "hinge", finder.hinge_point(j), False, ()))
         if 1 + j in taken:
             continue
-        handles = _handles(articulation, j, surfaces, half_diagonal_m)
+        handles = finder.handles(j)
         named += handles
         if not handles:
-            label = "rim" if joint.joint.kind == "revolute" else "front"
-            target = surfaces.rim_target(j) if label == "rim" else surfaces.front_target(j)
-            if label == "front" and category in _KNOB_ON_TOP:
-                label = "knob"
-            unnamed.append(_entity(articulation, j, label, *surfaces.outer_point(parts, target), ()))
+            label = "rim" if turns else "knob" if category in _KNOB_ON_TOP else "front"
+            target = finder.rim_target(j) if turns else finder.front_target(j)
+            unnamed.append(finder.entity(j, label, *finder.outer_point(parts, target), ()))
     # A button's or turntable's face is a nuisance unless it is all that there is.
     followed = [e for e in unnamed if e.travel_m >= MOVES_AT_LEAST * half_diagonal_m]
     if not any(not e.fixed for e in named) and not followed:
         followed = unnamed
-    fixed = [] if 0 in taken else _fixed_in_base(articulation, category, surfaces, half_diagonal_m)
+    fixed = [] if 0 in taken else finder.fixed_in_base(category)
     kept = sorted(named + followed, key=lambda e: (e.fixed, e.joint))
     return _with_unique_names(kept + fixed + hinges)
-
-
-def _fixed_in_base(
-    articulation: Articulation, category: str, surfaces: _Surfaces, half_diagonal_m: float
-) -> list[SimEntity]:
-    """What one lifts the whole thing by, in categories where that is known."""
-    if category in _LIFTED_BY_HANDLE:
-        return _handles(articulation, -1, surfaces, half_diagonal_m)
-    parts = articulation.body_parts(0)
-    area = {
-        j: sum(articulation.parts[i].surface.area for i in articulation.body_parts(1 + j))
-        for j, joint in enumerate(articulation.joints)
-        if joint.joint.kind == "revolute" and joint.parent == 0
-    }
-    if category not in _LIFTED_BY_RIM or not parts or not area:
-        return []
-    lid = max(area, key=lambda j: area[j])
-    point, inside = surfaces.outer_point(parts, surfaces.base_rim_target(lid), samples=_THIN_SAMPLES)
-    return [_entity(articulation, -1, "rim", point, inside, ())]
-
-
-def _placed(
-    articulation: Articulation, place: PlacedEntity, surfaces: _Surfaces, half_diagonal_m: float
-) -> list[SimEntity]:
-    if place.parts:
-        bodies = sorted({articulation.parts[i].body for i in place.parts})
-        return [
-            e
-            for body in bodies
-            for e in _of_parts(
-                articulation,
-                body - 1,
-                place.label,
-                [i for i in place.parts if articulation.parts[i].body == body],
-                surfaces,
-                half_diagonal_m,
-            )
-        ]
-    parts = articulation.body_parts(place.body)
-    if not parts:
-        raise ObjectError(f"{place.where}: its link has no visual that could be seen; use a link with meshes")
-    joint = place.body - 1
-    if place.point is None:
-        target = surfaces.rim_target(joint) if place.label == "rim" else surfaces.front_target(joint)
-    else:
-        target = place.point
-    point, inside = surfaces.outer_point(parts, target, samples=_THIN_SAMPLES)
-    gap = float(np.linalg.norm(point - target))
-    if place.point is not None and gap > PLACED_WITHIN * half_diagonal_m:
-        raise ObjectError(
-            f"{place.where}: the point lies {gap:.3f} m away from what can be seen of its link; give it in the link's "
-            "frame and the URDF's units"
-        )
-    return [_entity(articulation, joint, place.label, point, inside, ())]
-
-
-def _handles(articulation: Articulation, joint: int, surfaces: _Surfaces, half_diagonal_m: float) -> list[SimEntity]:
-    found = []
-    for label in GRIPS:
-        parts = [i for i in articulation.body_parts(1 + joint) if part_label(articulation.parts[i].name) == label]
-        found += _of_parts(articulation, joint, label, parts, surfaces, half_diagonal_m)
-    return found
-
-
-def _of_parts(
-    articulation: Articulation,
-    joint: int,
-    label: str,
-    parts: list[int],
-    surfaces: _Surfaces,
-    half_diagonal_m: float,
-) -> list[SimEntity]:
-    """One entity for every group of parts of a body that are near each other."""
-    found = []
-    for group in _near_groups([articulation.parts[i].surface for i in parts], HANDLE_GAP * half_diagonal_m):
-        members = tuple(parts[i] for i in group)
-        meshes = [articulation.parts[i].surface for i in members]
-        area = np.concatenate([m.area_faces for m in meshes])
-        centres = np.concatenate([m.triangles_center for m in meshes])
-        target = np.average(centres, axis=0, weights=area) if area.sum() > 0 else centres.mean(axis=0)
-        point, inside = surfaces.outer_point(list(members), target)
-        found.append(_entity(articulation, joint, label, point, inside, members))
-    return found
-
-
-def _entity(
-    articulation: Articulation,
-    joint: int,
-    label: str,
-    point: Float[np.ndarray, "3"],
-    inside: bool,
-    parts: tuple[int, ...],
-) -> SimEntity:
-    name = f"{articulation.body_names[1 + joint]}/{label}"
-    return SimEntity(name, label, joint, point, parts, articulation.travel_m(joint, point), inside)
 
 
 def _with_unique_names(entities: list[SimEntity]) -> tuple[SimEntity, ...]:
@@ -288,8 +192,8 @@ def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
     return joined
 
 
-class _Surfaces:
-    """Surfaces of an object at rest, with what can be seen of them from the front."""
+class _Finder:
+    """Entities of an object, and the surfaces on which they lie, at rest, with what is seen of them from the front."""
 
     def __init__(self, articulation: Articulation, half_diagonal_m: float) -> None:
         self._articulation = articulation
@@ -302,6 +206,71 @@ class _Surfaces:
         self._towards = np.stack(
             (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)), axis=-1
         )
+
+    def entity(
+        self, joint: int, label: str, point: Float[np.ndarray, "3"], inside: bool, parts: tuple[int, ...]
+    ) -> SimEntity:
+        """An entity of a joint's body, with its travel."""
+        name = f"{self._articulation.body_names[1 + joint]}/{label}"
+        return SimEntity(name, label, joint, point, parts, self._articulation.travel_m(joint, point), inside)
+
+    def fixed_in_base(self, category: str) -> list[SimEntity]:
+        """What one lifts the whole thing by, in categories where that is known."""
+        if category in _LIFTED_BY_HANDLE:
+            return self.handles(-1)
+        thing = self._articulation
+        parts = thing.body_parts(0)
+        area = {
+            j: sum(thing.parts[i].surface.area for i in thing.body_parts(1 + j))
+            for j, joint in enumerate(thing.joints)
+            if joint.joint.kind == "revolute" and joint.parent == 0
+        }
+        if category not in _LIFTED_BY_RIM or not parts or not area:
+            return []
+        lid = max(area, key=lambda j: area[j])
+        point, inside = self.outer_point(parts, self.base_rim_target(lid), samples=_THIN_SAMPLES)
+        return [self.entity(-1, "rim", point, inside, ())]
+
+    def placed(self, place: PlacedEntity) -> list[SimEntity]:
+        """What somebody has pointed out."""
+        if place.parts:
+            body_of = {i: self._articulation.parts[i].body for i in place.parts}
+            bodies = sorted(set(body_of.values()))
+            return [
+                e for b in bodies for e in self._of_parts(b - 1, place.label, [i for i in body_of if body_of[i] == b])
+            ]
+        parts, joint = self._articulation.body_parts(place.body), place.body - 1
+        if not parts:
+            raise ObjectError(f"{place.where}: its link has no visual that could be seen; use a link with meshes")
+        if place.point is None:
+            target = self.rim_target(joint) if place.label == "rim" else self.front_target(joint)
+        else:
+            target = place.point
+        point, inside = self.outer_point(parts, target, samples=_THIN_SAMPLES)
+        gap = float(np.linalg.norm(point - target))
+        if place.point is not None and gap > PLACED_WITHIN * self._half_diagonal_m:
+            raise ObjectError(
+                f"{place.where}: the point lies {gap:.3f} m away from what can be seen of its link; give it in the "
+                "link's frame and the URDF's units"
+            )
+        return [self.entity(joint, place.label, point, inside, ())]
+
+    def handles(self, joint: int) -> list[SimEntity]:
+        """Handles and knobs by the names of parts."""
+        parts = self._articulation.body_parts(1 + joint)
+        label_of = {i: part_label(self._articulation.parts[i].name) for i in parts}
+        return [e for label in GRIPS for e in self._of_parts(joint, label, [i for i in parts if label_of[i] == label])]
+
+    def _of_parts(self, joint: int, label: str, parts: list[int]) -> list[SimEntity]:
+        """One entity for every group of parts of a body that are near each other."""
+        found, surfaces = [], [self._articulation.parts[i].surface for i in parts]
+        for group in _near_groups(surfaces, HANDLE_GAP * self._half_diagonal_m):
+            area = np.concatenate([surfaces[i].area_faces for i in group])
+            centres = np.concatenate([surfaces[i].triangles_center for i in group])
+            target = np.average(centres, axis=0, weights=area) if area.sum() > 0 else centres.mean(axis=0)
+            members = [parts[i] for i in group]
+            found.append(self.entity(joint, label, *self.outer_point(members, target), tuple(members)))
+        return found
 
     def outer_point(
         self, parts: list[int], target: Float[np.ndarray, "3"], *, samples: int = 2 * _SAMPLES

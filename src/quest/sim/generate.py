@@ -10,12 +10,11 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim.annotate import entity_mask
-from quest.sim.appearance import Region, apply_appearance, sample_appearance
+from quest.sim.appearance import Region, apply_appearance, odd_appearance, sample_appearance
 from quest.sim.cameras import CameraPath
 from quest.sim.motion import FRAMES_PER_S
 from quest.sim.objects import SimObject
 from quest.sim.occlusion import stage_occlusion
-from quest.sim.props import odd_appearance
 from quest.sim.renderer import Picture, Renderer
 from quest.sim.sensor import SensorModel, sense
 from quest.sim.settings import TakeSettings
@@ -104,16 +103,8 @@ def record_take(
 ) -> Take:
     """Renders a take that is staged, with its ground truth.
 
-    Args:
-        sim_object: the object.
-        staging: what moves when, seen from where.
-        name: of the take.
-        seed: for the take's metadata.
-        appearance_rng: what light, surroundings and materials are drawn from.
-        sensor_rng: what noise is drawn from.
-        settings: how objects look, and sensors.
-        suite: for the take's metadata.
-        provenance: likewise; what the staging says of itself is added.
+    Light, surroundings and materials are drawn from ``appearance_rng``, noise from ``sensor_rng``; all else is for the
+    take's metadata, where what the staging says of itself is added to ``provenance``.
 
     Raises:
         RendererError: the renderer broke.
@@ -150,7 +141,7 @@ def record_take(
         link_pose=played.poses.astype(np.float32),
         joint_position=played.position.astype(np.float32),
         joint_velocity=played.velocity.astype(np.float32),
-        joint_axis=np.stack([sim_object.articulation.axes(p) for p in played.poses]).astype(np.float32),
+        joint_axis=sim_object.articulation.axes(played.poses).astype(np.float32),
     )
 
 

@@ -47,9 +47,7 @@ class GripperPart:
     """A box, or a cylinder along z."""
 
     kind: Literal["box", "cylinder"]
-    """Which of them."""
     material: Material
-    """What it is made of."""
     half_m: tuple[float, float, float]
     """Half extents along x, y, z."""
     centre_m: tuple[float, float, float]
@@ -157,7 +155,6 @@ class Grasp:
     """How an entity is held."""
 
     entity: SimEntity
-    """What is held."""
     body_from_gripper: Float[np.ndarray, "4 4"]
     """Where the gripper is then."""
     width_m: float
@@ -212,11 +209,7 @@ def find_grasp(
 ) -> tuple[Grasp, float]:
     """The best way to hold an entity while its joint moves, and what it costs: below 1 is good.
 
-    Args:
-        sim_object: the object.
-        entity: what to hold.
-        samples: of the object's surface.
-        motion: poses of the bodies at some moments: when the gripper comes, while the joint moves, at its end.
+    ``motion`` holds poses of the bodies at some moments: when the gripper comes, while the joint moves, at its end.
 
     Raises:
         ObjectError: everything that was tried is blocked by the object itself.
@@ -422,14 +415,8 @@ class Gripper:
     """A gripper that moves; a prop."""
 
     parts: tuple[Occluder, ...]
-    """Its parts with their materials and poses."""
     grasps: tuple[tuple[str, int, int], ...]
     """Name of every entity that it holds, the first frame and the frame after the last."""
-
-    @property
-    def world_from_part(self) -> Float[np.ndarray, "S P 4 4"]:
-        """Pose of every part at every frame of the script."""
-        return np.stack([p.world_from_shape for p in self.parts], axis=1)
 
     def add(self, scene: Any) -> Any:
         """Put it into a ``sapien.Scene``; returns the entities that :meth:`place` moves."""
@@ -470,11 +457,11 @@ def plan_gripper(
     """
     shares = share_plan(moved_joints, frames_per_joint=frames_per_joint, style=MotionStyle(margin=margin))
     _check_time(sim_object, script, shares, margin)
-    poses = np.stack([sim_object.articulation.poses(position) for position in script])
+    poses = sim_object.articulation.poses(script)
     samples = ObjectSamples(sim_object.articulation)
     grasps = [_grasp(sim_object, share, samples, poses) for share in shares]
     surfaces, scale = sample_gripper_surfaces(rng), gripper_scale(sim_object.half_diagonal_m)
-    gripper, opening = _Way(sim_object, poses, shares, grasps, rng).travel()
+    gripper, opening = _Way(sim_object, poses, rng).through(shares, grasps)
     parts = []
     for part in GRIPPER_PARTS:
         local = np.tile(np.eye(4), (len(script), 1, 1))
@@ -530,102 +517,82 @@ def _grasp(sim_object: SimObject, share: Share, samples: ObjectSamples, poses: F
 
 
 class _Way:
-    """Where the gripper is at every frame, and how far it is open."""
+    """Where the gripper is at every frame, and how far it is open; drawn from its first frame to its last."""
 
-    def __init__(
-        self,
-        sim_object: SimObject,
-        poses: Float[np.ndarray, "S B 4 4"],
-        shares: list[Share],
-        grasps: list[Grasp],
-        rng: np.random.Generator,
-    ) -> None:
-        self._poses, self._shares, self._grasps = poses, shares, grasps
+    def __init__(self, sim_object: SimObject, poses: Float[np.ndarray, "S B 4 4"], rng: np.random.Generator) -> None:
+        self._poses, self._rng = poses, rng
         self._scale = gripper_scale(sim_object.half_diagonal_m)
         hulls = sim_object.articulation.body_hulls
         moments = poses[np.unique(np.linspace(0, len(poses) - 1, 12).astype(int))]
         swept = np.concatenate([apply(p[b], h) for p in moments for b, h in enumerate(hulls) if len(h)])
         self._low, self._high = swept.min(axis=0), swept.max(axis=0)
         self._room = 0.3 * sim_object.half_diagonal_m + LENGTH_M * self._scale
-        self._rng = rng
         self._gripper = np.tile(np.eye(4), (len(poses), 1, 1))
         self._opening = np.zeros(len(poses))
+        self._frame, self._pose, self._open_m = 0, np.eye(4), 0.0
 
-    def travel(self) -> tuple[Float[np.ndarray, "S 4 4"], Float[np.ndarray, " S"]]:
+    def through(
+        self, shares: list[Share], grasps: list[Grasp]
+    ) -> tuple[Float[np.ndarray, "S 4 4"], Float[np.ndarray, " S"]]:
         """Poses of the gripper in the world, and the distance between its pads."""
-        for k, (share, grasp) in enumerate(zip(self._shares, self._grasps, strict=True)):
-            self._hold(share, grasp)
-            free_from = 0 if k == 0 else self._shares[k - 1].stops
-            coming = share.moves - free_from
+        before: Grasp | None = None
+        for share, grasp in zip(shares, grasps, strict=True):
+            coming = share.moves - self._frame
             closing = int(np.clip(coming // 6, *_CLOSING))
-            if k == 0:
+            held = self._poses[share.moves - 1, grasp.entity.body] @ grasp.body_from_gripper
+            fixed, ready = grasp.body_from_gripper, _back(held, grasp.back_m)
+            if before is None:  # from outside of the picture, or as far away as it gets in time
                 straight = (coming - closing) // 2
-                self._come(grasp, share.moves, closing, straight, first=0)
+                self._pose = self._outside(ready, coming - closing - straight)
+                self._open_m = grasp.open_m
+                self._go(coming - closing - straight, ready)
             else:
-                self._change(k, closing)
-        last = self._shares[-1]
-        self._leave(self._grasps[-1], last.stops, len(self._poses))
+                left = self._poses[self._frame - 1, before.entity.body] @ before.body_from_gripper
+                cleared = _back(left, before.back_m)
+                if np.sum(cleared[:3, 1] * ready[:3, 1]) < 0:  # its two sides are alike: turn by less than a quarter
+                    held, ready, fixed = held @ _HALF_TURN, ready @ _HALF_TURN, fixed @ _HALF_TURN
+                opening = max(2, closing - 1)
+                straight = (coming - opening - closing) // 3
+                self._pose = left
+                self._go(opening, left, before.open_m)
+                self._go(straight, cleared)
+                self._go(coming - closing - opening - 2 * straight, ready, grasp.open_m, around=True)
+            self._go(straight, held)
+            self._go(closing, held, grasp.width_m)
+            frames = slice(share.moves, share.stops)
+            self._gripper[frames] = self._poses[frames, grasp.entity.body] @ fixed
+            self._opening[frames] = grasp.width_m
+            self._frame, before = share.stops, grasp
+        self._leave(grasps[-1])
         return self._gripper, self._opening
 
-    def _held(self, grasp: Grasp, frame: int) -> Float[np.ndarray, "4 4"]:
-        return self._poses[frame, grasp.entity.body] @ grasp.body_from_gripper
+    def _leave(self, grasp: Grasp) -> None:
+        self._pose = self._gripper[self._frame - 1]
+        cleared, rest = _back(self._pose, grasp.back_m), len(self._poses) - self._frame
+        opening = max(2, min(4, rest // 4))
+        straight = (rest - opening + 1) // 2
+        self._go(opening, self._pose, grasp.open_m)
+        self._go(straight, cleared)
+        self._go(rest - opening - straight, self._outside(cleared, rest - opening - straight))
 
-    def _hold(self, share: Share, grasp: Grasp) -> None:
-        frames = slice(share.moves - 1, share.stops)
-        self._gripper[frames] = self._poses[frames, grasp.entity.body] @ grasp.body_from_gripper
-        self._opening[frames] = grasp.width_m
-
-    def _come(self, grasp: Grasp, moves: int, closing: int, straight: int, *, first: int) -> None:
-        """From outside of the picture, or as far away as it gets in time, to the entity."""
-        held = self._held(grasp, moves - 1)
-        ready = _back(held, grasp.back_m)
-        outside = self._outside(ready, moves - closing - straight - first)
-        self._segment(first, moves - closing - straight, outside, ready, grasp.open_m, grasp.open_m)
-        self._approach(grasp, ready, held, moves, closing, straight)
-
-    def _approach(
-        self,
-        grasp: Grasp,
-        ready: Float[np.ndarray, "4 4"],
-        held: Float[np.ndarray, "4 4"],
-        moves: int,
-        closing: int,
-        straight: int,
+    def _go(
+        self, frames: int, goal: Float[np.ndarray, "4 4"], open_m: float | None = None, *, around: bool = False
     ) -> None:
-        self._segment(moves - closing - straight, moves - closing, ready, held, grasp.open_m, grasp.open_m)
-        self._segment(moves - closing, moves, held, held, grasp.open_m, grasp.width_m)
-
-    def _change(self, k: int, closing: int) -> None:
-        """From one entity to the next."""
-        before, after, stops, moves = (
-            self._grasps[k - 1],
-            self._grasps[k],
-            self._shares[k - 1].stops,
-            self._shares[k].moves,
-        )
-        left, held = self._held(before, stops - 1), self._held(after, moves - 1)
-        cleared, ready = _back(left, before.back_m), _back(held, after.back_m)
-        if np.sum(cleared[:3, 1] * ready[:3, 1]) < 0:  # its two sides are alike: turn by less than a quarter
-            held, ready = held @ _HALF_TURN, ready @ _HALF_TURN
-            frames = slice(moves - 1, self._shares[k].stops)
-            self._gripper[frames] = self._gripper[frames] @ _HALF_TURN
-        opening = max(2, closing - 1)
-        straight = (moves - stops - opening - closing) // 3
-        self._segment(stops, stops + opening, left, left, before.width_m, before.open_m)
-        self._segment(stops + opening, stops + opening + straight, left, cleared, before.open_m, before.open_m)
-        first, end = stops + opening + straight, moves - closing - straight
-        self._segment(first, end, cleared, ready, before.open_m, after.open_m, around=True)
-        self._approach(after, ready, held, moves, closing, straight)
-
-    def _leave(self, grasp: Grasp, stops: int, frames: int) -> None:
-        left = self._gripper[stops - 1]
-        cleared = _back(left, grasp.back_m)
-        opening = max(2, min(4, (frames - stops) // 4))
-        straight = (frames - stops - opening + 1) // 2
-        self._segment(stops, stops + opening, left, left, grasp.width_m, grasp.open_m)
-        self._segment(stops + opening, stops + opening + straight, left, cleared, grasp.open_m, grasp.open_m)
-        first = stops + opening + straight
-        self._segment(first, frames, cleared, self._outside(cleared, frames - first), grasp.open_m, grasp.open_m)
+        """Fills some frames with a movement that reaches its goal at the last of them."""
+        start, opened = self._pose, self._open_m
+        self._pose, self._open_m = goal, opened if open_m is None else open_m
+        if frames <= 0:
+            return
+        share = minimum_jerk(np.arange(1, frames + 1) / frames)
+        path = (1 - share)[:, None] * start[:3, 3] + share[:, None] * goal[:3, 3]
+        if around:
+            path += (4 * share * (1 - share))[:, None] * self._detour(start[:3, 3], goal[:3, 3])
+        turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack((start[:3, :3], goal[:3, :3]))))
+        now = slice(self._frame, self._frame + frames)
+        self._gripper[now, :3, :3] = turns(share).as_matrix()
+        self._gripper[now, :3, 3] = path
+        self._opening[now] = opened + share * (self._open_m - opened)
+        self._frame += frames
 
     def _outside(self, ready: Float[np.ndarray, "4 4"], frames: int) -> Float[np.ndarray, "4 4"]:
         """Above or beside all that the object sweeps; not as far if there is no time to get there."""
@@ -642,30 +609,6 @@ class _Way:
         pose[:3, 3] += length * towards / np.linalg.norm(towards)
         pose[2, 3] = max(pose[2, 3], LENGTH_M * self._scale * 0.2)
         return pose
-
-    def _segment(
-        self,
-        first: int,
-        end: int,
-        start: Float[np.ndarray, "4 4"],
-        goal: Float[np.ndarray, "4 4"],
-        opening: float,
-        closing: float,
-        *,
-        around: bool = False,
-    ) -> None:
-        """Fills frames ``first`` to ``end`` with a movement that reaches its goal at the last of them."""
-        frames = end - first
-        if frames <= 0:
-            return
-        share = minimum_jerk(np.arange(1, frames + 1) / frames)
-        path = (1 - share)[:, None] * start[:3, 3] + share[:, None] * goal[:3, 3]
-        if around:
-            path += (4 * share * (1 - share))[:, None] * self._detour(start[:3, 3], goal[:3, 3])
-        turns = Slerp([0.0, 1.0], Rotation.from_matrix(np.stack((start[:3, :3], goal[:3, :3]))))
-        self._gripper[first:end, :3, :3] = turns(share).as_matrix()
-        self._gripper[first:end, :3, 3] = path
-        self._opening[first:end] = opening + share * (closing - opening)
 
     def _detour(self, start: Float[np.ndarray, "3"], goal: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """By how much the middle of a straight way has to move away to stay clear of all that the object sweeps."""

@@ -48,24 +48,6 @@ def trapezoid(share: Float[np.ndarray, " N"], ramp: float) -> Float[np.ndarray, 
     return speed * (up**2 / (2 * ramp) + (share - up) - down**2 / (2 * ramp))
 
 
-def joint_profile(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
-    """How far a person has opened a joint at each of its frames; starts near 0, reaches 0.6 to 1 of its opening.
-
-    Three scripts are drawn from: open; open with a stop on the way; open, return a part, open again.
-    """
-    top = rng.uniform(*_AMPLITUDE)
-    script = rng.choice(3, p=(0.4, 0.3, 0.3))
-    if script == 0:
-        knots, weights = [0.0, top], [1.0]
-    elif script == 1:
-        stop = rng.uniform(0.3, 0.7) * top
-        knots, weights = [0.0, stop, stop, top], [1.0, rng.uniform(0.15, 0.4), 1.0]
-    else:
-        back = rng.uniform(0.2, 0.6) * top
-        knots, weights = [0.0, top, back, rng.uniform(back, top)], [1.2, 0.8, 0.8]
-    return _along(knots, _with_last_stop(weights, rng), frames, minimum_jerk)
-
-
 def draw_profile(
     kind: ProfileKind, frames: int, rng: np.random.Generator, *, closing_from: float | None = None
 ) -> Float[np.ndarray, " N"]:
@@ -73,18 +55,12 @@ def draw_profile(
 
     No step from frame to frame is longer than 10 / ``frames``.
 
-    Args:
-        kind: who moves it.
-        frames: how many.
-        rng: what the profile is drawn from.
-        closing_from: where it starts if it closes, which it then does completely; None if it opens from closed to 0.6
-            or more (``creep``: 0.85 or more).
+    It starts at ``closing_from`` if it closes, which it then does completely; None if it opens from closed to 0.6 or
+    more (``creep``: 0.85 or more).
     """
     if closing_from is None:
-        if kind == "human":
-            return joint_profile(frames, rng)
         top = rng.uniform(*(_CREEP_AMPLITUDE if kind == "creep" else _AMPLITUDE))
-        return top * _way(kind, frames, rng)
+        return _person(frames, rng, opens_to=top) if kind == "human" else top * _way(kind, frames, rng)
     return closing_from * (1 - _way(kind, frames, rng))
 
 
@@ -94,15 +70,24 @@ def _way(kind: ProfileKind, frames: int, rng: np.random.Generator) -> Float[np.n
         return _creep(frames, rng)
     if kind == "robot":
         return _robot(frames, rng)
-    script = rng.choice(3, p=(0.5, 0.3, 0.2))
+    return _person(frames, rng)
+
+
+def _person(frames: int, rng: np.random.Generator, *, opens_to: float | None = None) -> Float[np.ndarray, " N"]:
+    """All the way, with a stop on it, or with a return; a person who opens may stay where the return ends."""
+    top = 1.0 if opens_to is None else opens_to
+    script = rng.choice(3, p=(0.5, 0.3, 0.2) if opens_to is None else (0.4, 0.3, 0.3))
     if script == 0:
-        knots, weights = [0.0, 1.0], [1.0]
+        knots, weights = [0.0, top], [1.0]
     elif script == 1:
-        stop = rng.uniform(0.3, 0.7)
-        knots, weights = [0.0, stop, stop, 1.0], [1.0, rng.uniform(0.15, 0.4), 1.0]
-    else:
+        stop = rng.uniform(0.3, 0.7) * top
+        knots, weights = [0.0, stop, stop, top], [1.0, rng.uniform(0.15, 0.4), 1.0]
+    elif opens_to is None:
         turn = rng.uniform(0.6, 0.95)
         knots, weights = [0.0, turn, rng.uniform(0.2, 0.8) * turn, 1.0], [1.0, 0.8, 1.0]
+    else:
+        back = rng.uniform(0.2, 0.6) * top
+        knots, weights = [0.0, top, back, rng.uniform(back, top)], [1.2, 0.8, 0.8]
     return _along(knots, _with_last_stop(weights, rng), frames, minimum_jerk)
 
 
@@ -209,9 +194,7 @@ class Share:
     """One movement of one joint."""
 
     joint: int
-    """Which one."""
     start: int
-    """First frame of the share."""
     moves: int
     """First frame at which the joint may be elsewhere than before."""
     stops: int
@@ -219,7 +202,6 @@ class Share:
     end: int
     """One past the last frame of the share."""
     opens: bool = True
-    """Whether it opens or closes."""
 
 
 def motion_script(
@@ -232,12 +214,7 @@ def motion_script(
 ) -> Float[np.ndarray, "T J"]:
     """Joint positions (radians or metres) at every frame of a take.
 
-    Args:
-        articulation: the object.
-        moved_joints: joints that move, in order.
-        rng: what the script is drawn from.
-        frames_per_joint: frames that each joint gets; the hold is taken from the first one's.
-        style: how they move.
+    ``frames_per_joint`` are the frames that each joint gets, in order; the hold is taken from the first one's.
 
     Raises:
         ConfigError: ``frames_per_joint`` leaves no time to move.

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 from xml.etree import ElementTree
 
@@ -16,10 +17,18 @@ from jaxtyping import Float
 
 from quest.errors import ObjectError
 from quest.sim.articulation import ArticulatedJoint, Articulation, Part
-from quest.sim.description import CORRECTIONS, DESCRIPTION_NAME, FRONTS, Description, place, read_description
+from quest.sim.description import (
+    CORRECTIONS,
+    DESCRIPTION_NAME,
+    FRONTS,
+    NOTHING_SAID,
+    Description,
+    place,
+    read_description,
+)
 from quest.sim.entities import MOVES_AT_LEAST, SimEntity, find_entities, part_label
 from quest.sim.standing import closed, placed, real_scale, scaled, size_scale, with_scaled_origins
-from quest.sim.urdf import Urdf, UrdfVisual, read_urdf
+from quest.sim.urdf import MeshData, Urdf, UrdfVisual, read_urdf
 from quest.types import Joint
 from quest.untrusted import read_json, reading
 
@@ -38,19 +47,19 @@ _CATEGORY_OF_BASE = {
     "oven_body": "Oven",
 }
 
+Source = Literal["partnet-mobility", "procedural", "own"]
+
 
 @dataclass(frozen=True)
 class SimObject:
     """An articulated object, ready to be moved and rendered."""
 
-    source: Literal["partnet-mobility", "procedural", "own"]
-    """``partnet-mobility``, ``procedural``, or ``own`` for a user's own."""
+    source: Source
+    """``own`` is a user's own."""
     object_id: str
-    """The folder's name."""
+    """The folder's name, or ``CATEGORY-SEED``."""
     category: str
     """Such as ``StorageFurniture``; ``Unknown`` if the folder does not tell."""
-    folder: Path
-    """Where it was read from."""
     articulation: Articulation
     """Bodies, joints and their geometry, metres."""
     entities: tuple[SimEntity, ...]
@@ -157,39 +166,70 @@ def _load(path: Path) -> SimObject:
     warnings: list[str] = []
     urdf = read_urdf(urdf_path)
     meta = _read_json(folder / "meta.json", warnings)
-    meta = meta if isinstance(meta, dict) else {}
     described = folder / DESCRIPTION_NAME
-    source: Literal["partnet-mobility", "procedural", "own"] = "partnet-mobility"
-    if meta.get("source") == "procedural":
-        source = "procedural"
-    elif described.is_file() or urdf_path.name != "mobility.urdf":
-        source = "own"
-    description = read_description(described) if described.is_file() else Description()
-    if source == "partnet-mobility":
+    description = read_description(described) if described.is_file() else NOTHING_SAID
+    own = described.is_file() or urdf_path.name != "mobility.urdf"
+    if not own:
         urdf = with_scaled_origins(urdf, warnings)
         description = CORRECTIONS.get(folder.name, description)
-    articulation, body_of_link = _articulation(urdf, urdf_path, warnings)
+    model_cat = meta.get("model_cat") if isinstance(meta, dict) else None
+    category = str(description.category or model_cat or _category_of_base(folder))
+    return object_from_urdf(
+        urdf,
+        object_id_of(path),
+        category,
+        source="own" if own else "partnet-mobility",
+        where=urdf_path,
+        description=description,
+        part_names=_names_of_meshes(folder, warnings),
+        warnings=warnings,
+    )
+
+
+def object_from_urdf(
+    urdf: Urdf,
+    object_id: str,
+    category: str,
+    *,
+    source: Source,
+    where: Path | str = "",
+    description: Description = NOTHING_SAID,
+    part_names: Mapping[str, str] = MappingProxyType({}),
+    warnings: Sequence[str] = (),
+) -> SimObject:
+    """An object in metres, closed, with its front towards +x and its entities found.
+
+    Args:
+        urdf: its links and joints.
+        object_id: what it is called.
+        category: in PartNet-Mobility's words.
+        source: where it comes from; PartNet-Mobility's objects get a plausible size.
+        where: what the URDF was read from, for messages.
+        description: what a user says of it.
+        part_names: what parts are, by the stems of their mesh files, where the URDF does not name them.
+        warnings: what is wrong with it so far.
+
+    Raises:
+        ObjectError: all meshes are missing, nothing moves, or there is more of something than masks can tell.
+    """
+    where, told = where or object_id, list(warnings)
+    articulation, body_of_link = _articulation(urdf, where, part_names, told)
     articulation = closed(articulation)
-    category = str(description.category or meta.get("model_cat") or _category_of_base(folder))
-    scale = _scale(articulation, source, category, description, warnings)
+    scale = _scale(articulation, source, category, description, told)
     front_rad = None if description.front is None else FRONTS[description.front]
     articulation = placed(scaled(articulation, scale), front_rad, by_lids=source == "own")
-    extent = np.ptp(articulation.world_points(articulation.rest), axis=0)
-    half_diagonal_m = float(np.linalg.norm(extent)) / 2
-    told = place(description, articulation, body_of_link, scale)
-    entities = find_entities(articulation, half_diagonal_m, category=category, placed=told)
+    half_diagonal_m = float(np.linalg.norm(articulation.extent_m)) / 2
+    pointed_out = place(description, articulation, body_of_link, scale)
+    entities = find_entities(articulation, half_diagonal_m, category=category, placed=pointed_out)
     if all(e.label == "hinge" or e.fixed for e in entities):
         raise ObjectError(
-            f"{folder}: expected a moving link with a handle, rim or front, found none; use another object"
+            f"{where}: expected a moving link with a handle, rim or front, found none; use another object"
         )
     if len(entities) > _MOST_ENTITIES:
         raise ObjectError(
-            f"{folder}: expected at most {_MOST_ENTITIES} handles, knobs, rims, fronts and hinges, got {len(entities)}"
+            f"{where}: expected at most {_MOST_ENTITIES} handles, knobs, rims, fronts and hinges, got {len(entities)}"
         )
-    object_id = object_id_of(path)
-    return SimObject(
-        source, object_id, category, folder, articulation, entities, half_diagonal_m, scale, tuple(warnings)
-    )  # fmt: skip
+    return SimObject(source, object_id, category, articulation, entities, half_diagonal_m, scale, tuple(told))
 
 
 def object_digest(path: Path) -> str:
@@ -203,7 +243,7 @@ def object_digest(path: Path) -> str:
     urdf_path = find_urdf(path)
     beside = [urdf_path.parent / name for name in (DESCRIPTION_NAME, "meta.json", *_PART_NAMES)]
     visuals = [visual for of_link in read_urdf(urdf_path).links.values() for visual in of_link]
-    meshes = sorted({visual.mesh for visual in visuals if visual.mesh is not None})
+    meshes = sorted({visual.mesh for visual in visuals if isinstance(visual.mesh, Path)})
     digest = hashlib.sha256()
     looks = sorted({file for mesh in meshes for file in _looks(mesh)})
     for file in (urdf_path, *beside, *meshes, *looks):
@@ -240,7 +280,7 @@ def _scale(
         if category == "Unknown":
             warnings.append("category unknown (no meta.json): assumed to be 0.8 m long")
         return real_scale(articulation, category)
-    longest = float(np.ptp(articulation.world_points(articulation.rest), axis=0).max())
+    longest = float(articulation.extent_m.max())
     if source == "own" and not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
         warnings.append(
             f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME} if they are not; "
@@ -266,18 +306,17 @@ def _category_of_base(folder: Path) -> str:
 
 
 def _articulation(
-    urdf: Urdf, urdf_path: Path, warnings: list[str]
+    urdf: Urdf, where: Path | str, part_names: Mapping[str, str], warnings: list[str]
 ) -> tuple[Articulation, dict[str, tuple[int, Float[np.ndarray, "4 4"]]]]:
     """Bodies of links that fixed joints hold together, in URDF units, with the root where the URDF puts it.
 
     Also tells the body that each link belongs to, and the link's pose in it.
     """
-    folder = urdf_path.parent
     moving = [j for j in urdf.joints if j.kind != "fixed" and j.upper > j.lower]
     if not moving:
-        raise ObjectError(f"{urdf_path}: expected a joint that moves, found none; use another object")
+        raise ObjectError(f"{where}: expected a joint that moves, found none; use another object")
     if len(moving) > _MOST_JOINTS:
-        raise ObjectError(f"{urdf_path}: expected at most {_MOST_JOINTS} joints that move, got {len(moving)}")
+        raise ObjectError(f"{where}: expected at most {_MOST_JOINTS} joints that move, got {len(moving)}")
     children = {j.child for j in urdf.joints}
     body = {name: 0 for name in urdf.links if name not in children}
     body_from_link = {name: np.eye(4) for name in body}
@@ -295,19 +334,25 @@ def _articulation(
         if j.mimics is not None:
             warnings.append(f"joint {j.name} mimics {j.mimics}: here it moves on its own")
     names = ("base", *(j.child for j in moving))
-    part_names = _names_of_meshes(folder, warnings)
     parts, missing = [], []
     for link, visuals in urdf.links.items():
         for visual in visuals:
             surface = _surface(visual)
             if surface is None:
-                missing.append(visual.mesh.name if visual.mesh else visual.shape)
+                missing.append(visual.mesh.name if isinstance(visual.mesh, Path) else visual.shape)
                 continue
             name = _part_name(visual, link, part_names)
-            parts.append(_part(visual, name, body[link], body_from_link[link], surface))
+            body_from_part = body_from_link[link] @ visual.link_from_visual
+            in_body = surface.copy().apply_transform(body_from_part)
+            parts.append(
+                Part(
+                    name=name, visual=visual.name, body=body[link], body_from_part=body_from_part, mesh=visual.mesh,
+                    scale=visual.scale, uv_scale=visual.scale, shape=visual.shape, rgba=visual.rgba, surface=in_body,
+                )
+            )  # fmt: skip
     if not parts:
         raise ObjectError(
-            f"{folder}: expected meshes beside {urdf_path.name}, found none of the {len(missing)} that it names "
+            f"{where}: expected meshes beside it, found none of the {len(missing)} that it names "
             f"(first: {missing[0] if missing else 'none named'}); copy the object's textured_objs folder too"
         )
     if missing:
@@ -318,13 +363,11 @@ def _articulation(
     return Articulation(names, tuple(parts), tuple(joints), np.eye(4)), body_of_link
 
 
-def _part_name(visual: UrdfVisual, link: str, part_names: dict[str, str]) -> str:
+def _part_name(visual: UrdfVisual, link: str, part_names: Mapping[str, str]) -> str:
     """What a visual is: its own name, else its link's if that says handle or knob, else the annotation's."""
-    if part_label(visual.name):
-        return visual.name
-    if part_label(link):
+    if part_label(link) and not part_label(visual.name):
         return link
-    return visual.name or part_names.get(visual.mesh.stem if visual.mesh else "", "")
+    return visual.name or part_names.get(visual.mesh.stem if isinstance(visual.mesh, Path) else "", "")
 
 
 def _names_of_meshes(folder: Path, warnings: list[str]) -> dict[str, str]:
@@ -355,6 +398,8 @@ def _surface(visual: UrdfVisual) -> trimesh.Trimesh | None:
         return trimesh.creation.cylinder(radius=visual.size[0], height=visual.size[1], sections=24)
     if visual.shape == "sphere":
         return trimesh.creation.icosphere(subdivisions=2, radius=visual.size[0])
+    if isinstance(visual.mesh, MeshData):
+        return trimesh.Trimesh(visual.mesh.vertices, visual.mesh.faces, process=False)
     assert visual.mesh is not None
     if not visual.mesh.is_file():
         return None
@@ -378,22 +423,3 @@ def _collada_unit_m(path: Path) -> float:
         return 1.0
     unit = next((e for e in ElementTree.parse(path).iter() if e.tag.rpartition("}")[2] == "unit"), None)
     return 1.0 if unit is None else float(unit.get("meter", 1.0))
-
-
-def _part(
-    visual: UrdfVisual, name: str, body: int, body_from_link: Float[np.ndarray, "4 4"], surface: trimesh.Trimesh
-) -> Part:
-    body_from_part = body_from_link @ visual.link_from_visual
-    in_body = surface.copy().apply_transform(body_from_part)
-    return Part(
-        name=name,
-        visual=visual.name,
-        body=body,
-        body_from_part=body_from_part,
-        mesh=visual.mesh,
-        scale=visual.scale,
-        uv_scale=visual.scale,
-        shape=visual.shape,
-        rgba=visual.rgba,
-        surface=in_body,
-    )

@@ -40,9 +40,7 @@ class Episode:
     """One joint's share of the script; ends are one past the last frame."""
 
     joint: int
-    """The joint that moves."""
     start: int
-    """First frame of the share."""
     moves: int
     """First frame at which the joint is elsewhere."""
     hidden: int
@@ -147,12 +145,7 @@ def occlusion_script(
 ) -> tuple[Float[np.ndarray, "S J"], list[Episode]]:
     """Joint positions at every frame, and what happens when.
 
-    Args:
-        articulation: the object.
-        joints: the joints that move, in order, one share each.
-        hiding: how long the shares are.
-        hidden: frames for which every joint's entity is hidden.
-        rng: what the script is drawn from.
+    Every joint has one share, in which its entity is hidden for ``hidden`` frames.
     """
     episodes: list[Episode] = []
     movements: list[Float[np.ndarray, " N"]] = []

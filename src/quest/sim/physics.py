@@ -91,7 +91,6 @@ class Heft:
     """What a body weighs."""
 
     mass_kg: float
-    """Its mass."""
     centre: Float[np.ndarray, "3"]
     """Its centre of mass, in the body's frame."""
     inertia: Float[np.ndarray, "3 3"]
@@ -103,10 +102,6 @@ class Heft:
 
         A part weighs as much as its bounding box, or as a shell of 2 cm of its surface if that is less. A body without
         parts weighs a gram.
-
-        Args:
-            parts: parts of one body.
-            density: kg / m^3.
         """
         if not parts:
             return cls(_LEAST_MASS_KG, np.zeros(3), _LEAST_MASS_KG * np.eye(3) * _LEAST_EDGE_M**2)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,11 +23,8 @@ class TakeSpec:
     object_id: str
     """Folder name, ``category-seed``, or the path of a user's own folder or URDF."""
     level: int
-    """How many joints move."""
     seed: int
-    """Of the take."""
     settings: TakeSettings = TakeSettings()
-    """How it is made."""
     suite: Suite | None = None
     """Which suite it belongs to; None for an ordinary take."""
 
@@ -102,23 +98,15 @@ def procedural_objects(
 
 
 class ObjectShelf:
-    """Loads objects by source and id, and keeps them; procedural ones are made in a temporary folder.
+    """Loads objects by source and id, and keeps them.
 
-    Args:
-        root: folder of PartNet-Mobility folders; default is the environment's ``QUEST_OBJECTS``.
+    ``root`` is the folder of PartNet-Mobility folders; by default the environment's ``QUEST_OBJECTS``.
     """
 
     def __init__(self, root: Path | None = None) -> None:
         self._root = root
         self._folders: dict[str, Path] | None = None
-        self._made = tempfile.TemporaryDirectory(prefix="quest-objects-")
         self._loaded: dict[tuple[str, str], SimObject | ObjectError] = {}
-
-    def __enter__(self) -> ObjectShelf:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._made.cleanup()
 
     def load(self, source: str, object_id: str) -> SimObject:
         """An object; one that failed before fails again without being read again.
@@ -129,7 +117,7 @@ class ObjectShelf:
         key = (source, object_id)
         if key not in self._loaded:
             try:
-                self._loaded[key] = load_object(self._folder(source, object_id))
+                self._loaded[key] = self._load(source, object_id)
             except ObjectError as error:
                 self._loaded[key] = error
         found = self._loaded[key]
@@ -137,16 +125,16 @@ class ObjectShelf:
             raise found
         return found
 
-    def _folder(self, source: str, object_id: str) -> Path:
+    def _load(self, source: str, object_id: str) -> SimObject:
         if source == "own":
-            return Path(object_id)
+            return load_object(Path(object_id))
         if source == "procedural":
             category, _, seed = object_id.rpartition("-")
             if category not in CATEGORIES or not seed.isdecimal():
                 raise ObjectError(
                     f"procedural object {object_id!r}: expected CATEGORY-SEED with one of {', '.join(CATEGORIES)}"
                 )
-            return make_object(category, int(seed), Path(self._made.name) / object_id)
+            return make_object(category, int(seed))
         if self._folders is None:
             self._folders = {folder.name: folder for folder in find_objects(self._root)}
         if object_id not in self._folders:
@@ -154,4 +142,4 @@ class ObjectShelf:
                 f"object {object_id!r}: expected one of the {len(self._folders)} folders of PartNet-Mobility objects, "
                 f"found none of that name; check the id and the folder"
             )
-        return self._folders[object_id]
+        return load_object(self._folders[object_id])

@@ -45,12 +45,6 @@ class Portrait:
 def portray(sim_object: SimObject, renderer: Renderer, *, sides: int = 2, size_px: int = 288) -> list[Portrait]:
     """Pictures of an object: from every side closed, then from every side open; always the same ones.
 
-    Args:
-        sim_object: the object.
-        renderer: the process's renderer.
-        sides: from how many sides.
-        size_px: edge length of a picture.
-
     Raises:
         ConfigError: fewer than one side, or pictures of fewer than 16 pixels.
         RendererError: the renderer broke.

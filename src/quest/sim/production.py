@@ -1,7 +1,7 @@
 """Making many takes: what one process does, and what each worker of a cluster does (:mod:`quest.sim.cluster`).
 
-A studio makes one take after the other; it holds what is costly to set up, a renderer and loaded objects. While a take
-is compressed and written in a thread of its own, the studio makes the next one.
+A studio makes one take after the other. While a take is compressed and written in a thread of its own, the studio makes
+the next one.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -35,9 +34,8 @@ class TakeMade:
     """A take is in the store."""
 
     spec: TakeSpec
-    """Which one."""
     frames: int
-    """Its frames, all views counted."""
+    """All views counted."""
     seconds: float
     """How long it took to make, without writing it."""
     warnings: tuple[str, ...] = ()
@@ -51,9 +49,7 @@ class TakeSkipped:
     """A take cannot be made."""
 
     spec: TakeSpec
-    """Which one."""
     reason: str
-    """Why not."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +76,9 @@ class Studio(Protocol):
         """A take, and what was found wrong with its object.
 
         Raises:
+            ConfigError: its suite cannot be made with its settings.
             ObjectError: it cannot be made from this object.
+            RendererError: the renderer broke.
         """
         ...
 
@@ -89,16 +87,15 @@ class Studio(Protocol):
 class StudioOpener(Protocol):
     """Says how a studio is set up; pickled, it sets one up on another machine."""
 
-    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> AbstractContextManager[Studio]:
+    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> Studio:
         """A studio that can make these takes.
 
-        Args:
-            specs: the takes.
-            complete: whether it must have all their objects. Workers of a cluster must, or it would depend on who
-                makes a take whether it can be made.
+        ``complete``: it must have all their objects. Workers of a cluster must, or it would depend on who makes a take
+        whether it can be made.
 
         Raises:
-            ObjectError: there is no folder of objects to take the named ones from.
+            ObjectError: there is no folder of objects to take the named ones from, or it is to be complete and some
+                objects have none here.
             RendererError: nothing can render here.
         """
         ...
@@ -114,13 +111,7 @@ class StudioSettings:
     """The command that makes these takes, for their provenance."""
 
     def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> RenderingStudio:
-        """A studio that can make these takes.
-
-        Raises:
-            ObjectError: there is no folder of objects to take the named ones from, or it is to be complete and some
-                objects have none here.
-            RendererError: nothing can render here.
-        """
+        """See :class:`StudioOpener`."""
         wanted = {spec.object_id for spec in specs if spec.source == "partnet"}
         if wanted:  # told before the renderer warms up
             missing = sorted(wanted - {folder.name for folder in find_objects(self.objects_root)})
@@ -136,44 +127,26 @@ class StudioSettings:
 
 
 class RenderingStudio:
-    """A renderer and loaded objects; a context manager."""
+    """What is costly to set up: a renderer and loaded objects."""
 
     def __init__(self, settings: StudioSettings) -> None:
         self._renderer = Renderer()
         self._shelf = ObjectShelf(settings.objects_root)
         self._provenance = {**self.describe(), "command": settings.command}
 
-    def __enter__(self) -> RenderingStudio:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._shelf.__exit__(*exception)
-
     def describe(self) -> dict[str, Any]:
         """Commit, versions and renderer."""
         return {"commit": code_commit(), "versions": package_versions(), "renderer": str(self._renderer.device)}
 
     def make(self, spec: TakeSpec) -> tuple[Take, tuple[str, ...]]:
-        """A take, and what was found wrong with its object.
-
-        Raises:
-            ConfigError: its suite cannot be made with its settings.
-            ObjectError: it cannot be made from this object.
-            RendererError: the renderer broke.
-        """
+        """See :class:`Studio`."""
         return make_take(spec, renderer=self._renderer, shelf=self._shelf, provenance=self._provenance)
 
 
 def make_take(
     spec: TakeSpec, *, renderer: Renderer, shelf: ObjectShelf, provenance: dict[str, Any] | None = None
 ) -> tuple[Take, tuple[str, ...]]:
-    """One take, and what was found wrong with its object.
-
-    Raises:
-        ConfigError: its suite cannot be made with its settings.
-        ObjectError: it cannot be made from this object.
-        RendererError: the renderer broke.
-    """
+    """One take, and what was found wrong with its object; errors as those of :meth:`Studio.make`."""
     sim_object = shelf.load(spec.source, spec.object_id)
     if spec.source == "own":
         provenance = {**(provenance or {}), "object": object_digest(Path(spec.object_id))}
@@ -226,27 +199,20 @@ def produce(specs: Sequence[TakeSpec], store: TakeStore, opener: StudioOpener, *
 
     Interrupted, it finishes the take that is being written; the store never has a part of one.
 
-    Args:
-        specs: the takes; the store must not have them.
-        store: where they go.
-        opener: who makes them.
-        report: told of every take when it is in the store, or cannot be made.
-
     Raises:
         ObjectError, RendererError: no studio can be opened here.
         TakeError: the store cannot be written.
     """
-    writing: tuple[TakeMade, Future[None]] | None = None
+    studio = opener.open(specs)
+    writing: list[tuple[TakeMade, Future[None]]] = []
 
     def finish() -> None:
-        nonlocal writing
-        if writing is not None:
-            made, future = writing
-            writing = None
-            future.result()
+        while writing:
+            made, written = writing.pop()
+            written.result()
             report(made)
 
-    with ThreadPoolExecutor(1, thread_name_prefix="quest-write") as writer, opener.open(specs) as studio:
+    with ThreadPoolExecutor(1, thread_name_prefix="quest-write") as writer:
         try:
             for spec in specs:
                 start = time.perf_counter()
@@ -259,7 +225,7 @@ def produce(specs: Sequence[TakeSpec], store: TakeStore, opener: StudioOpener, *
                 made = TakeMade(spec, len(take) * len(take.views), time.perf_counter() - start, warnings)
                 large = sum(view.clip.rgb.nbytes * 3 for view in take.views) > _WAIT_FOR_BYTES
                 finish()
-                writing = made, writer.submit(write_once, store, take)
+                writing.append((made, writer.submit(write_once, store, take)))
                 del take
                 if large:
                     finish()

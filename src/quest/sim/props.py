@@ -6,18 +6,18 @@ changes, odd materials, or a camera that is hit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial import ConvexHull, QhullError
 
-from quest.sim.appearance import Appearance, Distractor, ObjectLook
+from quest.sim.appearance import add_shape
 from quest.sim.articulation import apply
 from quest.sim.cameras import PosedCamera
 from quest.sim.motion import HOLD_FRAMES
-from quest.sim.surfaces import Surface, Texture, TextureKind, make_material, sample_surface, triple
+from quest.sim.surfaces import Surface, make_material, sample_surface
 
 
 @runtime_checkable
@@ -52,7 +52,7 @@ class Shape:
     """A box or a cylinder before a camera."""
 
     kind: Literal["box", "cylinder"]
-    """``box``, or ``cylinder`` with its axis along x."""
+    """A cylinder's axis is x."""
     half_m: Float[np.ndarray, "3"]
     """Half extents along x, y, z; a cylinder's last two are its radius."""
     cam_from_shape: Float[np.ndarray, "4 4"]
@@ -88,7 +88,6 @@ class Occluder:
     shape: Shape
     """What it is, at the place where it hides something."""
     surface: Surface
-    """Its material."""
     world_from_shape: Float[np.ndarray, "T 4 4"]
     """Its pose at every frame of the script."""
 
@@ -96,18 +95,12 @@ class Occluder:
         """Put it into a ``sapien.Scene``; returns the entity that :meth:`place` moves."""
         import sapien
 
-        shape, material = self.shape, make_material(self.surface)
-        half = shape.half_m.astype(np.float32).tolist()
-        component = sapien.render.RenderBodyComponent()
-        if shape.kind == "box":
-            component.attach(sapien.render.RenderShapeBox(half, material))
+        half, material = self.shape.half_m.astype(np.float32).tolist(), make_material(self.surface)
+        if self.shape.kind == "box":
+            shape: Any = sapien.render.RenderShapeBox(half, material)
         else:
-            component.attach(sapien.render.RenderShapeCylinder(half[1], half[0], material))
-        entity = sapien.Entity()
-        entity.add_component(component)
-        scene.add_entity(entity)
-        self.place(entity, 0)
-        return entity
+            shape = sapien.render.RenderShapeCylinder(half[1], half[0], material)
+        return add_shape(scene, shape, sapien.Pose(self.world_from_shape[0]))
 
     def place(self, actors: Any, frame: int) -> None:
         """Move its entity to where it is at a frame of the script."""
@@ -123,16 +116,9 @@ class Occluder:
 def fit_shape(
     slopes: Float[np.ndarray, "N 2"], posed: PosedCamera, nearest_m: float, rng: np.random.Generator
 ) -> Shape | None:
-    """A random shape that hides all given rays and stands nearer to the camera than ``nearest_m``.
+    """A random shape that hides all given rays (x / z, y / z) and stands nearer to the camera than ``nearest_m``.
 
-    Args:
-        slopes: x / z and y / z of the rays.
-        posed: the camera.
-        nearest_m: depth of what it must not touch.
-        rng: what it is drawn from.
-
-    Returns:
-        The shape, or None if it would hide too much of the image.
+    None if it would hide too much of the image.
     """
     form = str(rng.choice(list(_FORMS), p=list(_FORMS.values())))
     roll, thick = float(rng.normal(0, np.deg2rad(12))), float(rng.uniform(0.02, 0.1))
@@ -180,13 +166,9 @@ def _fits(shape: Shape, slopes: Float[np.ndarray, "N 2"]) -> bool:
 def slide_in(
     shape: Shape, posed: PosedCamera, away: Float[np.ndarray, " T"], rng: np.random.Generator
 ) -> Float[np.ndarray, "T 4 4"]:
-    """Poses in the world of a shape that comes from beyond an edge of the image, parallel to the image.
+    """Poses in the world of a shape that comes from beyond a random edge of the image, parallel to the image.
 
-    Args:
-        shape: where it hides something.
-        posed: the camera.
-        away: how far it is at every frame: 0 in place, 1 gone: far below the ground, where it casts no shadow.
-        rng: what the edge is drawn from.
+    ``away`` says how far it is at every frame: 0 in place, 1 gone: far below the ground, where it casts no shadow.
     """
     camera, vertices = posed.camera, shape.vertices
     axis, side = int(rng.choice(2, p=(0.7, 0.3))), int(rng.integers(2))
@@ -227,7 +209,6 @@ DISTURBANCES: tuple[Disturbance, ...] = get_args(Disturbance)
 _FADE_FRAMES = (1, 12)
 _AMBIENT = (0.35, 1.8)
 _LAMPS = (0.15, 1.6)
-_ODD_KINDS: tuple[TextureKind, ...] = ("checker", "stripes", "tiles", "speckle", "noise")
 
 
 def disturbed_at(frames: int, rng: np.random.Generator) -> int:
@@ -275,19 +256,3 @@ def change_light(frames: int, rng: np.random.Generator) -> LightChange:
         tint = np.exp(rng.normal(0.0, 0.15, 3))
         factors.append(1 + share * (strength * tint / tint.mean() - 1))
     return LightChange(*factors)
-
-
-def odd_appearance(appearance: Appearance, rng: np.random.Generator) -> Appearance:
-    """The same scene in materials that no room has: strong colours, coarse patterns, on everything, the object too."""
-    distractors: tuple[Distractor, ...] = tuple(replace(d, surface=_odd(rng)) for d in appearance.distractors)
-    look = ObjectLook(True, tuple(_odd(rng) for _ in range(3)), _odd(rng), bool(rng.random() < 0.5), 0)
-    wall = None if appearance.wall is None else _odd(rng)
-    return replace(appearance, floor=_odd(rng), wall=wall, distractors=distractors, look=look)
-
-
-def _odd(rng: np.random.Generator) -> Surface:
-    first = triple(rng.uniform(0.0, 1.0, 3) ** 0.5)
-    second = triple(rng.uniform(0.0, 1.0, 3) ** 2)
-    kind = _ODD_KINDS[int(rng.integers(len(_ODD_KINDS)))]
-    texture = Texture(kind, first, second, int(rng.integers(1, 5)), int(rng.integers(2**31)))
-    return Surface(first, float(rng.uniform(0.2, 1.0)), 0.0, float(rng.uniform(0.0, 0.6)), texture)

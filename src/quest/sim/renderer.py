@@ -24,6 +24,7 @@ from quest.sim.articulation import Part
 from quest.sim.cameras import PosedCamera
 from quest.sim.objects import SimObject
 from quest.sim.surfaces import ensure_uv
+from quest.sim.urdf import MeshData
 
 if TYPE_CHECKING:
     import sapien
@@ -187,30 +188,51 @@ def _groups(sim_object: SimObject) -> list[tuple[int, int, list[Part]]]:
 
 def _shapes(sapien: Any, part: Part) -> list[Any]:
     # SAPIEN shares meshes between scenes, and once drawn they no longer take texture coordinates: they get them here.
-    render = sapien.render
     if part.mesh is not None:
         try:
-            shape = render.RenderShapeTriangleMesh(str(part.mesh), np.array(part.scale, dtype=np.float32))
-            shape.set_local_pose(sapien.Pose(part.body_from_part))
-            shape.set_name(part.name)
+            shape = _mesh_shape(sapien, part)
+        except RuntimeError:
+            pass  # a file that trimesh reads and assimp refuses; its geometry is known
+        else:
             for piece in shape.parts:
                 ensure_uv(piece, np.array(part.uv_scale))
                 if part.rgba is not None and piece.material.base_color_texture is None:
                     piece.material.set_base_color(part.rgba)
             return [shape] if np.prod(part.scale) > 0 else [_mirrored(sapien, piece, part) for piece in shape.parts]
-        except RuntimeError:
-            pass  # a file that trimesh reads and assimp refuses; its geometry is known
     corners = np.asarray(part.surface.triangles, dtype=np.float32).reshape(-1, 3)
     normals = np.repeat(np.asarray(part.surface.face_normals, dtype=np.float32), 3, axis=0)
-    material = render.RenderMaterial()
-    material.set_base_color(part.rgba or (0.7, 0.7, 0.7, 1.0))
-    material.set_roughness(0.6)
-    faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
-    shape = render.RenderShapeTriangleMesh(corners, faces, normals, np.zeros((len(corners), 2), np.float32), material)
+    no_uv = np.zeros((len(corners), 2), np.float32)
+    shape = _triangles(sapien, (corners, normals, no_uv), part.rgba or (0.7, 0.7, 0.7, 1.0), roughness=0.6)
     shape.set_name(part.name)
     for piece in shape.parts:
         ensure_uv(piece, np.ones(3))
     return [shape]
+
+
+def _mesh_shape(sapien: Any, part: Part) -> Any:
+    """A part's own mesh with its name, scale and pose."""
+    if isinstance(part.mesh, MeshData):
+        look = (*part.mesh.colour, 1.0), part.mesh.roughness
+        shape = _triangles(sapien, part.mesh.corners, *look, specular=0.5)  # as SAPIEN gives to mesh files
+        shape.set_scale(np.array(part.scale, dtype=np.float32))
+    else:
+        shape = sapien.render.RenderShapeTriangleMesh(str(part.mesh), np.array(part.scale, dtype=np.float32))
+    shape.set_local_pose(sapien.Pose(part.body_from_part))
+    shape.set_name(part.name)
+    return shape
+
+
+def _triangles(
+    sapien: Any, corners: tuple[np.ndarray, ...], rgba: tuple[float, ...], roughness: float, specular: float = 0.0
+) -> Any:
+    """Triangles that share no corner, from the position, normal and texture coordinate of every corner."""
+    material = sapien.render.RenderMaterial()
+    material.set_base_color(rgba)
+    material.set_roughness(roughness)
+    material.set_specular(specular)
+    position, normal, uv = corners
+    faces = np.arange(len(position), dtype=np.uint32).reshape(-1, 3)
+    return sapien.render.RenderShapeTriangleMesh(position, faces, normal, uv, material)
 
 
 def _mirrored(sapien: Any, piece: Any, part: Part) -> Any:

@@ -48,7 +48,7 @@ class Playback:
     def of(cls, sim_object: SimObject, script: Float[np.ndarray, "S J"], every: int = 1) -> Playback:
         """Plays every n-th frame of a script."""
         kept = np.arange(0, len(script), every)
-        poses = np.stack([sim_object.articulation.poses(p) for p in script[kept]])
+        poses = sim_object.articulation.poses(script[kept])
         points = np.stack([[apply(p[e.body], e.point) for e in sim_object.entities] for p in poses])
         velocity = (np.gradient(script, axis=0) * FRAMES_PER_S)[kept]
         return cls(kept, script[kept], velocity, poses, points, _swept(sim_object, poses))
@@ -61,7 +61,6 @@ class Staging:
     moved_joints: tuple[int, ...]
     """The joints that move, in order."""
     playback: Playback
-    """The motion."""
     cameras: tuple[CameraPath, ...]
     """Where it is seen from at every frame of the script."""
     stage: Stage
@@ -146,11 +145,7 @@ def choose_joints(
 
     Joints whose entities can be seen while the object is closed come first: a tray moves after its oven's door.
 
-    Args:
-        sim_object: the object.
-        level: how many joints.
-        rng: what they are drawn from.
-        among: the joints that they are chosen from; by default all that carry an entity that moves.
+    They are chosen from ``among``, by default all that carry an entity that moves.
 
     Raises:
         ObjectError: there are fewer than ``level`` joints that carry an entity that moves.
@@ -186,7 +181,7 @@ def _reach(sim_object: SimObject) -> Float[np.ndarray, "N 3"]:
     joints = sim_object.articulation.joints
     rest = sim_object.articulation.rest
     opened = rest + np.diag([j.opening() for j in joints])
-    return _swept(sim_object, np.stack([sim_object.articulation.poses(p) for p in (rest, *opened)]))
+    return _swept(sim_object, sim_object.articulation.poses(np.stack((rest, *opened))))
 
 
 def _cameras(

@@ -40,11 +40,9 @@ _DEPTH_M = {"Refrigerator": (0.9, 0.65)}
 def real_scale(articulation: Articulation, category: str) -> float:
     """Metres per unit that give an object the size that things of its category have; a guess for unknown ones.
 
-    Args:
-        articulation: the object as it is in PartNet-Mobility: its front along an axis, z up.
-        category: in PartNet-Mobility's words.
+    It stands as it does in PartNet-Mobility: its front along an axis, z up.
     """
-    extent = np.ptp(articulation.world_points(articulation.rest), axis=0)
+    extent = articulation.extent_m
     dimension, metres = _REAL_SIZE_M.get(category, _DEFAULT_SIZE_M)
     scale = size_scale(articulation, dimension, metres)
     deepest, usual = _DEPTH_M.get(category, (np.inf, np.inf))
@@ -55,7 +53,7 @@ def real_scale(articulation: Articulation, category: str) -> float:
 
 def size_scale(articulation: Articulation, dimension: Literal["height", "length"], metres: float) -> float:
     """Metres per unit that make an object's height, or its longest extent, so many metres at rest."""
-    extent = np.ptp(articulation.world_points(articulation.rest), axis=0)
+    extent = articulation.extent_m
     length = float(extent[2] if dimension == "height" else extent.max())
     return metres / max(length, 1e-9)
 
@@ -64,7 +62,7 @@ def closed(articulation: Articulation) -> Articulation:
     """The object with doors that are modelled half open at their limit where it takes less room."""
 
     def room(trial: Articulation) -> float:
-        return float(np.prod(np.ptp(trial.world_points(trial.rest), axis=0)))
+        return float(np.prod(trial.extent_m))
 
     for index, joint in enumerate(articulation.joints):
         below, above = joint.travel()
@@ -80,44 +78,35 @@ def closed(articulation: Articulation) -> Articulation:
     return articulation
 
 
+def _shifted(pose: Float[np.ndarray, "4 4"], factor: float) -> Float[np.ndarray, "4 4"]:
+    """A pose whose place is scaled about the origin."""
+    pose = pose.copy()
+    pose[:3, 3] *= factor
+    return pose
+
+
 def scaled(articulation: Articulation, scale: float) -> Articulation:
     """An object scaled about the world's origin."""
-
-    def pose(matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        matrix = matrix.copy()
-        matrix[:3, 3] *= scale
-        return matrix
-
     parts = []
     for p in articulation.parts:
         sx, sy, sz = (s * scale for s in p.scale)
-        parts.append(
-            replace(
-                p,
-                body_from_part=pose(p.body_from_part),
-                scale=(sx, sy, sz),
-                uv_scale=(sx, sy, sz),
-                surface=p.surface.copy().apply_scale(scale),
-            )
-        )
+        pose, surface = _shifted(p.body_from_part, scale), p.surface.copy().apply_scale(scale)
+        parts.append(replace(p, body_from_part=pose, scale=(sx, sy, sz), uv_scale=(sx, sy, sz), surface=surface))
     joints = []
     for j in articulation.joints:
         factor = scale if j.joint.kind == "prismatic" else 1.0
         record = replace(j.joint, lower=j.joint.lower * factor, upper=j.joint.upper * factor)
-        joints.append(replace(j, joint=record, parent_from_joint=pose(j.parent_from_joint), rest=j.rest * factor))
-    return replace(
-        articulation, parts=tuple(parts), joints=tuple(joints), world_from_root=pose(articulation.world_from_root)
-    )
+        pose = _shifted(j.parent_from_joint, scale)
+        joints.append(replace(j, joint=record, parent_from_joint=pose, rest=j.rest * factor))
+    root = _shifted(articulation.world_from_root, scale)
+    return replace(articulation, parts=tuple(parts), joints=tuple(joints), world_from_root=root)
 
 
 def placed(articulation: Articulation, front_rad: float | None = None, *, by_lids: bool = False) -> Articulation:
     """The object standing on the floor around the origin, its front towards +x.
 
-    Args:
-        articulation: the object.
-        front_rad: azimuth of its front as it stands now; None to find out from its doors and drawers.
-        by_lids: whether the free edges of lids tell where the front is, if doors and drawers do not; else it is -x, as
-            in PartNet-Mobility.
+    ``front_rad`` is the azimuth of its front as it stands now; None to find out from its doors and drawers or, with
+    ``by_lids``, from the free edges of lids; if these do not tell it is -x, as in PartNet-Mobility.
     """
     yaw = -(_front_azimuth(articulation, by_lids=by_lids) if front_rad is None else front_rad)
     turn = np.eye(4)
@@ -132,11 +121,9 @@ def placed(articulation: Articulation, front_rad: float | None = None, *, by_lid
 
 def _front_azimuth(articulation: Articulation, *, by_lids: bool = False) -> float:
     """Where the object's doors and drawers open to, as a multiple of a right angle; PartNet's -x if that is unclear."""
-    lines = articulation.axes(articulation.poses(articulation.rest))
-    lids = np.zeros(2)
     poses = articulation.poses(articulation.rest)
-    total = np.zeros(2)
-    opened = 0.0
+    lines = articulation.axes(poses)
+    lids, total, opened = np.zeros(2), np.zeros(2), 0.0
     for j, joint in enumerate(articulation.joints):
         points = articulation.body_points[1 + j]
         below, above = joint.travel()
@@ -179,19 +166,12 @@ def with_scaled_origins(urdf: Urdf, warnings: list[str]) -> Urdf:
     (factor,) = factors
     warnings.append(f"all meshes are scaled by {factor:g} but joint origins are not: origins were scaled alike")
 
-    def scaled(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
-        pose = pose.copy()
-        pose[:3, 3] *= factor
-        return pose
-
     links = {
-        name: tuple(replace(v, link_from_visual=scaled(v.link_from_visual)) for v in vs)
+        name: tuple(replace(v, link_from_visual=_shifted(v.link_from_visual, factor)) for v in vs)
         for name, vs in urdf.links.items()
     }
     joints = []
     for j in urdf.joints:
-        travel = factor if j.kind == "prismatic" else 1.0
-        joints.append(
-            replace(j, parent_from_joint=scaled(j.parent_from_joint), lower=j.lower * travel, upper=j.upper * travel)
-        )
+        travel, pose = factor if j.kind == "prismatic" else 1.0, _shifted(j.parent_from_joint, factor)
+        joints.append(replace(j, parent_from_joint=pose, lower=j.lower * travel, upper=j.upper * travel))
     return Urdf(links, tuple(joints))

@@ -15,9 +15,7 @@ from quest.sim.objects import SimObject
 def draw_stretch(rng: np.random.Generator, most: float) -> Float[np.ndarray, "3"]:
     """Random factors of depth, width and height that leave an object about as large as it is.
 
-    Args:
-        rng: what they are drawn from.
-        most: each is drawn from one ``most``-th to ``most``, evenly in its logarithm, before their product is made 1.
+    Each is drawn from one ``most``-th to ``most``, evenly in its logarithm, before their product is made 1.
     """
     logs = rng.uniform(-np.log(most), np.log(most), size=3)
     return np.exp(logs - logs.mean())
@@ -29,9 +27,7 @@ def stretched(sim_object: SimObject, factors: Float[np.ndarray, "3"]) -> SimObje
     Entities, limits of slides and axes go with it; limits of turns stay. A part whose mesh lies askew is drawn in
     its plain colour, as a scale along its own axes cannot stretch it.
 
-    Args:
-        sim_object: as it was loaded.
-        factors: of depth, width and height (world x, y, z).
+    The factors are those of world x, y, z.
 
     Raises:
         ObjectError: a joint turns about an oblique axis and is not at zero when closed, so that stretching would turn
@@ -47,7 +43,7 @@ def stretched(sim_object: SimObject, factors: Float[np.ndarray, "3"]) -> SimObje
         before.body_names, tuple(_part(part, stretch[part.body]) for part in before.parts), before.joints, root
     )
     after = _with_joints(after, poses, factors, sim_object.object_id)
-    extent = np.ptp(after.world_points(after.rest), axis=0)
+    extent = after.extent_m
     entities = []
     for e in sim_object.entities:
         point = stretch[e.body] @ e.point
@@ -80,14 +76,7 @@ def _with_joints(
     factors: Float[np.ndarray, "3"],
     object_id: str,
 ) -> Articulation:
-    """The object with joints between bodies that stand where stretching put them.
-
-    Args:
-        after: the object, its joints as before.
-        poses: of the bodies before.
-        factors: of depth, width and height.
-        object_id: for messages.
-    """
+    """The object with joints between bodies that stand where stretching put them."""
     joints = []
     for joint in after.joints:
         world_from_parent = poses[joint.parent]

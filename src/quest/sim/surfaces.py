@@ -29,7 +29,6 @@ class Texture:
     """A procedural texture; :func:`paint` makes its image."""
 
     kind: TextureKind
-    """Pattern."""
     first: Colour
     """Main colour."""
     second: Colour
@@ -41,12 +40,7 @@ class Texture:
 
 
 def paint(texture: Texture, *, size: int = 128) -> UInt8[np.ndarray, "S S 4"]:
-    """The image of a texture; its edges match, the grain runs along x, alpha is 255.
-
-    Args:
-        texture: what to draw.
-        size: edge length in pixels.
-    """
+    """The image of a texture; its edges match, the grain runs along x, alpha is 255."""
     rng = np.random.default_rng(texture.seed)
     u, v = np.meshgrid(np.arange(size) / size, np.arange(size) / size)
     n = max(1, texture.repeats)
@@ -242,10 +236,7 @@ def sample_surface(
 ) -> Surface:
     """Draw a material.
 
-    Args:
-        rng: source of randomness.
-        kinds: textures that may come out.
-        textured: how often there is a texture.
+    ``textured`` says how often there is a texture, one of ``kinds``.
     """
     colour = sample_colour(rng)
     texture = None

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, Int
 
 from quest.errors import ObjectError
 from quest.untrusted import MOST_TEXT, reading, require_file
@@ -26,17 +26,31 @@ _JOINT_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "
 
 
 @dataclass(frozen=True)
+class MeshData:
+    """A mesh that has no file."""
+
+    vertices: Float[np.ndarray, "N 3"]
+    """Positions."""
+    faces: Int[np.ndarray, "M 3"]
+    """Vertex indices, counter-clockwise seen from outside."""
+    corners: tuple[Float32[np.ndarray, "M*3 3"], Float32[np.ndarray, "M*3 3"], Float32[np.ndarray, "M*3 2"]]
+    """Position, normal and texture coordinate of every corner of every face, as they are drawn."""
+    colour: tuple[float, float, float]
+    """Linear red, green, blue."""
+    roughness: float
+    """0 mirror, 1 matt."""
+
+
+@dataclass(frozen=True)
 class UrdfVisual:
-    """One visual of a URDF link: a mesh file or a primitive."""
+    """One visual of a URDF link: a mesh or a primitive."""
 
     name: str
-    """The visual's name; empty where the file gives none."""
     link_from_visual: Float[np.ndarray, "4 4"]
     """Pose in its URDF link."""
-    mesh: Path | None
-    """Mesh file, or None for a primitive."""
+    mesh: Path | MeshData | None
+    """Mesh file or mesh, or None for a primitive."""
     scale: tuple[float, float, float]
-    """Factors per axis of the mesh."""
     shape: str
     """``mesh``, ``box``, ``cylinder`` or ``sphere``."""
     size: tuple[float, ...]
@@ -50,13 +64,10 @@ class UrdfJoint:
     """One joint of a URDF."""
 
     name: str
-    """The joint's name."""
     kind: str
     """``revolute``, ``prismatic`` or ``fixed``."""
     parent: str
-    """Name of the parent link."""
     child: str
-    """Name of the child link."""
     parent_from_joint: Float[np.ndarray, "4 4"]
     """Pose of the joint's frame in the parent link."""
     axis: Float[np.ndarray, "3"]

@@ -1,4 +1,4 @@
-"""Procedural furniture and appliances, written in PartNet-Mobility's shape."""
+"""Procedural furniture and appliances."""
 
 from quest.sim.procedural.catalogue import CATEGORIES, MIXES, category_for_seed, make_object
 

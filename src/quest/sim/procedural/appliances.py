@@ -15,8 +15,20 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim.procedural.handles import SUNK_M, HandleKind, HandleStyle, handle_part, sample_any_style
-from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
-from quest.sim.procedural.shapes import UP, box, lathe, prism_between
+from quest.sim.procedural.model import (
+    FRONT,
+    UP,
+    Dice,
+    Link,
+    Mesh,
+    ObjectModel,
+    Part,
+    box,
+    join,
+    lathe,
+    prism_between,
+    turn_x,
+)  # fmt: skip
 from quest.types import GRIPS
 
 _MARGIN_M = 0.004
@@ -44,8 +56,7 @@ class _Panel:
 
     def turned(self, mesh: Mesh) -> Mesh:
         """What is drawn for an upright panel, leant back with this one."""
-        cos, sin = np.cos(self.tilt), np.sin(self.tilt)
-        return mesh.rotated(np.array([[1.0, 0.0, 0.0], [0.0, cos, sin], [0.0, -sin, cos]]))
+        return mesh.rotated(turn_x(-self.tilt))
 
     def at(self, across: float, up: float) -> tuple[float, float, float]:
         """A point of its face in the object's frame; ``across`` from its middle, ``up`` from its foot, metres."""
@@ -58,40 +69,34 @@ class _Panel:
         return (0.0, -float(np.cos(self.tilt)), float(np.sin(self.tilt)))
 
 
-def with_dials(model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+def with_dials(model: ObjectModel, rng: Dice) -> ObjectModel:
     """The object with a panel of one to seven dials, each a link that turns; painted ones (``dial``) are gone.
 
-    The panel lies above or beside the doors where the front has room there, else, and at times anyway, stands on top at
-    the back.
-
-    Args:
-        model: an object whose fronts look along -y.
-        rng: source of randomness.
+    Its fronts look along -y. The panel lies above or beside the doors where the front has room there, else, and at
+    times anyway, stands on top at the back.
     """
     model = replace(model, body=tuple(part for part in model.body if part.role != "dial"))
     panels = _free_panels(model, rng)
-    panel = panels[int(rng.integers(len(panels)))]
+    panel = rng.pick(panels)
     face = box((-panel.width / 2, 0.0, 0.0), (panel.width / 2, panel.depth, panel.height))
-    body = [Part("control_panel", panel.turned(face).moved(panel.foot), str(rng.choice(_DIAL_SURFACES)))]
+    body = [Part("control_panel", panel.turned(face).moved(panel.foot), rng.pick(_DIAL_SURFACES))]
     row = panel.width >= panel.height
     long, short = (panel.width, panel.height) if row else (panel.height, panel.width)
-    radius = min(float(rng.uniform(0.013, 0.034)), 0.36 * short)
+    radius = min(rng.real(0.013, 0.034), 0.36 * short)
     offsets = _places(long, radius, rng)
-    level = float(rng.uniform(0.4, 0.6)) * short
-    if rng.random() < 0.5:
+    level = rng.real(0.4, 0.6) * short
+    if rng.chance(0.5):
         body += _displays(panel, offsets, radius, row=row)
-    mesh, surface = _dial(radius, rng), str(rng.choice(_DIAL_SURFACES))
+    mesh, surface = _dial(radius, rng), rng.pick(_DIAL_SURFACES)
     links = list(model.links)
     for offset in offsets:
         across, up = (offset, level) if row else (level - short / 2, offset + long / 2)
-        turned = panel.turned(mesh)
-        upper = float(np.deg2rad(rng.uniform(90, 300)))
-        part = Part("knob", turned, surface)
-        links.append(Link(f"link_{len(links)}", (part,), "revolute", panel.at(across, up), panel.out, upper))
+        part = Part("knob", panel.turned(mesh), surface)
+        links.append(Link((part,), "revolute", panel.at(across, up), panel.out, rng.angle(90, 300)))
     return ObjectModel(model.model_cat, (*model.body, *body), tuple(links))
 
 
-def _free_panels(model: ObjectModel, rng: np.random.Generator) -> list[_Panel]:
+def _free_panels(model: ObjectModel, rng: Dice) -> list[_Panel]:
     """Where the front has room for a panel, and one on top at the back."""
     body = np.concatenate([part.mesh.vertices for part in model.body])
     low, high = body.min(axis=0), body.max(axis=0)
@@ -99,13 +104,13 @@ def _free_panels(model: ObjectModel, rng: np.random.Generator) -> list[_Panel]:
         part.mesh.vertices + link.origin for link in model.links for part in link.parts if part.role not in GRIPS
     ])  # fmt: skip
     near, far = fronts.min(axis=0), fronts.max(axis=0)
-    front = min(float(low[1]), float(near[1])) - float(rng.uniform(0.001, 0.015))
+    front = min(float(low[1]), float(near[1])) - rng.real(0.001, 0.015)
     middle = float(low[0] + high[0]) / 2
     panels = [
         _Panel(
-            float(high[0] - low[0]), float(rng.uniform(0.08, 0.22)),
-            (middle, float(high[1]) - float(rng.uniform(0.06, 0.12)), float(high[2]) - _MARGIN_M),
-            tilt=max(0.0, float(rng.uniform(-0.3, 0.6))),
+            float(high[0] - low[0]), rng.real(0.08, 0.22),
+            (middle, float(high[1]) - rng.real(0.06, 0.12), float(high[2]) - _MARGIN_M),
+            tilt=max(0.0, rng.real(-0.3, 0.6)),
         )
     ]  # fmt: skip
     above = float(high[2] - far[2]) - 2 * _MARGIN_M
@@ -120,19 +125,19 @@ def _free_panels(model: ObjectModel, rng: np.random.Generator) -> list[_Panel]:
     return panels
 
 
-def _places(long: float, radius: float, rng: np.random.Generator) -> list[float]:
+def _places(long: float, radius: float, rng: Dice) -> list[float]:
     """Where along a panel dials sit, from its middle: evenly over all of it, close together, or in two groups."""
-    gap = radius * float(rng.uniform(2.6, 5.0))
+    gap = radius * rng.real(2.6, 5.0)
     most = max(1, min(7, int((long - 2 * radius) / gap)))
-    count = int(rng.integers(1, most + 1))
+    count = rng.whole(1, most + 1)
     free = max(0.0, long - 2.4 * radius - (count - 1) * gap)
-    way = str(rng.choice(["spread", "tight", "groups"]))
+    way = rng.pick(["spread", "tight", "groups"])
     if count > 1 and way == "spread":
         return [float(x) for x in np.linspace(-0.5, 0.5, count) * (long - 3 * radius)]
     steps = np.arange(count) * gap
     if count > 2 and way == "groups":
-        steps[count // 2 :] += float(rng.uniform(0.3, 1.0)) * free
-    shift = float(rng.uniform(-0.5, 0.5)) * max(0.0, long - 2.4 * radius - float(steps[-1]))
+        steps[count // 2 :] += rng.real(0.3, 1.0) * free
+    shift = rng.real(-0.5, 0.5) * max(0.0, long - 2.4 * radius - float(steps[-1]))
     return [float(x) for x in steps - steps[-1] / 2 + shift]
 
 
@@ -150,18 +155,18 @@ def _displays(panel: _Panel, offsets: list[float], radius: float, *, row: bool) 
     return [Part("display", mesh.moved(panel.at(across, up)), "dark")]
 
 
-def _dial(radius: float, rng: np.random.Generator) -> Mesh:
+def _dial(radius: float, rng: Dice) -> Mesh:
     """A dial on y = 0 that reaches towards -y: a knob, a cylinder, or a disc with a bar to turn it by."""
-    reach = float(rng.uniform(0.6, 1.3)) * radius
-    kind = _SHAPES[int(rng.integers(len(_SHAPES)))]
+    reach = rng.real(0.6, 1.3) * radius
+    kind = rng.pick(_SHAPES)
     if kind == "cylinder":
-        profile = [[1.0, -SUNK_M], [float(rng.uniform(0.8, 1.0)), 0.9 * reach], [0.8, reach]]
-        return lathe(np.array([[radius * r, h] for r, h in profile]))
+        profile = [[1.0, -SUNK_M], [rng.real(0.8, 1.0), 0.9 * reach], [0.8, reach]]
+        return lathe([[radius * r, h] for r, h in profile])
     if kind == "turned":
-        foot = lathe(np.array([[radius, -SUNK_M], [radius, 0.25 * reach], [0.9 * radius, 0.4 * reach]]))
-        half = radius * float(rng.uniform(0.15, 0.3))
+        foot = lathe([[radius, -SUNK_M], [radius, 0.25 * reach], [0.9 * radius, 0.4 * reach]])
+        half = radius * rng.real(0.15, 0.3)
         bar = box((-0.95 * radius, -reach, -half), (0.95 * radius, -0.2 * reach, half))
-        angle = float(rng.choice([0.0, np.pi / 2, float(rng.uniform(0, np.pi))]))
+        angle = rng.pick([0.0, np.pi / 2, rng.real(0, np.pi)])
         cos, sin = np.cos(angle), np.sin(angle)
         return join([foot, bar.rotated(np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]))])
     style = HandleStyle(kind, radius, radius, reach, 1.0, "dark")
@@ -172,12 +177,12 @@ _WASHER_GRIPS: tuple[HandleKind, ...] = ("bow", "d_pull", "arched")
 _SURFACES = ("white", "metal", "dark", "body")
 
 
-def _handle(rng: np.random.Generator, scale: float) -> HandleStyle:
+def _handle(rng: Dice, scale: float) -> HandleStyle:
     """A handle that fits an appliance's door."""
     style = sample_any_style(rng, knobs=False, scale=scale)
     if style.kind in ("loop", "t_bar", "cup"):
-        style = replace(style, kind="d_pull" if rng.random() < 0.5 else "bow")
-    return replace(style, surface=str(rng.choice(["metal", "dark", "white"], p=[0.6, 0.25, 0.15])))
+        style = replace(style, kind="d_pull" if rng.chance(0.5) else "bow")
+    return replace(style, surface=rng.pick(["metal", "dark", "white"], p=[0.6, 0.25, 0.15]))
 
 
 def _shell(width: float, depth: float, low: float, high: float, wall: float) -> Mesh:
@@ -205,9 +210,9 @@ def _flap(width: float, height: float, thick: float, window: float, surface: str
     return [Part("door_panel", panel, surface), Part("window", pane, "glass")]
 
 
-def _rack(rng: np.random.Generator, width: float, depth: float, height: float) -> Mesh:
+def _rack(rng: Dice, width: float, depth: float, height: float) -> Mesh:
     """A basket of wires from (0, 0, 0), its front at y = 0."""
-    wire, gap = 0.004, float(rng.uniform(0.035, 0.06))
+    wire, gap = 0.004, rng.real(0.035, 0.06)
     rods = []
     for z in (0.0, height):
         rods += [
@@ -224,15 +229,15 @@ def _rack(rng: np.random.Generator, width: float, depth: float, height: float) -
     return join(rods)
 
 
-def build_rack_dishwasher(rng: np.random.Generator) -> ObjectModel:
+def _rack_dishwasher(rng: Dice) -> ObjectModel:
     """A dishwasher whose door folds down, and two racks behind it that slide out."""
-    width, height, depth = float(rng.uniform(0.45, 0.62)), float(rng.uniform(0.8, 0.88)), float(rng.uniform(0.55, 0.62))
-    plinth, thick, wall = float(rng.uniform(0.08, 0.14)), float(rng.uniform(0.03, 0.05)), 0.03
-    surface = str(rng.choice(_SURFACES))
+    width, height, depth = rng.real(0.45, 0.62), rng.real(0.8, 0.88), rng.real(0.55, 0.62)
+    plinth, thick, wall = rng.real(0.08, 0.14), rng.real(0.03, 0.05), 0.03
+    surface = rng.pick(_SURFACES)
     inside, deep = width - 2 * wall, depth - wall
-    rack_w, rack_d, rack_h = inside - 0.02, deep - 0.06, float(rng.uniform(0.1, 0.15))
+    rack_w, rack_d, rack_h = inside - 0.02, deep - 0.06, rng.real(0.1, 0.15)
     low = plinth + wall + 0.05
-    high = low + float(rng.uniform(0.27, 0.33))
+    high = low + rng.real(0.27, 0.33)
     body = [
         Part("frame", _shell(width, depth, plinth, height, wall), surface),
         Part("base", box((0.01, 0.06, 0), (width - 0.01, depth - 0.01, plinth)), "dark"),
@@ -242,7 +247,7 @@ def build_rack_dishwasher(rng: np.random.Generator) -> ObjectModel:
     door_h = height - plinth - 0.01
     parts = _flap(width - 0.006, door_h, thick, 0.0, surface)
     style = _handle(rng, 1.6)
-    edge = float(rng.uniform(0.05, 0.09))
+    edge = rng.real(0.05, 0.09)
     panel = box((0.004, -0.001, door_h - 0.035), (width - 0.01, 0.001, door_h - 0.004))
     room = (0.95 * width, 2 * edge)
     parts += [
@@ -250,22 +255,22 @@ def build_rack_dishwasher(rng: np.random.Generator) -> ObjectModel:
         Part("decal", panel, "dark"),
     ]
     hinge = (0.003, -thick - 0.001, plinth + 0.005)
-    links = [Link("link_0", tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), float(np.deg2rad(rng.uniform(82, 91))))]
-    for n, z in enumerate((low, high)):
+    links = [Link(tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), rng.angle(82, 91))]
+    for z in (low, high):
         rack = [Part("rack", _rack(rng, rack_w, rack_d, rack_h), "metal")]
         bar = box((0.3 * rack_w, -0.014, rack_h - 0.012), (0.7 * rack_w, 0.0, rack_h + 0.006))
-        rack.append(Part("handle", bar, str(rng.choice(["dark", "white"]))))
+        rack.append(Part("handle", bar, rng.pick(["dark", "white"])))
         origin = (wall + 0.01, 0.03, z)
-        links.append(Link(f"link_{n + 1}", tuple(rack), "prismatic", origin, (0.0, -1.0, 0.0), 0.8 * rack_d))
-    return ObjectModel("Dishwasher", tuple(body), tuple(links)).moved((-width / 2, -depth / 2, 0.0))
+        links.append(Link(tuple(rack), "prismatic", origin, (0.0, -1.0, 0.0), 0.8 * rack_d))
+    return ObjectModel("Dishwasher", tuple(body), tuple(links)).centred(width, depth)
 
 
-def build_drawer_oven(rng: np.random.Generator) -> ObjectModel:
+def _drawer_oven(rng: Dice) -> ObjectModel:
     """A cooker: a hob and dials above an oven's door that folds down, above a drawer."""
-    width, height, depth = float(rng.uniform(0.5, 0.76)), float(rng.uniform(0.84, 0.94)), float(rng.uniform(0.56, 0.66))
-    wall, thick = 0.035, float(rng.uniform(0.03, 0.05))
-    store, dials = float(rng.uniform(0.16, 0.22)), float(rng.uniform(0.08, 0.12))
-    surface = str(rng.choice(_SURFACES))
+    width, height, depth = rng.real(0.5, 0.76), rng.real(0.84, 0.94), rng.real(0.56, 0.66)
+    wall, thick = 0.035, rng.real(0.03, 0.05)
+    store, dials = rng.real(0.16, 0.22), rng.real(0.08, 0.12)
+    surface = rng.pick(_SURFACES)
     foot, roof = 0.04, height - dials
     body = [
         Part("frame", join([
@@ -275,33 +280,32 @@ def build_drawer_oven(rng: np.random.Generator) -> ObjectModel:
         Part("base", box((0.02, 0.05, 0), (width - 0.02, depth - 0.02, foot)), "dark"),
     ]  # fmt: skip
     plates = [
-        lathe(np.array([[r, -0.001], [r, 0.008], [0.6 * r, 0.01]]), sides=24).rotated(UP).moved((x, y, height))
+        lathe([[r, -0.001], [r, 0.008], [0.6 * r, 0.01]], sides=24).rotated(UP).moved((x, y, height))
         for x, r in ((0.27 * width, 0.075), (0.73 * width, 0.095)) for y in (0.27 * depth, 0.72 * depth)
     ]  # fmt: skip
     body.append(Part("hob", join(plates), "dark"))
-    dial = lathe(np.array([[0.02, -0.001], [0.02, 0.012], [0.014, 0.014], [0.013, 0.026]]))
-    places = np.linspace(0.15, 0.85, int(rng.integers(4, 7))) * width
+    dial = lathe([[0.02, -0.001], [0.02, 0.012], [0.014, 0.014], [0.013, 0.026]])
+    places = np.linspace(0.15, 0.85, rng.whole(4, 7)) * width
     body.append(Part("dial", join([dial.moved((x, -thick, roof + dials / 2)) for x in places]), "metal"))
     racks = [_rack(rng, width - 2 * wall, depth - 2 * wall, 0.01).moved((wall, wall, foot + store + 0.2))]
     body.append(Part("shelf", join(racks), "metal"))
     style, gap = _handle(rng, 1.7), 0.006
     door_w, door_h = width - gap, roof - foot - store - gap
-    parts = _flap(door_w, door_h, thick, float(rng.uniform(0.5, 0.72)), surface)
+    parts = _flap(door_w, door_h, thick, rng.real(0.5, 0.72), surface)
     parts.append(handle_part(style, at=(door_w / 2, 0, door_h - 0.045), vertical=False, room_m=(0.95 * door_w, 0.07)))
     hinge = (gap / 2, -thick - 0.001, foot + store + gap / 2)
-    opening = float(np.deg2rad(rng.uniform(82, 91)))
-    oven = Link("link_0", tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), opening)
+    oven = Link(tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), rng.angle(82, 91))
     tray = _tray(width - 0.06, depth - 0.1, 0.6 * store).moved((0.03 - gap / 2, thick, 0.02))
     front = box((0, 0, 0), (door_w, thick, store - gap))
     low = handle_part(style, at=(door_w / 2, 0, 0.65 * store), vertical=False, room_m=(0.95 * door_w, 0.6 * store))
     drawer = (Part("drawer_front", front, surface), Part("drawer_box", tray, "inside"), low)
     slide = (gap / 2, -thick - 0.001, foot + gap / 2)
-    links = (oven, Link("link_1", drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.7 * depth))
-    return ObjectModel("Oven", tuple(body), links).moved((-width / 2, -depth / 2, 0.0))
+    links = (oven, Link(drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.7 * depth))
+    return ObjectModel("Oven", tuple(body), links).centred(width, depth)
 
 
 def _round_door(
-    rng: np.random.Generator,
+    rng: Dice,
     style: HandleStyle,
     circle: Float[np.ndarray, "P 2"],
     radius: float,
@@ -309,29 +313,29 @@ def _round_door(
     surface: str,
 ) -> Link:
     """A round door of glass around a point (x, z) of the front, hinged at either side, with a grip at the other."""
-    sign = -1.0 if rng.random() < 0.7 else 1.0
+    sign = -1.0 if rng.chance(0.7) else 1.0
     # In the frame of its hinge, the door's middle lies at (-sign * reach, 0).
     reach = radius + 0.012
     shift = (-sign * reach, 0.0, 0.0)
-    ring = prism_between(circle * radius, circle * 0.72 * radius, 0.0, 0.035, closed=True).rotated(_FRONT)
+    ring = prism_between(circle * radius, circle * 0.72 * radius, 0.0, 0.035, closed=True).rotated(FRONT)
     r = 0.74 * radius
-    glass = lathe(np.array([[r, -0.02], [r, 0.012], [0.85 * r, 0.022], [0.5 * r, 0.032], [0.15 * r, 0.036]]), sides=32)
+    glass = lathe([[r, -0.02], [r, 0.012], [0.85 * r, 0.022], [0.5 * r, 0.032], [0.15 * r, 0.036]], sides=32)
     grip = handle_part(style, at=(-sign * 0.86 * radius, -0.035, 0.0), vertical=True, room_m=(0.1, 0.16))
     parts = (
-        Part("door_panel", ring.moved(shift), str(rng.choice(["metal", "dark", surface]))),
+        Part("door_panel", ring.moved(shift), rng.pick(["metal", "dark", surface])),
         Part("glass", glass.moved(shift), "glass"),
         Part("handle", grip.mesh.moved(shift), grip.surface),
     )
     hinge = (middle[0] + sign * reach, -0.001, middle[1])
-    return Link("link_0", parts, "revolute", hinge, (0.0, 0.0, sign), float(np.deg2rad(rng.uniform(95, 125))))
+    return Link(parts, "revolute", hinge, (0.0, 0.0, sign), rng.angle(95, 125))
 
 
-def build_washing_machine(rng: np.random.Generator) -> ObjectModel:
+def _washing_machine(rng: Dice) -> ObjectModel:
     """A washing machine: a round glass door hinged at one side, and a drawer for the powder."""
-    width, height, depth = 0.6, float(rng.uniform(0.82, 0.88)), float(rng.uniform(0.45, 0.62))
-    surface = str(rng.choice(["white", "white", "metal", "dark"]))
-    radius, wall = float(rng.uniform(0.15, 0.19)), 0.02
-    x, z = width / 2, float(rng.uniform(0.4, 0.46))
+    width, height, depth = 0.6, rng.real(0.82, 0.88), rng.real(0.45, 0.62)
+    surface = rng.pick(["white", "white", "metal", "dark"])
+    radius, wall = rng.real(0.15, 0.19), 0.02
+    x, z = width / 2, rng.real(0.4, 0.46)
     angle = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     square = circle / np.abs(circle).max(axis=1, keepdims=True)
@@ -339,9 +343,9 @@ def build_washing_machine(rng: np.random.Generator) -> ObjectModel:
     half = np.array([width / 2 - wall, (panel_high - panel_low) / 2])
     middle = np.array([x, (panel_low + panel_high) / 2])
     hole = circle * (radius - 0.025) + [x, z]
-    plate = prism_between(square * half + middle, hole, -wall, 0.0, closed=True).rotated(_FRONT)
-    tub = prism_between(circle * (radius - 0.02) + [x, z], hole, -0.3, -wall, closed=True).rotated(_FRONT)
-    back = lathe(np.array([[radius - 0.02, 0.0], [radius - 0.02, 0.004]]), sides=36).moved((x, 0.3, z))
+    plate = prism_between(square * half + middle, hole, -wall, 0.0, closed=True).rotated(FRONT)
+    tub = prism_between(circle * (radius - 0.02) + [x, z], hole, -0.3, -wall, closed=True).rotated(FRONT)
+    back = lathe([[radius - 0.02, 0.0], [radius - 0.02, 0.004]], sides=36).moved((x, 0.3, z))
     body = [
         Part("frame", join([
             box((0, 0, 0.02), (wall, depth, height)), box((width - wall, 0, 0.02), (width, depth, height)),
@@ -356,11 +360,11 @@ def build_washing_machine(rng: np.random.Generator) -> ObjectModel:
     body.append(
         Part("control_panel", box((wall + drawer_w + 0.008, -0.004, z0), (width - wall, 0.02, z0 + strip)), "dark")
     )
-    dial = lathe(np.array([[0.03, -0.001], [0.028, 0.02], [0.024, 0.022]]), sides=24)
-    body.append(Part("dial", dial.moved((float(rng.uniform(0.5, 0.8)) * width, -0.004, z0 + strip / 2)), "metal"))
+    dial = lathe([[0.03, -0.001], [0.028, 0.02], [0.024, 0.022]], sides=24)
+    body.append(Part("dial", dial.moved((rng.real(0.5, 0.8) * width, -0.004, z0 + strip / 2)), "metal"))
     style = HandleStyle(
-        _WASHER_GRIPS[int(rng.integers(3))], 0.11, 0.014, float(rng.uniform(0.024, 0.036)), 1.0,
-        str(rng.choice(["dark", "metal", "white"])),
+        rng.pick(_WASHER_GRIPS), 0.11, 0.014, rng.real(0.024, 0.036), 1.0,
+        rng.pick(["dark", "metal", "white"]),
     )  # fmt: skip
     door = _round_door(rng, style, circle, radius, (x, z), surface)
     tray = _tray(drawer_w - 0.01, 0.2, strip - 0.03).moved((0.005, 0.02, 0.01))
@@ -371,16 +375,12 @@ def build_washing_machine(rng: np.random.Generator) -> ObjectModel:
     front = box((0, 0, 0), (drawer_w, 0.02, strip))
     drawer = (Part("drawer_front", front, surface), Part("drawer_box", tray, "inside"), lip)
     slide = (wall + 0.004, -0.004, z0)
-    links = (door, Link("link_1", drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.16))
-    return ObjectModel("WashingMachine", tuple(body), links).moved((-width / 2, -depth / 2, -0.02))
+    links = (door, Link(drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.16))
+    return ObjectModel("WashingMachine", tuple(body), links).centred(width, depth, -0.02)
 
 
-_FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Turns what is drawn in the x-y plane and extruded along +z so that it stands upright, extruded towards -y."""
-
-APPLIANCES: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
-    "rack_dishwasher": build_rack_dishwasher,
-    "drawer_oven": build_drawer_oven,
-    "washing_machine": build_washing_machine,
+APPLIANCES: dict[str, Callable[[Dice], ObjectModel]] = {
+    "rack_dishwasher": _rack_dishwasher,
+    "drawer_oven": _drawer_oven,
+    "washing_machine": _washing_machine,
 }
-"""How to build each kind."""

@@ -1,4 +1,4 @@
-"""Which procedural objects there are, and the one function that writes them."""
+"""Which procedural objects there are, and the one function that makes them."""
 
 from __future__ import annotations
 
@@ -6,80 +6,61 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from quest.errors import ConfigError
+from quest.sim.objects import SimObject, object_from_urdf
 from quest.sim.procedural.appliances import APPLIANCES, with_dials
 from quest.sim.procedural.clutter import with_clutter
-from quest.sim.procedural.furniture import STORAGE, TABLES
+from quest.sim.procedural.furniture import FURNITURE, MORE_FURNITURE, TABLES
 from quest.sim.procedural.handles import with_long_handles
-from quest.sim.procedural.layouts import FURNITURE
-from quest.sim.procedural.model import ObjectModel, write_object
-from quest.sim.procedural.room_door import build_room_door
+from quest.sim.procedural.model import Dice, ObjectModel, as_urdf
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
-from quest.sim.procedural.things import THINGS, build_laptop, build_trunk
+from quest.sim.procedural.things import LIDDED, THINGS
 from quest.types import GRIPS
 
-_OFTEN_BARE = (
-    "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
-    "french_refrigerator", "microwave", "apron_table",
-)  # fmt: skip
 
-
-_OFTEN_LONG = (
-    "chest", "cabinet", "wardrobe", "sideboard", "wall_unit", "base_cabinet", "wall_cabinet", "refrigerator",
-    "french_refrigerator", "microwave", "range", "dishwasher", "rack_dishwasher", "drawer_oven",
-)  # fmt: skip
-_OFTEN_BUSY = (
-    "chest", "cabinet", "sideboard", "wall_unit", "desk", "base_cabinet", "refrigerator", "long_refrigerator",
-    "bare_microwave", "microwave", "long_microwave", "range", "dishwasher", "long_drawer_oven",
-)  # fmt: skip
-
-_OFTEN_DIALS = (
-    "range", "long_range", "drawer_oven", "long_drawer_oven", "microwave", "bare_microwave", "long_microwave",
-    "dishwasher", "rack_dishwasher", "washing_machine",
-)  # fmt: skip
-
-
-def _build_bare(category: str, rng: np.random.Generator) -> ObjectModel:
+def _without_handles(model: ObjectModel, rng: Dice) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
-    model = _BUILDERS[category](rng)
     links = [replace(link, parts=tuple(p for p in link.parts if p.role not in GRIPS)) for link in model.links]
     return replace(model, links=tuple(links))
 
 
-def _build_long(category: str, rng: np.random.Generator) -> ObjectModel:
-    """Furniture and appliances with handles as long as their fronts."""
-    return with_long_handles(_BUILDERS[category](rng), rng)
-
-
-def _build_busy(category: str, rng: np.random.Generator) -> ObjectModel:
-    """Furniture and appliances with what is no handle on and around them."""
-    return with_clutter(_BUILDERS[category](rng), rng)
-
-
-def _build_dials(category: str, rng: np.random.Generator) -> ObjectModel:
-    """Appliances with dials that turn."""
-    return with_dials(_BUILDERS[category](rng), rng)
-
-
-_BUILDERS: dict[str, Callable[[np.random.Generator], ObjectModel]] = {
+_BUILDERS: dict[str, Callable[[Dice], ObjectModel]] = {
     **FURNITURE,
     **{name: partial(build_kitchen, name) for name in KITCHEN},
-    "laptop": build_laptop,
-    "trunk": build_trunk,
-    **STORAGE,
+    **LIDDED,
+    **MORE_FURNITURE,
     **APPLIANCES,
     **THINGS,
-    "room_door": build_room_door,
     **TABLES,
-    **{f"bare_{name}": partial(_build_bare, name) for name in _OFTEN_BARE},
-    **{f"long_{name}": partial(_build_long, name) for name in _OFTEN_LONG},
-    **{f"busy_{name}": partial(_build_busy, name) for name in _OFTEN_BUSY},
-    **{f"dial_{name}": partial(_build_dials, name) for name in _OFTEN_DIALS},
 }
+_CHANGES: dict[str, tuple[Callable[[ObjectModel, Dice], ObjectModel], tuple[str, ...]]] = {
+    "bare": (_without_handles, (
+        "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",
+        "french_refrigerator", "microwave", "apron_table",
+    )),
+    "long": (with_long_handles, (
+        "chest", "cabinet", "wardrobe", "sideboard", "wall_unit", "base_cabinet", "wall_cabinet", "refrigerator",
+        "french_refrigerator", "microwave", "range", "dishwasher", "rack_dishwasher", "drawer_oven",
+    )),
+    "busy": (with_clutter, (
+        "chest", "cabinet", "sideboard", "wall_unit", "desk", "base_cabinet", "refrigerator", "long_refrigerator",
+        "bare_microwave", "microwave", "long_microwave", "range", "dishwasher", "long_drawer_oven",
+    )),
+    "dial": (with_dials, (
+        "range", "long_range", "drawer_oven", "long_drawer_oven", "microwave", "bare_microwave", "long_microwave",
+        "dishwasher", "rack_dishwasher", "washing_machine",
+    )),
+}  # fmt: skip
+"""What can be done to an object, by the first word of its category, and the categories that it is done to."""
+
+CATEGORIES: tuple[str, ...] = (
+    *_BUILDERS,
+    *(f"{word}_{category}" for word, (_, categories) in _CHANGES.items() for category in categories),
+)
+"""Names that :func:`make_object` knows."""
 
 _WEIGHTS = {
     "chest": 6, "desk": 4, "cabinet": 6, "lockers": 5, "sideboard": 3, "wardrobe": 2, "night_stand": 1, "wall_unit": 2,
@@ -98,63 +79,48 @@ MIXES: dict[str, dict[str, int]] = {"usual": _WEIGHTS, "broad": {**_WEIGHTS, **_
 sunglasses, what has no handles (``bare_``), long ones (``long_``), what is no handle beside its own (``busy_``), or
 dials that turn (``dial_``)."""
 
-CATEGORIES: tuple[str, ...] = tuple(_BUILDERS)
-"""Names that :func:`make_object` knows."""
-
 
 def category_for_seed(seed: int, *, mix: str = "usual") -> str:
-    """The category that a seed stands for in a mix.
-
-    Args:
-        seed: seed of an object.
-        mix: a key of :data:`MIXES`.
+    """The category that the seed of an object stands for in a mix, a key of :data:`MIXES`.
 
     Raises:
         ConfigError: there is no such mix.
     """
     if mix not in MIXES:
         raise ConfigError(f"procedural objects: unknown mix {mix!r}; expected one of {', '.join(MIXES)}")
-    weight_of = MIXES[mix]
-    names = [name for name in CATEGORIES if name in weight_of]
-    weights = np.array([weight_of[name] for name in names], dtype=float)
+    names = [name for name in CATEGORIES if name in MIXES[mix]]
+    weights = np.array([MIXES[mix][name] for name in names], dtype=float)
     rng = np.random.default_rng([zlib.crc32(b"category"), seed])
     return names[int(rng.choice(len(names), p=weights / weights.sum()))]
 
 
 def build_model(category: str, seed: int) -> ObjectModel:
-    """The object of a category and a seed, not written yet.
-
-    Args:
-        category: one of :data:`CATEGORIES`.
-        seed: same category and seed, same object.
+    """The model of a category and a seed.
 
     Raises:
-        ConfigError: If the category is unknown or the seed negative.
+        ConfigError: the category is unknown or the seed negative.
     """
-    if category not in _BUILDERS:
+    if category not in CATEGORIES:
         raise ConfigError(f"procedural object: unknown category {category!r}; expected one of {', '.join(CATEGORIES)}")
     if seed < 0:
         raise ConfigError(f"procedural object: expected a seed >= 0, got {seed}")
-    return _BUILDERS[category](np.random.default_rng([zlib.crc32(category.encode()), seed]))
+    return _built(category, Dice(np.random.PCG64([zlib.crc32(category.encode()), seed])))
 
 
-def make_object(category: str, seed: int, folder: Path) -> Path:
-    """Write a procedural object as a folder of PartNet-Mobility's shape, in metres.
+def _built(category: str, rng: Dice) -> ObjectModel:
+    word, _, changed = category.partition("_")
+    if word in _CHANGES:
+        return _CHANGES[word][0](_built(changed, rng), rng)
+    return _BUILDERS[category](rng)
 
-    The folder gets ``mobility.urdf``, ``textured_objs/*.obj`` and ``meta.json``. Visuals of moving links are
-    called ``handle-N`` or ``knob-N`` where they are one. Joints are 0 when closed; lower limits are 0.
 
-    Args:
-        category: one of :data:`CATEGORIES`.
-        seed: same category and seed, same files.
-        folder: where to write; made if missing.
+def make_object(category: str, seed: int) -> SimObject:
+    """A procedural object in metres; same category and seed, same object.
 
-    Returns:
-        The folder.
+    Its joints are 0 when closed, which is their lower limit.
 
     Raises:
-        ConfigError: If the category is unknown or the seed negative.
+        ConfigError: the category is unknown or the seed negative.
     """
-    name = f"{category}-{seed}"
-    meta = {"category": category, "seed": seed, "source": "procedural", "unit_m": 1.0}
-    return write_object(build_model(category, seed), Path(folder), name=name, meta=meta)
+    model = build_model(category, seed)
+    return object_from_urdf(as_urdf(model), f"{category}-{seed}", model.model_cat, source="procedural")

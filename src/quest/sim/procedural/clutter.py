@@ -11,40 +11,38 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
-from quest.sim.procedural.shapes import UP, box, lathe
+from quest.sim.procedural.model import UP, Dice, Link, Mesh, ObjectModel, Part, box, join, lathe
 from quest.types import GRIPS
 
 _SUNK_M = 0.001
 _MARGIN_M = 0.02
 _TRIES = 6
+_ACROSS = np.array([1.0, 0.0, 1.0])
 
 Rect = tuple[float, float, float, float]
 """Least x and z, greatest x and z."""
 
 
-def with_clutter(model: ObjectModel, rng: np.random.Generator) -> ObjectModel:
+def with_clutter(model: ObjectModel, rng: Dice) -> ObjectModel:
     """The object with things that are no handles; nothing of it moves otherwise than before.
 
-    Args:
-        model: an object whose fronts look along -y and that stands on the ground.
-        rng: source of randomness.
+    Its fronts look along -y, and it stands on the ground.
     """
     links = tuple(_decorated(link, rng) for link in model.links)
     vertices = np.concatenate([part.mesh.vertices for part in model.body])
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     body = [*model.body, *_on_top(low, high, rng)]
-    if rng.random() < 0.4:
+    if rng.chance(0.4):
         body.append(_shelf(low, high, rng))
     model = ObjectModel(model.model_cat, tuple(body), links)
-    if rng.random() < 0.4:
-        height = float(rng.uniform(0.05, 0.3)) * min(1.0, float(high[2] - low[2]))
+    if rng.chance(0.4):
+        height = rng.real(0.05, 0.3) * min(1.0, float(high[2] - low[2]))
         raised = model.moved((0.0, 0.0, height))
         model = replace(raised, body=(*raised.body, _legs(low, high, height, rng)))
     return model
 
 
-def _decorated(link: Link, rng: np.random.Generator) -> Link:
+def _decorated(link: Link, rng: Dice) -> Link:
     """The link with none to three things on its front, away from its handles."""
     fronts = [part for part in link.parts if part.role not in GRIPS]
     if not fronts:
@@ -53,51 +51,52 @@ def _decorated(link: Link, rng: np.random.Generator) -> Link:
     low, high = fronts[int(np.argmax([size[0] * size[2] for size in sizes]))].mesh.bounds
     taken = [_rect(part.mesh) for part in link.parts if part.role in GRIPS]
     added: list[Part] = []
-    for _ in range(int(rng.integers(0, 4))):
+    for _ in range(rng.whole(0, 4)):
         width, height = (high - low)[[0, 2]]
-        kind = str(rng.choice(["vent", "keypad", "display", "badge"]))
+        kind = rng.pick(["vent", "keypad", "display", "badge"])
         share = {"vent": (0.3, 0.8), "keypad": (0.12, 0.3), "display": (0.15, 0.5), "badge": (0.06, 0.2)}[kind]
-        w = float(rng.uniform(*share)) * width
-        h = min(w * float(rng.uniform(*((0.15, 0.5) if kind != "keypad" else (0.8, 1.8)))), 0.8 * height)
+        w = rng.real(*share) * width
+        h = min(w * rng.real(*((0.15, 0.5) if kind != "keypad" else (0.8, 1.8))), 0.8 * height)
         for _ in range(_TRIES):
-            x = float(rng.uniform(low[0] + w / 2, high[0] - w / 2))
-            z = float(rng.uniform(low[2] + h / 2, high[2] - h / 2))
+            x = rng.real(low[0] + w / 2, high[0] - w / 2)
+            z = rng.real(low[2] + h / 2, high[2] - h / 2)
             place = (x - w / 2, z - h / 2, x + w / 2, z + h / 2)
             if not any(_overlap(place, other) for other in taken):
                 taken.append(place)
                 added.append(_ornament(kind, place, float(low[1]), rng))
                 break
-    if rng.random() < 0.2 and min(high[0] - low[0], high[2] - low[2]) > 0.12:
-        added.append(Part("moulding", _frame(_inset((low[0], low[2], high[0], high[2])), float(low[1])), "front"))
+    if rng.chance(0.2) and min(high[0] - low[0], high[2] - low[2]) > 0.12:
+        added.append(Part("moulding", _moulding(low, high), "front"))
     return replace(link, parts=(*link.parts, *added))
 
 
-def _ornament(kind: str, place: Rect, front: float, rng: np.random.Generator) -> Part:
+def _ornament(kind: str, place: Rect, front: float, rng: Dice) -> Part:
     x0, z0, x1, z1 = place
     if kind in ("display", "badge"):
         out = 0.002 if kind == "display" else 0.004
         surface = "dark" if kind == "display" else "metal"
         return Part(kind, box((x0, front - out, z0), (x1, front + _SUNK_M, z1)), surface)
     if kind == "vent":
-        rows = int(rng.integers(3, 10))
+        rows = rng.whole(3, 10)
         edges = np.linspace(z0, z1, 2 * rows)
-        out = float(rng.uniform(0.002, 0.008))
+        out = rng.real(0.002, 0.008)
         slats = [
             box((x0, front - out, float(a)), (x1, front + _SUNK_M, float(b)))
             for a, b in zip(edges[::2], edges[1::2], strict=True)
         ]
-        return Part(kind, join(slats), str(rng.choice(["dark", "metal", "front"])))
-    columns, rows = 3, int(rng.integers(3, 6))
+        return Part(kind, join(slats), rng.pick(["dark", "metal", "front"]))
+    columns, rows = 3, rng.whole(3, 6)
     across, up = np.linspace(x0, x1, 3 * columns).reshape(-1, 3), np.linspace(z0, z1, 3 * rows).reshape(-1, 3)
     keys = [
         box((float(left), front - 0.003, float(below)), (float(right), front + _SUNK_M, float(above)))
         for left, _, right in across for below, _, above in up
     ]  # fmt: skip
-    return Part(kind, join(keys), str(rng.choice(["dark", "white", "metal"])))
+    return Part(kind, join(keys), rng.pick(["dark", "white", "metal"]))
 
 
-def _frame(place: Rect, front: float) -> Mesh:
-    x0, z0, x1, z1 = place
+def _moulding(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Mesh:
+    """A frame a little inside the edges of a front."""
+    (x0, front, z0), (x1, _, z1) = low + _MARGIN_M * _ACROSS, high - _MARGIN_M * _ACROSS
     wide, out = 0.012, 0.006
     return join([
         box((x0, front - out, z0), (x1, front + _SUNK_M, z0 + wide)),
@@ -107,40 +106,40 @@ def _frame(place: Rect, front: float) -> Mesh:
     ])  # fmt: skip
 
 
-def _on_top(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: np.random.Generator) -> list[Part]:
+def _on_top(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice) -> list[Part]:
     """None to three bottles and boxes on the highest face."""
     things: list[Part] = []
-    for _ in range(int(rng.integers(0, 4))):
-        radius, height = float(rng.uniform(0.025, 0.07)), float(rng.uniform(0.06, 0.28))
-        x, y = (float(rng.uniform(low[i] + radius, high[i] - radius)) for i in (0, 1))
-        if rng.random() < 0.5:
-            neck = float(rng.uniform(0.3, 1.0)) * radius
+    for _ in range(rng.whole(0, 4)):
+        radius, height = rng.real(0.025, 0.07), rng.real(0.06, 0.28)
+        x, y = (rng.real(low[i] + radius, high[i] - radius) for i in (0, 1))
+        if rng.chance(0.5):
+            neck = rng.real(0.3, 1.0) * radius
             profile = [[radius, 0.0], [radius, 0.6 * height], [neck, 0.8 * height], [neck, height]]
-            mesh = lathe(np.array(profile)).rotated(UP)
+            mesh = lathe(profile).rotated(UP)
         else:
-            deep = radius * float(rng.uniform(0.4, 1.0))
+            deep = radius * rng.real(0.4, 1.0)
             mesh = box((-radius, -deep, 0.0), (radius, deep, height))
-        things.append(Part("thing", mesh.moved((x, y, float(high[2]))), str(rng.choice(["white", "dark", "metal"]))))
+        things.append(Part("thing", mesh.moved((x, y, float(high[2]))), rng.pick(["white", "dark", "metal"])))
     return things
 
 
-def _shelf(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: np.random.Generator) -> Part:
+def _shelf(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice) -> Part:
     """An open case with shelves beside the object, as deep and nearly as high."""
-    board, wide = float(rng.uniform(0.012, 0.025)), float(rng.uniform(0.2, 0.5)) * max(0.5, float(high[2] - low[2]))
-    x0 = float(high[0]) + 0.004 if rng.random() < 0.5 else float(low[0]) - 0.004 - wide
+    board, wide = rng.real(0.012, 0.025), rng.real(0.2, 0.5) * max(0.5, float(high[2] - low[2]))
+    x0 = float(high[0]) + 0.004 if rng.chance(0.5) else float(low[0]) - 0.004 - wide
     x1, y0, y1, z0, z1 = x0 + wide, float(low[1]), float(high[1]), float(low[2]), float(high[2])
-    levels = np.linspace(z0, z1 - board, int(rng.integers(3, 7)))
+    levels = np.linspace(z0, z1 - board, rng.whole(3, 7))
     boards = [box((x0, y0, z0), (x0 + board, y1, z1)), box((x1 - board, y0, z0), (x1, y1, z1))]
     boards += [box((x0 + board, y0, float(z)), (x1 - board, y1, float(z) + board)) for z in levels]
     boards.append(box((x0 + board, y1 - 0.5 * board, z0), (x1 - board, y1, z1)))
     return Part("shelf_case", join(boards), "body")
 
 
-def _legs(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], height: float, rng: np.random.Generator) -> Part:
+def _legs(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], height: float, rng: Dice) -> Part:
     """Four legs under the corners, turned or square."""
-    half = float(rng.uniform(0.012, 0.03))
-    if rng.random() < 0.6:
-        thin, bulge = (half * float(s) for s in (rng.uniform(0.4, 0.8), rng.uniform(0.8, 1.0)))
+    half = rng.real(0.012, 0.03)
+    if rng.chance(0.6):
+        thin, bulge = half * rng.real(0.4, 0.8), half * rng.real(0.8, 1.0)
         shape = [[thin, 0.0], [thin, 0.3], [bulge, 0.5], [thin, 0.65], [half, 0.9], [half, 1.0]]
         leg = lathe(np.array(shape) * [1.0, height]).rotated(UP)
     else:
@@ -152,11 +151,6 @@ def _legs(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], height: flo
 def _rect(mesh: Mesh) -> Rect:
     (x0, _, z0), (x1, _, z1) = mesh.bounds
     return (x0 - _MARGIN_M, z0 - _MARGIN_M, x1 + _MARGIN_M, z1 + _MARGIN_M)
-
-
-def _inset(place: Rect) -> Rect:
-    x0, z0, x1, z1 = place
-    return (x0 + _MARGIN_M, z0 + _MARGIN_M, x1 - _MARGIN_M, z1 - _MARGIN_M)
 
 
 def _overlap(a: Rect, b: Rect) -> bool:

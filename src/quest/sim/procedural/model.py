@@ -1,23 +1,55 @@
-"""What a procedural object is made of: meshes, parts, links and joints; and how it is written.
+"""What a procedural object is made of: chance, meshes, parts, links and joints; and its URDF, in memory.
 
 Axes while an object is built: x to the right of someone who stands before it, y into the object (the
-front looks along -y), z up, the ground at z = 0. Metres and radians. It is written as a folder of PartNet-Mobility's
-shape: URDF, OBJ meshes, ``meta.json``.
+front looks along -y), z up, the ground at z = 0. Metres and radians.
 """
 
 from __future__ import annotations
 
-import json
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal
-from xml.etree import ElementTree as ET
+from typing import Literal, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Float32, Int
+from numpy.random import Generator
 
+from quest.sim.urdf import MeshData, Urdf, UrdfJoint, UrdfVisual, pose_matrix
 from quest.types import GRIPS
+
+UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+"""Turns a solid of revolution, which grows towards -y, so that it grows towards +z."""
+FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane and extruded along +z so that it stands upright, extruded towards -y."""
+SIDE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+"""Turns what is drawn in the x-y plane and extruded along z so that x becomes y, y becomes z, and z becomes x."""
+
+_UV_UNIT_M = 0.5
+_T = TypeVar("_T")
+
+
+class Dice(Generator):
+    """A generator that draws plain numbers; what is drawn in which order is part of what a seed means."""
+
+    def real(self, low: float, high: float) -> float:
+        """Evenly from a range."""
+        return float(self.uniform(low, high))
+
+    def angle(self, low_deg: float, high_deg: float) -> float:
+        """Radians out of a range in degrees."""
+        return float(np.deg2rad(self.uniform(low_deg, high_deg)))
+
+    def whole(self, low: int, high: int) -> int:
+        """From ``low`` to ``high - 1``."""
+        return int(self.integers(low, high))
+
+    def chance(self, share: float) -> bool:
+        """True in that share of draws."""
+        return bool(self.random() < share)
+
+    def pick(self, options: Sequence[_T], p: Sequence[float] | None = None) -> _T:
+        """One of some options, each as likely as ``p`` says."""
+        return options[int(self.choice(len(options), p=p))]
 
 
 @dataclass(frozen=True)
@@ -47,7 +79,7 @@ class Mesh:
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
 
-def join(meshes: list[Mesh]) -> Mesh:
+def join(meshes: Sequence[Mesh]) -> Mesh:
     """One mesh out of several; closed meshes stay closed."""
     assert meshes, "nothing to join"
     starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
@@ -57,6 +89,177 @@ def join(meshes: list[Mesh]) -> Mesh:
         np.concatenate([m.normals for m in meshes]),
         np.concatenate([m.uv for m in meshes]),
     )
+
+
+def turn_x(angle_rad: float) -> Float[np.ndarray, "3 3"]:
+    """Rotation about the x axis."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
+    """An axis-aligned box between two corners, metres; the grain follows its longest edge."""
+    lo, hi = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    assert (hi > lo).all(), f"box: empty between {low} and {high}"
+    size = hi - lo
+    vertices, normals, uv = [], [], []
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        columns = [u, v] if size[u] >= size[v] else [v, u]
+        for side in (0, 1):
+            corners = np.empty((4, 3))
+            corners[:, axis] = (lo, hi)[side][axis]
+            corners[:, u] = np.array([lo[u], hi[u], hi[u], lo[u]])
+            corners[:, v] = np.array([lo[v], lo[v], hi[v], hi[v]])
+            if side == 0:
+                corners = corners[::-1]
+            normal = np.zeros(3)
+            normal[axis] = 2 * side - 1
+            vertices.append(corners)
+            normals.append(np.tile(normal, (4, 1)))
+            uv.append(corners[:, columns] / _UV_UNIT_M)
+    faces = (4 * np.arange(6)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+    return Mesh(np.concatenate(vertices), faces, np.concatenate(normals), np.concatenate(uv))
+
+
+def centred_box(centre: tuple[float, float, float], size: tuple[float, float, float]) -> Mesh:
+    """An axis-aligned box by its centre and edge lengths in metres."""
+    c, half = np.asarray(centre, dtype=float), np.asarray(size, dtype=float) / 2
+    return box(tuple(c - half), tuple(c + half))
+
+
+def tube(
+    path: Float[np.ndarray, "P 3"], *, radius_m: float, flatness: float = 1.0, sides: int = 10, closed: bool = False
+) -> Mesh:
+    """A tube of elliptic section along a path in the x-y plane.
+
+    Args:
+        path: points along the middle; z must be constant. With ``closed``, the last point joins the first.
+        radius_m: half the width of the section along the path's normal in its plane.
+        flatness: half the height (along z) over ``radius_m``.
+        sides: corners of the section; 4 makes a square bar.
+        closed: whether the path is a ring, which needs no caps.
+    """
+    path = np.asarray(path, dtype=float)
+    if closed:
+        path = np.concatenate([path, path[:1]])
+        tangent = np.roll(path[:-1], -1, axis=0) - np.roll(path[:-1], 1, axis=0)
+        tangent = np.concatenate([tangent, tangent[:1]])
+    else:
+        tangent = np.gradient(path, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+    across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(path))], axis=1)
+    up = np.array([0.0, 0.0, 1.0])
+    angle = 2 * np.pi * np.arange(sides + 1) / sides + np.pi / sides
+    stretch = 1 / np.cos(np.pi / sides) if sides == 4 else 1.0
+    cos, sin = np.cos(angle) * stretch, np.sin(angle) * stretch
+    offset = radius_m * (cos[None, :, None] * across[:, None] + flatness * sin[None, :, None] * up)
+    normal = cos[None, :, None] * across[:, None] + sin[None, :, None] * up / max(flatness, 1e-6)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    uv = np.stack(np.broadcast_arrays(length[:, None], radius_m * (angle - angle[0])[None, :]), axis=-1).reshape(-1, 2)
+    vertices = (path[:, None] + offset).reshape(-1, 3)
+    mesh = Mesh(vertices, _grid_faces(len(path), sides + 1)[:, ::-1], normal.reshape(-1, 3), uv / _UV_UNIT_M)
+    if sides == 4:
+        mesh = _faceted(mesh)
+    if closed:
+        return mesh
+    first, last = (path[0] + offset[0, :-1])[::-1], path[-1] + offset[-1, :-1]
+    return join([mesh, _cap(first, -tangent[0]), _cap(last, tangent[-1])])
+
+
+def lathe(profile: Float[np.ndarray, "P 2"] | list, *, sides: int = 18) -> Mesh:
+    """A solid of revolution about the y axis, standing on y = 0 and growing towards -y.
+
+    The profile is (radius, height) from the foot to the tip; height grows; the radii at the ends may be 0.
+    """
+    profile = np.asarray(profile, dtype=float)
+    if profile[0, 0] > 0:
+        profile = np.concatenate([[[0.0, profile[0, 1]]], profile])
+    if profile[-1, 0] > 0:
+        profile = np.concatenate([profile, [[0.0, profile[-1, 1]]]])
+    angle = 2 * np.pi * np.arange(sides + 1) / sides
+    radius, height = profile[:, :1], profile[:, 1:]
+    corners = np.broadcast_arrays(radius * np.cos(angle), -height, radius * np.sin(angle))
+    vertices = np.stack(corners, axis=-1).reshape(-1, 3)
+    uv = np.stack(np.broadcast_arrays(angle * 0.02, height), axis=-1).reshape(-1, 2) / _UV_UNIT_M
+    faces = _grid_faces(len(profile), sides + 1)
+    corner = vertices[faces]
+    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
+    return _faceted(Mesh(vertices, faces[area > 1e-12], np.zeros_like(vertices), uv))
+
+
+def prism_between(
+    outer: Float[np.ndarray, "P 2"], inner: Float[np.ndarray, "P 2"], low: float, high: float, *, closed: bool = False
+) -> Mesh:
+    """The solid between two lines in the x-y plane, from z = ``low`` to ``high``: a curved wall, or a frame.
+
+    Args:
+        outer: points of one line, metres.
+        inner: as many points of the other line, at its left as seen from above.
+        low: smallest z.
+        high: largest z.
+        closed: whether the lines are rings (``outer`` counter-clockwise around ``inner``), without ends.
+    """
+    if closed:
+        outer, inner = np.concatenate([outer, outer[:1]]), np.concatenate([inner, inner[:1]])
+    count = len(outer)
+    rows = [(outer, low), (inner, low), (inner, high), (outer, high)]
+    vertices = np.concatenate([np.column_stack([line, np.full(count, z)]) for line, z in rows])
+    faces = []
+    for row in range(4):
+        a = row * count + np.arange(count - 1)
+        b = (row + 1) % 4 * count + np.arange(count - 1)
+        faces += [np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)]
+    if not closed:
+        start, end = count * np.arange(4), count * np.arange(4) + count - 1
+        faces += [start[[[0, 2, 1], [0, 3, 2]]], end[[[0, 1, 2], [0, 2, 3]]]]
+    mesh = polygon_flat(vertices, np.concatenate(faces))
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
+    if (np.cross(a, b) * c).sum() < 0:  # the lines run the other way round
+        mesh = polygon_flat(vertices, np.concatenate(faces)[:, ::-1])
+    return mesh
+
+
+def polygon_flat(vertices: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "M 3"]) -> Mesh:
+    """A mesh from bare triangles: flat shading, texture coordinates by projection along each face's main axis."""
+    bare = np.asarray(vertices, dtype=float)
+    zeros = np.zeros_like(bare)
+    flat = _faceted(Mesh(bare, np.asarray(faces, dtype=np.int64), zeros, zeros[:, :2]))
+    main = np.abs(flat.normals).argmax(axis=1)
+    size = np.ptp(bare, axis=0)
+    uv = np.empty((len(flat.vertices), 2))
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        columns = [u, v] if size[u] >= size[v] else [v, u]
+        uv[main == axis] = flat.vertices[main == axis][:, columns] / _UV_UNIT_M
+    return replace(flat, uv=uv)
+
+
+def _grid_faces(rows: int, columns: int) -> np.ndarray:
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
+    a = (row * columns + column).ravel()
+    b, c, d = a + 1, a + columns + 1, a + columns
+    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int64)
+
+
+def _faceted(mesh: Mesh) -> Mesh:
+    """The same triangles with their own corners and flat normals."""
+    corner = mesh.vertices[mesh.faces]
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    faces = np.arange(3 * len(corner), dtype=np.int64).reshape(-1, 3)
+    return Mesh(corner.reshape(-1, 3), faces, np.repeat(normal, 3, axis=0), mesh.uv[mesh.faces].reshape(-1, 2))
+
+
+def _cap(ring: Float[np.ndarray, "S 3"], normal: Float[np.ndarray, "3"]) -> Mesh:
+    """A fan over a convex ring, counter-clockwise about ``normal`` once the ring is put in that order."""
+    a, b = ring[1] - ring[0], ring[2] - ring[0]
+    if np.dot(np.cross(a, b), normal) < 0:
+        ring = ring[::-1]
+    index = np.arange(1, len(ring) - 1)
+    faces = np.stack([np.zeros_like(index), index, index + 1], axis=1).astype(np.int64)
+    return Mesh(ring.copy(), faces, np.tile(normal, (len(ring), 1)), ring[:, [0, 2]] / _UV_UNIT_M)
 
 
 @dataclass(frozen=True)
@@ -81,19 +284,17 @@ SURFACES = {
     "leather": (0.25, 0.13, 0.06),
     "glass": (0.10, 0.13, 0.14),
 }
-"""Base colours (linear RGB) that the written ``.mtl`` gives to each kind of surface."""
+"""Base colours (linear RGB) of each kind of surface."""
 
 
 @dataclass(frozen=True)
 class Link:
     """A moving link and the joint that carries it on the body."""
 
-    name: str
-    """Name of the link; its joint is called ``<name>_joint``."""
     parts: tuple[Part, ...]
     """Visuals, in the frame whose origin is ``origin``."""
     kind: Literal["revolute", "prismatic"]
-    """``revolute`` or ``prismatic``."""
+    """How its joint moves."""
     origin: tuple[float, float, float]
     """Joint origin in the object's frame, metres."""
     axis: tuple[float, float, float]
@@ -127,99 +328,52 @@ class ObjectModel:
             links.append(replace(link, origin=(float(x), float(y), float(z))))
         return ObjectModel(self.model_cat, body, tuple(links))
 
-
-MESH_FOLDER = "textured_objs"
-URDF_NAME = "mobility.urdf"
-_BODY = "body"
-_ALWAYS = 6
-"""So many surfaces are written for every object, worn or not."""
+    def centred(self, width: float, depth: float, lift: float = 0.0) -> ObjectModel:
+        """An object built from the origin, its middle above the origin, and lifted."""
+        return self.moved((-width / 2, -depth / 2, lift))
 
 
-def write_object(model: ObjectModel, folder: Path, *, name: str, meta: dict[str, object]) -> Path:
-    """Write a model; whatever the folder held under the same names is replaced.
+def as_urdf(model: ObjectModel) -> Urdf:
+    """The model as a URDF would hold it, numbers rounded as in its text: so takes have been made from the beginning.
 
     The root link ``base`` carries the body by a fixed joint that turns the front from -y to -x, as
     PartNet-Mobility's own base joints do.
-
-    Args:
-        model: the object, front along -y, metres.
-        folder: where to write; made if missing.
-        name: name of the robot in the URDF.
-        meta: what ``meta.json`` holds beside ``model_cat``.
-
-    Returns:
-        The folder.
     """
-    meshes = folder / MESH_FOLDER
-    meshes.mkdir(parents=True, exist_ok=True)
-    (meshes / "surfaces.mtl").write_text(_materials(model), encoding="ascii")
-    robot = ET.Element("robot", name=name)
-    ET.SubElement(robot, "link", name="base")
-    number = _write_link(robot, _BODY, model.body, meshes, 0)
-    _write_joint(robot, "body_joint", "fixed", "base", _BODY, origin=(0, 0, 0), yaw_rad=-math.pi / 2)
-    for link in model.links:
-        number = _write_link(robot, link.name, link.parts, meshes, number)
-        joint = _write_joint(robot, f"{link.name}_joint", link.kind, _BODY, link.name, origin=link.origin)
-        ET.SubElement(joint, "axis", xyz=_numbers(link.axis))
-        ET.SubElement(joint, "limit", lower="0", upper=f"{link.upper:.6g}", effort="100", velocity="10")
-    ET.indent(robot)
-    text = '<?xml version="1.0"?>\n' + ET.tostring(robot, encoding="unicode") + "\n"
-    (folder / URDF_NAME).write_text(text, encoding="ascii")
-    meta_text = json.dumps({"model_cat": model.model_cat, **meta}, indent=1, sort_keys=True)
-    (folder / "meta.json").write_text(meta_text + "\n", encoding="ascii")
-    return folder
+    links: dict[str, tuple[UrdfVisual, ...]] = {"base": ()}
+    yaw = pose_matrix(np.zeros(3), np.array([0.0, 0.0, -1.5707963267949]))
+    joints = [UrdfJoint("body_joint", "fixed", "base", "body", yaw, np.array([1.0, 0.0, 0.0]), 0.0, 0.0)]
+    number = 0
+    for name, parts in (("body", model.body), *((f"link_{n}", link.parts) for n, link in enumerate(model.links))):
+        links[name] = tuple(_visual(part, number + n) for n, part in enumerate(parts))
+        number += len(parts)
+    for n, link in enumerate(model.links):
+        pose, axis = pose_matrix(_short(link.origin), np.zeros(3)), _short(link.axis)
+        axis /= max(float(np.linalg.norm(axis)), 1e-9)
+        upper = float(f"{link.upper:.6g}")
+        joints.append(UrdfJoint(f"link_{n}_joint", link.kind, "body", f"link_{n}", pose, axis, 0.0, upper))
+    return Urdf(links, tuple(joints))
 
 
-def _write_link(robot: ET.Element, name: str, parts: tuple[Part, ...], meshes: Path, number: int) -> int:
-    link = ET.SubElement(robot, "link", name=name)
-    for part in parts:
-        filename = f"part-{number}.obj"
-        (meshes / filename).write_text(_obj(part.mesh, part.surface), encoding="ascii")
-        visual = ET.SubElement(link, "visual", name=f"{part.role}-{number}")
-        ET.SubElement(visual, "origin", xyz="0 0 0")
-        geometry = ET.SubElement(visual, "geometry")
-        ET.SubElement(geometry, "mesh", filename=f"{MESH_FOLDER}/{filename}")
-        number += 1
-    return number
+def _short(values: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
+    return np.array([float(f"{value:.6g}") for value in values])
 
 
-def _write_joint(
-    robot: ET.Element,
-    name: str,
-    kind: str,
-    parent: str,
-    child: str,
-    *,
-    origin: tuple[float, float, float],
-    yaw_rad: float = 0.0,
-) -> ET.Element:
-    joint = ET.SubElement(robot, "joint", name=name, type=kind)
-    ET.SubElement(joint, "origin", xyz=_numbers(origin), rpy=f"0 0 {yaw_rad:.15g}")
-    ET.SubElement(joint, "parent", link=parent)
-    ET.SubElement(joint, "child", link=child)
-    return joint
+def _visual(part: Part, number: int) -> UrdfVisual:
+    mesh, corner = part.mesh, part.mesh.faces.ravel()
+    uv = _single(mesh.uv, 5)[corner]
+    uv[:, 1] = 1 - uv[:, 1]  # images begin at their upper edge
+    data = MeshData(
+        np.round(mesh.vertices, 6),
+        mesh.faces,
+        (_single(mesh.vertices, 6)[corner], _single(mesh.normals, 4)[corner], uv),
+        SURFACES[part.surface],
+        0.88 if part.surface == "metal" else 0.98,
+    )
+    return UrdfVisual(f"{part.role}-{number}", np.eye(4), data, (1.0, 1.0, 1.0), "mesh", (), None)
 
 
-def _numbers(values: tuple[float, float, float]) -> str:
-    return " ".join(f"{value:.6g}" for value in values)
-
-
-def _obj(mesh: Mesh, surface: str) -> str:
-    assert surface in SURFACES, surface
-    rows = ["mtllib surfaces.mtl", f"usemtl {surface}"]
-    rows += [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in mesh.vertices.tolist()]
-    rows += [f"vt {u:.5f} {v:.5f}" for u, v in mesh.uv.tolist()]
-    rows += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.normals.tolist()]
-    rows += [f"f {a}/{a}/{a} {b}/{b}/{b} {c}/{c}/{c}" for a, b, c in (mesh.faces + 1).tolist()]
-    return "\n".join(rows) + "\n"
-
-
-def _materials(model: ObjectModel) -> str:
-    rows = []
-    worn = {part.surface for part in (*model.body, *(part for link in model.links for part in link.parts))}
-    for index, (name, colour) in enumerate(SURFACES.items()):
-        if index >= _ALWAYS and name not in worn:
-            continue
-        shine = "0.6 0.6 0.6" if name == "metal" else "0.1 0.1 0.1"
-        rows.append(f"newmtl {name}\nKd {colour[0]} {colour[1]} {colour[2]}\nKs {shine}\nNs 40\nd 1\n")
-    return "\n".join(rows)
+def _single(values: Float[np.ndarray, "N D"], decimals: int) -> Float32[np.ndarray, "N D"]:
+    """Single precision as readers of mesh files come to it: the whole part plus the decimals."""
+    whole, rest = np.divmod(np.rint(np.abs(values) * 10.0**decimals), 10.0**decimals)
+    single = whole.astype(np.float32) + (rest * 10.0**-decimals).astype(np.float32)
+    return np.copysign(single, values.astype(np.float32))

@@ -12,8 +12,7 @@ from jaxtyping import Float
 from quest.errors import MissingExtraError
 from quest.extras import install_command
 from quest.sim.procedural.handles import HandleStyle, handle_part, sample_style
-from quest.sim.procedural.model import Link, Mesh, ObjectModel, Part, join
-from quest.sim.procedural.shapes import box, polygon_flat
+from quest.sim.procedural.model import Dice, Link, Mesh, ObjectModel, Part, box, join, polygon_flat
 
 _OWN_HANDLE_SHARE = 0.5
 _BARE_SHARE = 0.06
@@ -23,15 +22,99 @@ _SURFACES = {
 }  # fmt: skip
 
 
-def build_kitchen(category: str, rng: np.random.Generator) -> ObjectModel:
-    """A kitchen cabinet or an appliance with random proportions.
+_FOLDER = object()
+"""Stands for a folder for mesh files."""
 
-    Args:
-        category: one of :data:`KITCHEN`.
-        rng: source of randomness.
+
+def _share(name: str, low: float, high: float) -> Callable[[dict[str, Any], Dice], float]:
+    """A random share of an argument that is drawn already."""
+    return lambda drawn, rng: drawn[name] * rng.real(low, high)
+
+
+def _doors(drawn: dict[str, Any], rng: Dice) -> tuple[str, ...]:
+    if drawn["_doors"] == 1:
+        return (rng.pick(["door_left", "door_right"]),)
+    return tuple("door_right" if index % 2 == 0 else "door_left" for index in range(drawn["_doors"]))
+
+
+_SHAPE = {
+    "straight_ratio": (0.3, 2.0), "curvature_ratio": (0.2, 1.0), "num_segments_cross_section": [4, 8],
+    "num_segments_curvature": 8, "aspect_ratio_cross_section": (0.5, 1.2), "tmp_mesh_dir": _FOLDER,
+}  # fmt: skip
+_CABINET_HANDLE = {
+    "_curved": lambda drawn, rng: rng.chance(0.6),
+    "handle_shape_args": lambda drawn, rng: _SHAPE if drawn["_curved"] else None,
+    "handle_width": (0.1, 0.22), "handle_height": (0.015, 0.035), "handle_depth": (0.025, 0.045),
+}  # fmt: skip
+_FRONT_HANDLE = {
+    "handle_length": _share("width", 0.45, 0.85), "handle_thickness": (0.018, 0.04), "handle_depth": (0.035, 0.06),
+    "handle_offset": (0.03, 0.06), "handle_shape_args": {**_SHAPE, "straight_ratio": (0.6, 2.0)},
+}  # fmt: skip
+
+KITCHEN: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "base_cabinet": ("StorageFurniture", "BaseCabinetAsset", {
+        "_doors": range(1, 4), "num_drawers_vertical": [1, 1, 2],
+        "width": lambda drawn, rng: rng.real(0.38, 0.48) * max(drawn["_doors"], 3 - drawn["num_drawers_vertical"]),
+        "depth": (0.5, 0.7), "height": (0.8, 0.95),
+        "num_drawers_horizontal": lambda drawn, rng: max(drawn["_doors"], 2) if rng.chance(0.8) else 1,
+        "drawer_height": (0.16, 0.2), "lower_compartment_types": _doors, "num_shelves": range(3), **_CABINET_HANDLE,
+    }),
+    "wall_cabinet": ("StorageFurniture", "WallCabinetAsset", {
+        "_doors": range(2, 5), "width": lambda drawn, rng: rng.real(0.32, 0.45) * drawn["_doors"],
+        "depth": (0.28, 0.38), "height": (0.55, 0.95), "compartment_types": _doors, "num_shelves": range(1, 4),
+        **_CABINET_HANDLE,
+    }),
+    "island": ("StorageFurniture", "KitchenIslandAsset", {
+        "depth": (0.6, 0.9), "width": (1.1, 1.6), "height": (0.85, 0.95), "depth_storage": _share("depth", 0.5, 0.7),
+        **_CABINET_HANDLE,
+    }),
+    "sink_cabinet": ("StorageFurniture", "SinkCabinetAsset", {
+        "width": (0.7, 1.1), "depth": (0.58, 0.75), "height": (0.82, 0.95), "sink_width": _share("width", 0.55, 0.8),
+        "sink_depth": _share("depth", 0.5, 0.6), "sink_tmp_mesh_dir": _FOLDER, "use_primitives_for_sink": True,
+        **_CABINET_HANDLE,
+    }),
+    "microwave": ("Microwave", "MicrowaveAsset", {
+        "width": (0.42, 0.6), "height": (0.26, 0.36), "depth": (0.32, 0.42), "thickness": (0.02, 0.04),
+        "display_panel_width": _share("width", 0.18, 0.28), "handle_left": lambda drawn, rng: rng.chance(0.3),
+        "handle_depth": (0.03, 0.06), "handle_thickness": (0.015, 0.035),
+        "handle_length": _share("height", 0.5, 0.85), "handle_straight_ratio": (0.3, 1.5),
+        "handle_num_segments_cross_section": [4, 8], "tmp_mesh_dir": _FOLDER,
+    }),
+    "refrigerator": ("Refrigerator", "RefrigeratorAsset", {
+        "height": (1.2, 1.9), "handle_vertical": lambda drawn, rng: rng.chance(0.8), "width": (0.55, 0.9),
+        "depth": (0.55, 0.75),
+        "freezer_compartment_height":
+            lambda drawn, rng: drawn["height"] * rng.real(0.25, 0.4) if rng.chance(0.8) else 0.0,
+        "thickness": (0.04, 0.07), "num_shelves": range(2, 5), "num_door_shelves": range(2, 4),
+        "handle_left": lambda drawn, rng: rng.chance(0.5),
+        "handle_length":
+            lambda drawn, rng: rng.real(0.2, 0.28) if drawn["handle_vertical"] else drawn["width"] * rng.real(0.3, 0.5),
+        "handle_thickness": (0.025, 0.06), "handle_depth": (0.03, 0.06), "handle_shape_args": _SHAPE,
+        "door_shape_args": {
+            "straight_ratio": (0.85, 0.95), "curvature_ratio": 0.9, "num_segments": 9, "tmp_mesh_dir": _FOLDER,
+        },
+    }),
+    "range": ("Oven", "RangeAsset", {
+        "width": (0.55, 0.9), "height": (0.85, 0.95), "storage_height": (0.16, 0.24), "depth": (0.58, 0.72),
+        "oven_height": lambda drawn, rng: drawn["height"] - drawn["storage_height"] - 0.1, **_FRONT_HANDLE,
+    }),
+    "dishwasher": ("Dishwasher", "DishwasherAsset", {
+        "width": (0.45, 0.75), "depth": (0.55, 0.7), "height": (0.8, 0.92), "basket_wire_mesh_gap": 0.09,
+        **_FRONT_HANDLE,
+    }),
+}  # fmt: skip
+"""PartNet-Mobility's word for each category, scene-synthesizer's, and a recipe of what to ask of it.
+
+A recipe is gone through in order. A pair is a range, a list a choice, a ``range`` a choice of whole numbers; a function
+knows what is drawn so far; names with an underscore are not asked for.
+"""
+
+
+def build_kitchen(category: str, rng: Dice) -> ObjectModel:
+    """A kitchen cabinet or an appliance of :data:`KITCHEN` with random proportions.
 
     Raises:
-        MissingExtraError: If scene-synthesizer is not installed.
+        MissingExtraError: scene-synthesizer is not installed.
     """
     try:
         from scene_synthesizer import procedural_assets
@@ -39,197 +122,34 @@ def build_kitchen(category: str, rng: np.random.Generator) -> ObjectModel:
         raise MissingExtraError(
             f"procedural {category}: scene-synthesizer is missing; install the extra: {install_command('sim')}"
         ) from error
-    model_cat, describe = KITCHEN[category]
+    model_cat, name, recipe = KITCHEN[category]
     with tempfile.TemporaryDirectory(prefix="quest-") as folder:
-        name, arguments = describe(rng, folder)
-        asset = getattr(procedural_assets, name)(**arguments)
+        asset = getattr(procedural_assets, name)(**_drawn(recipe, rng, folder))
         return _convert(asset._model.robot, rng, model_cat)
 
 
-def _handle_shape(
-    rng: np.random.Generator, folder: str, *, straight: tuple[float, float] = (0.3, 2.0)
-) -> dict[str, Any]:
-    return {
-        "straight_ratio": float(rng.uniform(*straight)),
-        "curvature_ratio": float(rng.uniform(0.2, 1.0)),
-        "num_segments_cross_section": int(rng.choice([4, 8])),
-        "num_segments_curvature": 8,
-        "aspect_ratio_cross_section": float(rng.uniform(0.5, 1.2)),
-        "tmp_mesh_dir": folder,
-    }
+def _drawn(recipe: dict[str, Any], rng: Dice, folder: str) -> dict[str, Any]:
+    drawn: dict[str, Any] = {}
+    for name, value in recipe.items():
+        if callable(value):
+            value = value(drawn, rng)
+        elif isinstance(value, tuple):
+            value = rng.real(*value)
+        elif isinstance(value, list | range):
+            value = rng.pick(value)
+        drawn[name] = _drawn(value, rng, folder) if isinstance(value, dict) else folder if value is _FOLDER else value
+    return {name: value for name, value in drawn.items() if not name.startswith("_")}
 
 
-def _cabinet_handle(rng: np.random.Generator, folder: str) -> dict[str, Any]:
-    shape = _handle_shape(rng, folder) if rng.random() < 0.6 else None
-    return {
-        "handle_width": float(rng.uniform(0.1, 0.22)),
-        "handle_height": float(rng.uniform(0.015, 0.035)),
-        "handle_depth": float(rng.uniform(0.025, 0.045)),
-        "handle_shape_args": shape,
-    }
-
-
-def _doors(rng: np.random.Generator, count: int) -> tuple[str, ...]:
-    if count == 1:
-        return (str(rng.choice(["door_left", "door_right"])),)
-    return tuple("door_right" if index % 2 == 0 else "door_left" for index in range(count))
-
-
-def _base_cabinet(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    doors = int(rng.integers(1, 4))
-    rows = int(rng.choice([1, 1, 2]))
-    return "BaseCabinetAsset", {
-        "width": float(rng.uniform(0.38, 0.48)) * max(doors, 2 if rows == 1 else 1),
-        "depth": float(rng.uniform(0.5, 0.7)),
-        "height": float(rng.uniform(0.8, 0.95)),
-        "num_drawers_horizontal": max(doors, 2) if rng.random() < 0.8 else 1,
-        "num_drawers_vertical": rows,
-        "drawer_height": float(rng.uniform(0.16, 0.2)),
-        "lower_compartment_types": _doors(rng, doors),
-        "num_shelves": int(rng.integers(0, 3)),
-        **_cabinet_handle(rng, folder),
-    }
-
-
-def _wall_cabinet(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    doors = int(rng.integers(2, 5))
-    return "WallCabinetAsset", {
-        "width": float(rng.uniform(0.32, 0.45)) * doors,
-        "depth": float(rng.uniform(0.28, 0.38)),
-        "height": float(rng.uniform(0.55, 0.95)),
-        "compartment_types": _doors(rng, doors),
-        "num_shelves": int(rng.integers(1, 4)),
-        **_cabinet_handle(rng, folder),
-    }
-
-
-def _island(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    depth = float(rng.uniform(0.6, 0.9))
-    return "KitchenIslandAsset", {
-        "width": float(rng.uniform(1.1, 1.6)),
-        "depth": depth,
-        "height": float(rng.uniform(0.85, 0.95)),
-        "depth_storage": depth * float(rng.uniform(0.5, 0.7)),
-        **_cabinet_handle(rng, folder),
-    }
-
-
-def _sink_cabinet(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    width, depth = float(rng.uniform(0.7, 1.1)), float(rng.uniform(0.58, 0.75))
-    return "SinkCabinetAsset", {
-        "width": width,
-        "depth": depth,
-        "height": float(rng.uniform(0.82, 0.95)),
-        "sink_width": width * float(rng.uniform(0.55, 0.8)),
-        "sink_depth": depth * float(rng.uniform(0.5, 0.6)),
-        "sink_tmp_mesh_dir": folder,
-        "use_primitives_for_sink": True,
-        **_cabinet_handle(rng, folder),
-    }
-
-
-def _microwave(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    width = float(rng.uniform(0.42, 0.6))
-    height = float(rng.uniform(0.26, 0.36))
-    return "MicrowaveAsset", {
-        "width": width,
-        "depth": float(rng.uniform(0.32, 0.42)),
-        "height": height,
-        "thickness": float(rng.uniform(0.02, 0.04)),
-        "display_panel_width": width * float(rng.uniform(0.18, 0.28)),
-        "handle_left": bool(rng.random() < 0.3),
-        "handle_depth": float(rng.uniform(0.03, 0.06)),
-        "handle_thickness": float(rng.uniform(0.015, 0.035)),
-        "handle_length": height * float(rng.uniform(0.5, 0.85)),
-        "handle_straight_ratio": float(rng.uniform(0.3, 1.5)),
-        "handle_num_segments_cross_section": int(rng.choice([4, 8])),
-        "tmp_mesh_dir": folder,
-    }
-
-
-def _refrigerator(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    height = float(rng.uniform(1.2, 1.9))
-    upright = bool(rng.random() < 0.8)
-    width = float(rng.uniform(0.55, 0.9))
-    return "RefrigeratorAsset", {
-        "width": width,
-        "depth": float(rng.uniform(0.55, 0.75)),
-        "height": height,
-        "freezer_compartment_height": height * float(rng.uniform(0.25, 0.4)) if rng.random() < 0.8 else 0.0,
-        "thickness": float(rng.uniform(0.04, 0.07)),
-        "num_shelves": int(rng.integers(2, 5)),
-        "num_door_shelves": int(rng.integers(2, 4)),
-        "handle_left": bool(rng.random() < 0.5),
-        "handle_vertical": upright,
-        "handle_length": float(rng.uniform(0.2, 0.28)) if upright else width * float(rng.uniform(0.3, 0.5)),
-        "handle_thickness": float(rng.uniform(0.025, 0.06)),
-        "handle_depth": float(rng.uniform(0.03, 0.06)),
-        "handle_shape_args": _handle_shape(rng, folder),
-        "door_shape_args": {
-            "straight_ratio": float(rng.uniform(0.85, 0.95)),
-            "curvature_ratio": 0.9,
-            "num_segments": 9,
-            "tmp_mesh_dir": folder,
-        },
-    }
-
-
-def _front_handle(rng: np.random.Generator, folder: str, width: float) -> dict[str, Any]:
-    return {
-        "handle_length": width * float(rng.uniform(0.45, 0.85)),
-        "handle_thickness": float(rng.uniform(0.018, 0.04)),
-        "handle_depth": float(rng.uniform(0.035, 0.06)),
-        "handle_offset": float(rng.uniform(0.03, 0.06)),
-        "handle_shape_args": _handle_shape(rng, folder, straight=(0.6, 2.0)),
-    }
-
-
-def _range(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    width, height = float(rng.uniform(0.55, 0.9)), float(rng.uniform(0.85, 0.95))
-    storage = float(rng.uniform(0.16, 0.24))
-    return "RangeAsset", {
-        "width": width,
-        "depth": float(rng.uniform(0.58, 0.72)),
-        "height": height,
-        "storage_height": storage,
-        "oven_height": height - storage - 0.1,
-        **_front_handle(rng, folder, width),
-    }
-
-
-def _dishwasher(rng: np.random.Generator, folder: str) -> tuple[str, dict[str, Any]]:
-    width = float(rng.uniform(0.45, 0.75))
-    return "DishwasherAsset", {
-        "width": width,
-        "depth": float(rng.uniform(0.55, 0.7)),
-        "height": float(rng.uniform(0.8, 0.92)),
-        "basket_wire_mesh_gap": 0.09,
-        **_front_handle(rng, folder, width),
-    }
-
-
-KITCHEN: dict[str, tuple[str, Callable[[np.random.Generator, str], tuple[str, dict[str, Any]]]]] = {
-    "base_cabinet": ("StorageFurniture", _base_cabinet),
-    "wall_cabinet": ("StorageFurniture", _wall_cabinet),
-    "island": ("StorageFurniture", _island),
-    "sink_cabinet": ("StorageFurniture", _sink_cabinet),
-    "microwave": ("Microwave", _microwave),
-    "refrigerator": ("Refrigerator", _refrigerator),
-    "range": ("Oven", _range),
-    "dishwasher": ("Dishwasher", _dishwasher),
-}
-"""PartNet-Mobility's word for each category, and what to ask of scene-synthesizer."""
-
-
-def _convert(robot: Any, rng: np.random.Generator, model_cat: str) -> ObjectModel:
+def _convert(robot: Any, rng: Dice, model_cat: str) -> ObjectModel:
     """A yourdfpy robot whose moving links hang on one root, as our own model; dish racks stay with the body."""
     joints = {joint.child: joint for joint in robot.joints}
     furniture = model_cat == "StorageFurniture"
     own_style = sample_style(rng, knobs=furniture, scale=1.0 if furniture else 2.0)
-    use_own = bool(rng.random() < _OWN_HANDLE_SHARE)
-    bare = bool(rng.random() < _BARE_SHARE)
-    surface = str(rng.choice(["metal", "dark", "white"], p=[0.55, 0.3, 0.15]))
-    opening = float(np.deg2rad(rng.uniform(80, 115)))
+    use_own = rng.chance(_OWN_HANDLE_SHARE)
+    bare = rng.chance(_BARE_SHARE)
+    surface = rng.pick(["metal", "dark", "white"], p=[0.55, 0.3, 0.15])
+    opening = rng.angle(80, 115)
     body: list[tuple[str, Mesh]] = []
     links: list[Link] = []
     for link in robot.links:
@@ -253,16 +173,16 @@ def _convert(robot: Any, rng: np.random.Generator, model_cat: str) -> ObjectMode
             upper = min(upper, np.deg2rad(92.0))  # a bottom-hinged door would hit the floor
         x, y, z = joint.origin[:3, 3].tolist()
         ax, ay, az = (np.asarray(joint.axis, dtype=float) + 0.0).tolist()
-        links.append(Link(f"link_{len(links)}", tuple(parts), joint.type, (x, y, z), (ax, ay, az), float(upper)))
+        links.append(Link(tuple(parts), joint.type, (x, y, z), (ax, ay, az), float(upper)))
     model = ObjectModel(model_cat, tuple(_group(body, moving=False)), tuple(links))
     lowest = min(float(part.mesh.bounds[0, 2]) for part in model.body)
     return model.moved((0.0, 0.0, -lowest))
 
 
-def _pane(panel: Mesh, rng: np.random.Generator) -> Mesh:
+def _pane(panel: Mesh, rng: Dice) -> Mesh:
     """A thin pane on the face of a door, clear of the strip where its handle stands."""
     (x0, y, z0), (x1, _, z1) = panel.bounds
-    margin = np.array([0.2 * (x1 - x0), float(rng.uniform(0.1, 0.25)) * (z1 - z0)])
+    margin = np.array([0.2 * (x1 - x0), rng.real(0.1, 0.25) * (z1 - z0)])
     return box((x0 + margin[0], y - 0.002, z0 + margin[1]), (x1 - margin[0], y + 0.002, z1 - margin[1]))
 
 
