@@ -74,20 +74,29 @@ def tum(root: Path, name: str = "rgbd_dataset_own") -> Path:
     return root
 
 
-def seven_scenes(root: Path) -> Path:
+def pictures(root: Path, colours: str, depth: str) -> Path:
+    """Colours and depth under names with the number of the frame in them."""
     for t in range(FRAMES):
-        png(root / f"frame-{t:06d}.color.png", RGB[t])
-        png(root / f"frame-{t:06d}.depth.png", MM)
-        numbers(root / f"frame-{t:06d}.pose.txt", POSES[t])
+        png(root / colours.format(t), RGB[t])
+        png(root / depth.format(t), MM)
     return root
 
 
-def rscan(root: Path) -> Path:
+def pose_files(root: Path, name: str) -> None:
     for t in range(FRAMES):
-        (root).mkdir(exist_ok=True)
+        numbers(root / name.format(t), POSES[t])
+
+
+def seven_scenes(root: Path) -> Path:
+    pose_files(root, "frame-{:06d}.pose.txt")
+    return pictures(root, "frame-{:06d}.color.png", "frame-{:06d}.depth.png")
+
+
+def rscan(root: Path) -> Path:
+    pose_files(root, "frame-{:06d}.pose.txt")
+    for t in range(FRAMES):
         Image.fromarray(RGB[t]).save(root / f"frame-{t:06d}.color.jpg", quality=98)
         cv2.imwrite(str(root / f"frame-{t:06d}.depth.pgm"), MM[::4, ::4])
-        numbers(root / f"frame-{t:06d}.pose.txt", POSES[t])
     lines = [f"m_{which}{side} = {n}" for which, size in (("color", (WIDTH, HEIGHT)), ("depth", (160, 120)))
              for side, n in zip(("Width", "Height"), size, strict=True)]  # fmt: skip
     for which, scale in (("Color", 1.0), ("Depth", 0.25)):
@@ -99,9 +108,7 @@ def rscan(root: Path) -> Path:
 
 
 def open3d(root: Path) -> Path:
-    for t in range(FRAMES):
-        png(root / "color" / f"{t:06d}.png", RGB[t])
-        png(root / "depth" / f"{t:06d}.png", MM)
+    pictures(root, "color/{:06d}.png", "depth/{:06d}.png")
     fields = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": MATRIX.T.ravel().tolist(), "depth_scale": 1000.0}
     (root / "intrinsic.json").write_text(json.dumps(fields))
     with (root / "trajectory.log").open("w") as log:
@@ -111,10 +118,9 @@ def open3d(root: Path) -> Path:
 
 
 def scannet(root: Path) -> Path:
-    for t in range(FRAMES):
-        png(root / "color" / f"{t}.png", RGB[t])
-        png(root / "depth" / f"{t}.png", MM)
-        numbers(root / "pose" / f"{t}.txt", np.full((4, 4), -np.inf) if t == 2 else POSES[t])
+    pictures(root, "color/{}.png", "depth/{}.png")
+    pose_files(root, "pose/{}.txt")
+    numbers(root / "pose" / "2.txt", np.full((4, 4), -np.inf))
     whole = np.eye(4)
     whole[:3, :3] = MATRIX
     for name in ("color", "depth"):
@@ -157,10 +163,9 @@ def stray(root: Path) -> Path:
 
 
 def nerfstudio(root: Path) -> Path:
+    pictures(root, "images/frame_{:05d}.png", "depths/frame_{:05d}.png")
     frames = []
     for t in range(FRAMES):
-        png(root / "images" / f"frame_{t:05d}.png", RGB[t])
-        png(root / "depths" / f"frame_{t:05d}.png", MM)
         paths = {"file_path": f"images/frame_{t:05d}.png", "depth_file_path": f"depths/frame_{t:05d}.png"}
         frames.append({**paths, "transform_matrix": (POSES[t] @ GL_FROM_CV).tolist()})
     fields = {"fl_x": 520.0, "fl_y": 521.0, "cx": 320.5, "cy": 240.5, "w": WIDTH, "h": HEIGHT, "k1": 0, "k2": 0}

@@ -48,16 +48,13 @@ def test_tensors_and_lists(clip: Clip):
         channels_first.permute(0, 2, 3, 1), torch.from_numpy(clip.depth_m).double().requires_grad_(), clip.camera,
         stamp_s=torch.arange(12) / 30, cam_from_world=torch.eye(4), name="mine",
     )  # fmt: skip
+    for rgb in (clip.rgb.astype(np.float32) / 255, torch.from_numpy(clip.rgb) / 255):  # from 0 to 1
+        np.testing.assert_array_equal(Clip.from_arrays(rgb).rgb, clip.rgb)
     for found in (lists, tensors):
         np.testing.assert_array_equal(found.rgb, expected.rgb)
         np.testing.assert_array_equal(found.depth_m, expected.depth_m)  # type: ignore[arg-type]
         np.testing.assert_allclose(found.stamp_s, expected.stamp_s, atol=1e-6)
         np.testing.assert_array_equal(found.cam_from_world, expected.cam_from_world)
-
-
-def test_colours_from_0_to_1_are_those_of_bytes(clip: Clip):
-    for rgb in (clip.rgb.astype(np.float32) / 255, torch.from_numpy(clip.rgb) / 255):
-        np.testing.assert_array_equal(Clip.from_arrays(rgb).rgb, clip.rgb)
 
 
 @pytest.mark.parametrize(
@@ -106,10 +103,15 @@ def test_shapes_that_contradict_each_other(clip: Clip):
         ({"cam_from_world": np.eye(3)}, "12 time stamps and poses"),
         ({"stamp_s": np.arange(12.0), "fps": 10}, "not from both"),
         ({"fps": 0}, "fps > 0"),
+        ({"stamp_s": clip.stamp_s[::-1].copy()}, "sort the frames"),
     ]
     for how, what in wrong:
         with pytest.raises(InputError, match=what):
             Clip.from_arrays(clip.rgb, **how)
+    with pytest.raises(InputError, match="at least one frame"):
+        Clip.from_arrays(clip.rgb[:0])
+    with pytest.raises(RecordingError, match=r"depth_scale_m = 0\.001 would give"):
+        Clip.from_arrays(clip.rgb, (clip.depth_m * 1000).astype(np.uint16), clip.camera)
 
 
 def test_intrinsics_of_numpy_are_numbers(clip: Clip, tmp_path: Path):
@@ -119,19 +121,6 @@ def test_intrinsics_of_numpy_are_numbers(clip: Clip, tmp_path: Path):
     assert read_recording(tmp_path / "again").camera == camera
     with pytest.raises(InputError, match=r"whole pixels|int"):
         Camera(50.0, 50.0, 32.0, 24.0, 64.5, 48)  # type: ignore[arg-type]
-
-
-def test_arrays_in_millimetres(clip: Clip):
-    assert clip.depth_m is not None
-    with pytest.raises(RecordingError, match=r"depth_scale_m = 0\.001 would give"):
-        Clip.from_arrays(clip.rgb, (clip.depth_m * 1000).astype(np.uint16), clip.camera)
-
-
-def test_arrays_without_frames_or_with_unsorted_stamps(clip: Clip):
-    with pytest.raises(InputError, match="at least one frame"):
-        Clip.from_arrays(clip.rgb[:0])
-    with pytest.raises(InputError, match="sort the frames"):
-        Clip.from_arrays(clip.rgb, stamp_s=clip.stamp_s[::-1].copy())
 
 
 def test_whatever_can_be_tracked_is_read(clip: Clip, tmp_path: Path):

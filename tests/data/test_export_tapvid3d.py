@@ -36,7 +36,7 @@ def take() -> Take:
 
 
 def test_round_trip(take: Take, tmp_path: Path):
-    paths = export_tapvid3d(take, tmp_path / "out")
+    paths = export_tapvid3d(take, tmp_path / "out", jpeg_quality=100)
     assert [path.name for path in paths] == ["panels-v0.npz", "panels-v1.npz"]
     for path, view, tracked in zip(paths, take.views, ([0, 1, 2], [0, 2]), strict=True):
         with np.load(path, allow_pickle=False) as example:
@@ -54,36 +54,22 @@ def test_round_trip(take: Take, tmp_path: Path):
         world = np.einsum("tji,tnj->tni", pose[:, :3, :3], point - pose[:, None, :3, 3])
         assert np.abs(world - take.point_world[:, tracked]).max() < 1e-5
         assert list(arrays["track_names"]) == [take.info.entities[e].name for e in tracked]
+        images = arrays["images_jpeg_bytes"]
+        assert (images.shape, images.dtype.kind) == ((16,), "S")
+        for jpeg, rgb in zip(images, view.clip.rgb, strict=True):
+            assert jpeg.endswith(b"\xff\xd9")
+            found = np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
+            assert np.abs(found.astype(int) - rgb).mean() < 2
 
 
-def test_images(take: Take, tmp_path: Path):
-    path = export_tapvid3d(take, tmp_path, jpeg_quality=100)[0]
-    with np.load(path, allow_pickle=False) as example:
-        images = example["images_jpeg_bytes"]
-    assert (images.shape, images.dtype.kind) == ((16,), "S")
-    for jpeg, rgb in zip(images, take.views[0].clip.rgb, strict=True):
-        assert jpeg.endswith(b"\xff\xd9")
-        found = np.asarray(Image.open(io.BytesIO(jpeg)).convert("RGB"))
-        assert found.shape == rgb.shape
-        assert np.abs(found.astype(int) - rgb).mean() < 2
-
-
-def test_views_without_entities_are_left_out(take: Take, tmp_path: Path):
+def test_depth_only_if_asked_for_and_no_views_without_entities(take: Take, tmp_path: Path):
     blind = replace(take.views[0], visible=np.zeros_like(take.views[0].visible))
-    paths = export_tapvid3d(replace(take, views=(blind, take.views[1])), tmp_path)
-    assert [path.name for path in paths] == ["panels-v1.npz"]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["panels-v1.npz"]
-
-
-def test_depth_only_if_asked_for(take: Take, tmp_path: Path):
     for depth in (False, True):
-        path = export_tapvid3d(take, tmp_path, depth=depth)[0]
-        with np.load(path, allow_pickle=False) as example:
+        paths = export_tapvid3d(replace(take, views=(blind, take.views[1])), tmp_path, depth=depth)
+        assert [path.name for path in tmp_path.iterdir()] == [path.name for path in paths] == ["panels-v1.npz"]
+        with np.load(paths[0], allow_pickle=False) as example:
             assert ("depth_m" in example) == depth
-    with np.load(path, allow_pickle=False) as example:
-        np.testing.assert_array_equal(example["depth_m"], take.views[0].clip.depth_m)
-
-
-def test_bad_quality(take: Take, tmp_path: Path):
+            if depth:
+                np.testing.assert_array_equal(example["depth_m"], take.views[1].clip.depth_m)
     with pytest.raises(InputError, match="quality of 1 to 100"):
         export_tapvid3d(take, tmp_path, jpeg_quality=0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -47,13 +48,11 @@ def rows_of(folder: Path, pattern: str) -> list[dict[str, Any]]:
     return pa.concat_tables(tables).to_pylist()
 
 
-@pytest.mark.parametrize("episode", [0, 1])
-@pytest.mark.parametrize("view", [0, 1])
+@pytest.mark.parametrize(("episode", "view"), [(0, 1), (1, 0)])
 def test_round_trip(dataset: Path, takes: list[Take], episode: int, view: int):
     clip = takes[episode].views[view].clip
     source = open_recording(dataset, parts=Parts(episode=episode, camera_key=f"view_{view}"))
-    assert source.length == FRAMES + episode
-    assert source.flags == ()
+    assert (source.length, source.flags) == (FRAMES + episode, ())
     assert source.name == f"dataset-{episode:06d}-view_{view}"
     found = source.clip()
     assert found.camera == clip.camera
@@ -64,14 +63,6 @@ def test_round_trip(dataset: Path, takes: list[Take], episode: int, view: int):
     np.testing.assert_array_equal(found.depth_m > 0, clip.depth_m > 0)
     np.testing.assert_allclose(found.depth_m, clip.depth_m, atol=2e-3)
     assert np.abs((found.rgb.astype(int) - clip.rgb) @ [0.299, 0.587, 0.114]).mean() < 4
-
-
-def test_the_first_camera_is_taken_and_said(dataset: Path):
-    source = open_recording(dataset)
-    assert source.flags == (
-        "camera observation.images.view_0 of observation.images.view_0, observation.images.view_1; choose another with "
-        "--camera-key",
-    )
 
 
 def test_what_the_loader_of_lerobot_asks_for(dataset: Path, takes: list[Take]):
@@ -239,27 +230,18 @@ def encoded(picture: np.ndarray, kind: str) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.parametrize("episode", [0, 1])
-def test_episodes_that_share_a_video(episode: int, tmp_path: Path):
+def test_episodes_that_share_a_video(tmp_path: Path):
     folder, rgb, _ = foreign(tmp_path / "set")
-    source = open_recording(folder, camera=CAMERA, parts=Parts(episode=episode))
-    expected = rgb[:8] if episode == 0 else rgb[8:]
-    found = source.clip()
-    assert len(found) == len(expected)
-    assert np.abs(found.rgb.astype(int) - expected).mean() < 8
-    np.testing.assert_allclose(found.stamp_s, np.arange(len(expected)) / 10, atol=1e-6)
-    assert source.flags == (
-        "no depth feature beside observation.images.top: colours only",
-        "the dataset has no camera poses: the world is the camera",
-    )
-
-
-def test_pictures_in_the_rows(tmp_path: Path):
-    folder, rgb, depth_mm = foreign(tmp_path / "set", keep="image")
-    found = read_recording(folder, camera=CAMERA, parts=Parts(episode=1))
-    np.testing.assert_array_equal(found.rgb, rgb[8:])
-    assert found.depth_m is not None
-    np.testing.assert_allclose(found.depth_m, depth_mm[8:] / 1000, atol=1e-6)
+    for episode, expected in enumerate((rgb[:8], rgb[8:])):
+        source = open_recording(folder, camera=CAMERA, parts=Parts(episode=episode))
+        found = source.clip()
+        assert len(found) == len(expected)
+        assert np.abs(found.rgb.astype(int) - expected).mean() < 8
+        np.testing.assert_allclose(found.stamp_s, np.arange(len(expected)) / 10, atol=1e-6)
+        assert source.flags == (
+            "no depth feature beside observation.images.top: colours only",
+            "the dataset has no camera poses: the world is the camera",
+        )
 
 
 def edit_rows(folder: Path, **columns: list[Any]) -> None:
@@ -270,25 +252,25 @@ def edit_rows(folder: Path, **columns: list[Any]) -> None:
     pq.write_table(table, path)
 
 
-def test_units_of_depth_in_the_rows(tmp_path: Path):
-    folder, _, depth_mm = foreign(tmp_path / "set", keep="image")
-    found = read_recording(folder, camera=CAMERA, depth_scale_m=2e-3)
-    assert found.depth_m is not None
-    np.testing.assert_allclose(found.depth_m, depth_mm[:8] / 500, atol=1e-6)
-    camera = CameraFile(CAMERA, depth_scale_m=5e-4)
-    write_camera(camera, tmp_path / "camera.json")
-    found = read_recording(folder, camera=tmp_path / "camera.json")
-    assert found.depth_m is not None
-    np.testing.assert_allclose(found.depth_m, depth_mm[:8] / 2000, atol=1e-6)
+def test_pictures_in_the_rows_and_their_units(dataset: Path, tmp_path: Path):
+    folder, rgb, depth_mm = foreign(tmp_path / "set", keep="image")
+    write_camera(CameraFile(CAMERA, depth_scale_m=5e-4), tmp_path / "camera.json")
+    cases: list[tuple[dict[str, Any], float]] = [
+        ({"camera": CAMERA}, 1e-3),
+        ({"camera": CAMERA, "depth_scale_m": 2e-3}, 2e-3),
+        ({"camera": tmp_path / "camera.json"}, 5e-4),
+    ]
+    for options, unit_m in cases:
+        found = read_recording(folder, parts=Parts(episode=1), **options)
+        np.testing.assert_array_equal(found.rgb, rgb[8:])
+        assert found.depth_m is not None
+        np.testing.assert_allclose(found.depth_m, depth_mm[8:] * unit_m, atol=1e-6)
     with pytest.raises(RecordingError, match="depth_scale_m is -1, expected a positive number"):
         open_recording(folder, camera=CAMERA, depth_scale_m=-1)
     with pytest.raises(RecordingError, match=r"with depth_scale_m = 1, .*depth_scale_m = 0\.001 would give"):
         read_recording(folder, camera=CAMERA, depth_scale_m=1)
     with pytest.raises(RecordingError, match="is for a folder or video, and this is a LeRobot v3 dataset"):
         open_recording(folder, camera=CAMERA, depth=tmp_path)
-
-
-def test_a_depth_video_has_units_of_its_own(dataset: Path):
     with pytest.raises(RecordingError, match=r"view_0_depth is a video, whose metres info\.json gives"):
         open_recording(dataset, depth_scale_m=1e-3)
 
@@ -361,35 +343,62 @@ BAD: dict[str, tuple[Callable[[Path], object], dict[str, Any], str]] = {
     "torn episodes": (lambda f: tear(f, "meta/episodes/*/*.parquet"), {}, "file-000.parquet: cannot be read"),
     "torn video": (lambda f: tear(f, "videos/*/*/*.mp4"), {}, "cannot be decoded"),
     "short video": (cut_video, {}, "has 6 of the 8 frames of episode 0; the file is corrupt"),
-    "attributes in a path": (
-        lambda f: edit_info(f, data_path="{chunk_index.__class__}/x"),
-        {},
-        "expected a path below",
-    ),
+    "a path of code": (lambda f: edit_info(f, data_path="{chunk_index.__class__}/x"), {}, "expected a path below"),
     "a path of gigabytes": (lambda f: edit_info(f, data_path="{chunk_index:2000000000d}"), {}, "expected a path below"),
     "a path that leads out": (lambda f: edit_info(f, data_path="../{file_index:03d}"), {}, "expected a path below"),
     "an unknown field": (lambda f: edit_info(f, data_path="{episode}"), {}, "expected fields"),
     "no rate": (lambda f: edit_info(f, fps=0), {}, "fps: expected frames per second"),
     "features in a list": (lambda f: edit_info(f, features=[1]), {}, "features: expected an object"),
     "no video": (lambda f: next(f.glob("videos/*/*/*.mp4")).unlink(), {}, "no such file"),
-}
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return foreign(tmp_path_factory.mktemp("foreign") / "set")[0]
 
 
 @pytest.mark.parametrize("how", BAD)
-def test_what_is_refused(how: str, tmp_path: Path):
-    folder, _, _ = foreign(tmp_path / "set")
+def test_what_is_refused(how: str, whole: Path, tmp_path: Path):
+    folder = Path(shutil.copytree(whole, tmp_path / "set"))
     spoil, parts, message = BAD[how]
     spoil(folder)
     with pytest.raises(RecordingError, match=message):
         read_recording(folder, camera=CAMERA, parts=Parts(**parts))
 
 
-def test_intrinsics_are_guessed_or_asked_for(tmp_path: Path):
-    folder, _, _ = foreign(tmp_path / "set")
-    assert any("guessed a focal length of 64 px" in flag for flag in open_recording(folder).flags)
-    assert open_recording(folder, fov_deg=90).camera.fx == pytest.approx(32)
+def test_intrinsics_are_guessed_or_asked_for(whole: Path, tmp_path: Path):
+    assert any("guessed a focal length of 64 px" in flag for flag in open_recording(whole).flags)
+    assert open_recording(whole, fov_deg=90).camera.fx == pytest.approx(32)
     with pytest.raises(RecordingError, match=r"frames|colours"):
-        read_recording(folder, camera=Camera(60, 60, 30, 30, 60, 60))
+        read_recording(whole, camera=Camera(60, 60, 30, 30, 60, 60))
     with_depth, _, _ = foreign(tmp_path / "images", keep="image")
     with pytest.raises(RecordingError, match=r"depth but no camera.*--camera FILE.*--fov"):
         open_recording(with_depth)
+
+
+def test_every_episode_has_its_own_intrinsics(takes: list[Take], tmp_path: Path):
+    first, second = (Episode({"front": take.views[0].clip, "side": take.views[1].clip}, "look") for take in takes)
+    clip = second.views["front"]
+    other = replace(clip, camera=replace(clip.camera, fx=1.5 * clip.camera.fx, fy=1.5 * clip.camera.fy))
+    export_lerobot([first, replace(second, views=second.views | {"front": other})], tmp_path / "set")
+    for index, episode in enumerate((first.views["front"], other)):
+        parts = Parts(episode=index, camera_key="front")
+        assert open_recording(tmp_path / "set", parts=parts).camera == episode.camera
+    features = json.loads((tmp_path / "set" / "meta" / "info.json").read_text())["features"]
+    assert "quest.camera" not in features["observation.images.front"]["info"], "it would hold for one episode only"
+    assert "quest.camera" in features["observation.images.side"]["info"]
+
+
+def test_datasets_with_intrinsics_in_the_feature_alone(dataset: Path, takes: list[Take], tmp_path: Path):
+    """As they were written before there was a column for them."""
+    folder = Path(shutil.copytree(dataset, tmp_path / "set"))
+    path = next(folder.glob("meta/episodes/*/*.parquet"))
+    table = pq.read_table(path)
+    pq.write_table(table.drop_columns([name for name in table.column_names if name.startswith("quest/camera")]), path)
+    source = open_recording(folder)
+    assert source.camera == takes[0].views[0].clip.camera
+    assert source.flags == (
+        "camera observation.images.view_0 of observation.images.view_0, observation.images.view_1; choose another with "
+        "--camera-key",
+    )

@@ -97,25 +97,15 @@ class FakeCapture:
         self.left = 0
 
 
-@pytest.fixture
-def _camera(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_webcam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     monkeypatch.setattr(cv2, "VideoCapture", FakeCapture)
-
-
-@pytest.mark.usefixtures("_camera")
-@pytest.mark.parametrize("name", ["camera:0", "camera:rtsp://there"])
-def test_a_webcam(name: str):
-    source = open_recording(name)
-    assert (source.live, source.camera.width, source.camera.height, source.flags) == (True, 8, 6, (GUESSED_CAMERA,))
-    frames = iter(source)
-    first = next(frames)
-    assert first.rgb[0, 0].tolist() == [0, 0, 255]
-    with pytest.raises(RecordingError, match="no pictures any more"):
-        list(frames)
-
-
-@pytest.mark.usefixtures("_camera")
-def test_intrinsics_of_a_webcam(tmp_path: Path):
+    for name in ("camera:0", "camera:rtsp://there"):
+        source = open_recording(name)
+        assert (source.live, source.camera, source.flags) == (True, Camera.from_fov(8, 6), (GUESSED_CAMERA,))
+        frames = iter(source)
+        assert next(frames).rgb[0, 0].tolist() == [0, 0, 255]
+        with pytest.raises(RecordingError, match="no pictures any more"):
+            list(frames)
     assert open_recording("camera:0", fov_deg=90).camera == Camera.from_fov(8, 6, 90)
     camera = Camera(9, 9, 4, 3, 8, 6)
     write_camera(CameraFile(camera), tmp_path / "camera.json")
@@ -126,17 +116,6 @@ def test_intrinsics_of_a_webcam(tmp_path: Path):
         open_recording("camera:7")
     with pytest.raises(RecordingError, match="--depth-scale-m"):
         open_recording("camera:0", depth_scale_m=0.001)
-
-
-class FakeFrame:
-    def __init__(self, data: np.ndarray) -> None:
-        self.data = data
-
-    def get_data(self) -> np.ndarray:
-        return self.data
-
-    def get_timestamp(self) -> float:
-        return 1500.0
 
 
 class FakePipeline:
@@ -161,8 +140,9 @@ class FakePipeline:
         self.sent += 1
         if self.sent > 2:
             raise RuntimeError("Frame didn't arrive within 5000")
-        colour, depth = np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 1250, np.uint16)
-        return SimpleNamespace(get_color_frame=lambda: FakeFrame(colour), get_depth_frame=lambda: FakeFrame(depth))
+        pixels = (np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 1250, np.uint16))
+        colour, depth = (SimpleNamespace(get_data=lambda of=of: of, get_timestamp=lambda: 1500.0) for of in pixels)
+        return SimpleNamespace(get_color_frame=lambda: colour, get_depth_frame=lambda: depth)
 
     def stop(self) -> None:
         self.running.discard(id(self))

@@ -16,7 +16,7 @@ from quest.types import Clip, State, Tracks
 from tests.data.bags import write_mcap
 from tests.synthetic import make_take
 
-FRAMES = 10
+FRAMES = 6
 
 
 @pytest.fixture(scope="module")
@@ -33,8 +33,7 @@ def moving(clip: Clip) -> Clip:
     return replace(clip, cam_from_world=turn @ poses, stamp_s=clip.stamp_s + 1.7e9)
 
 
-@pytest.mark.parametrize("still", [True, False])
-@pytest.mark.parametrize(("rgb", "depth"), [("jpeg", "16UC1"), ("raw", "32FC1")])
+@pytest.mark.parametrize(("rgb", "depth", "still"), [("jpeg", "16UC1", True), ("raw", "32FC1", False)])
 def test_round_trip(clip: Clip, rgb: str, depth: str, still: bool, tmp_path: Path):
     clip = clip if still else moving(clip)
     export_mcap(clip, tmp_path / "clip.mcap", rgb=rgb, depth=depth)  # type: ignore[arg-type]
@@ -58,28 +57,15 @@ def test_round_trip(clip: Clip, rgb: str, depth: str, still: bool, tmp_path: Pat
     assert source.flags == ()
 
 
-def test_colours_only(clip: Clip, tmp_path: Path):
-    export_mcap(replace(clip, depth_m=None), tmp_path / "clip.mcap")
-    assert read_recording(tmp_path / "clip.mcap").depth_m is None
-
-
 def test_tracks_are_markers_in_the_world(clip: Clip, tmp_path: Path):
     from mcap.reader import make_reader
     from mcap_ros2.decoder import DecoderFactory
 
     points = np.random.default_rng(0).normal(size=(FRAMES, 2, 3)).astype(np.float32)
     points[0, 1] = np.nan
-    seen = np.ones((FRAMES, 2), bool)
-    tracks = Tracks(
-        ("left", "right"),
-        ("handle", None),
-        np.zeros((FRAMES, 2, 2), np.float32),
-        points,
-        np.ones((FRAMES, 2), np.float32),
-        seen,
-        np.full((FRAMES, 2), State.TRACKING.value),
-        clip.stamp_s,
-    )
+    ones, pixels = np.ones((FRAMES, 2), np.float32), np.zeros((FRAMES, 2, 2), np.float32)
+    state = np.full((FRAMES, 2), State.TRACKING.value)
+    tracks = Tracks(("left", "right"), ("handle", None), pixels, points, ones, ones > 0, state, clip.stamp_s)
     export_mcap(clip, tmp_path / "clip.mcap", tracks=tracks)
     with (tmp_path / "clip.mcap").open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
@@ -91,13 +77,16 @@ def test_tracks_are_markers_in_the_world(clip: Clip, tmp_path: Path):
     assert [marker.action for marker in arrays[0].markers] == [0, 0, 2, 2]
     assert all(marker.header.frame_id == "world" for marker in arrays[0].markers)
     assert read_recording(tmp_path / "clip.mcap").camera == clip.camera
-    with pytest.raises(InputError, match="tracks of 10 frames for a clip of 4"):
-        export_mcap(
-            Clip("short", clip.camera, clip.rgb[:4], None, clip.stamp_s[:4], clip.cam_from_world[:4]),
-            tmp_path / "short.mcap",
-            tracks=tracks,
-        )
+    short = replace(
+        clip, rgb=clip.rgb[:4], depth_m=None, stamp_s=clip.stamp_s[:4], cam_from_world=clip.cam_from_world[:4]
+    )
+    with pytest.raises(InputError, match=f"tracks of {FRAMES} frames for a clip of 4"):
+        export_mcap(short, tmp_path / "short.mcap", tracks=tracks)
     assert not (tmp_path / "short.mcap").exists()
+    export_mcap(short, tmp_path / "short.mcap")
+    assert read_recording(tmp_path / "short.mcap").depth_m is None
+    with pytest.raises(InputError, match="no times before 0"):
+        export_mcap(replace(clip, stamp_s=clip.stamp_s - 1), tmp_path / "early.mcap")
 
 
 def test_the_rosbags_library_reads_it_too(clip: Clip, tmp_path: Path):
@@ -115,28 +104,15 @@ def test_the_rosbags_library_reads_it_too(clip: Clip, tmp_path: Path):
     np.testing.assert_array_equal(message.data.reshape(48, 64, 3), clip.rgb[0])  # type: ignore[attr-defined]
 
 
-def test_negative_times_are_refused(clip: Clip, tmp_path: Path):
-    with pytest.raises(InputError, match="no times before 0"):
-        export_mcap(replace(clip, stamp_s=clip.stamp_s - 1), tmp_path / "clip.mcap")
-
-
-@pytest.mark.parametrize("keep", [0.0, 0.001, 0.3, 0.9, 0.999])
-def test_torn_files(clip: Clip, keep: float, tmp_path: Path):
+def test_torn_files(clip: Clip, tmp_path: Path):
     path = tmp_path / "clip.mcap"
     export_mcap(clip, path)
-    path.write_bytes(path.read_bytes()[: int(path.stat().st_size * keep)])
-    with pytest.raises(RecordingError, match=r"clip.mcap.*(mcap recover|record it again)"):
-        read_recording(path)
-
-
-def test_damage_in_the_middle(clip: Clip, tmp_path: Path):
-    path = tmp_path / "clip.mcap"
-    export_mcap(clip, path)
-    data = bytearray(path.read_bytes())
-    data[3000:3100] = b"\xff" * 100
-    path.write_bytes(bytes(data))
-    with pytest.raises(RecordingError, match=r"clip.mcap.*mcap recover"):
-        read_recording(path)
+    whole = path.read_bytes()
+    spoiled = [whole[: int(len(whole) * keep)] for keep in (0.0, 0.001, 0.3, 0.9, 0.999)]
+    for data in (*spoiled, whole[:3000] + b"\xff" * 100 + whole[3100:]):
+        path.write_bytes(data)
+        with pytest.raises(RecordingError, match=r"clip.mcap.*(mcap recover|record it again)"):
+            read_recording(path)
 
 
 def test_other_files(tmp_path: Path):

@@ -18,12 +18,11 @@ from quest.data.frame_source import Notes, Parts
 from quest.data.recording import open_recording, read_recording, readers, write_recording
 from quest.data.store import TakeStore
 from quest.data.video import write_video
-from quest.depth import clean_depth
 from quest.errors import InputError, RecordingError, TakeError
 from quest.types import Camera, Clip
 from tests.synthetic import make_take
 
-FRAMES = 12
+FRAMES = 8
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +40,7 @@ def template(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def folder(template: Path, tmp_path: Path) -> Path:
-    """A recording of twelve PNG frames that a test may spoil."""
+    """A recording of PNG frames that a test may spoil."""
     return Path(shutil.copytree(template, tmp_path / "recording"))
 
 
@@ -66,46 +65,19 @@ def write_depth(folder: Path, scale: float, *, dtype: type = np.uint16) -> None:
         cv2.imwrite(str(path), np.full((48, 64), 2.0 / scale, dtype=dtype))
 
 
-def test_images_come_back_exactly(folder: Path, clip: Clip):
+def test_images_come_back_exactly(folder: Path, clip: Clip, tmp_path: Path):
     assert_same(read_recording(folder), clip)
-
-
-@pytest.mark.parametrize("size", [(64, 48), (63, 47)])
-def test_video_comes_back_closely(tmp_path: Path, size: tuple[int, int]):
-    clip = replace(make_take(frames=FRAMES, views=1, size=size).views[0].clip, name="video")
-    write_recording(clip, tmp_path / "video")
-    found = read_recording(tmp_path / "video")
-    assert_same(replace(found, rgb=clip.rgb), clip)
-    off = found.rgb.astype(int) - clip.rgb
-    assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 2
-    # Chroma has half the resolution, so single pixels may be off, but not the colours of the picture.
-    assert np.abs(off.mean(axis=(0, 1, 2))).max() < 1.5
-    alone = read_recording(tmp_path / "video" / "rgb.mp4")
-    assert alone.name == "rgb"
-    np.testing.assert_array_equal(alone.rgb, found.rgb)
-    assert alone.depth_m is not None
-
-
-def test_moving_camera_and_far_depth(tmp_path: Path, clip: Clip):
-    poses = clip.cam_from_world.copy()
-    poses[:, 0, 3] += np.linspace(0, 1, FRAMES)
-    assert clip.depth_m is not None
-    far = replace(clip, cam_from_world=poses, depth_m=clip.depth_m + 8)
-    write_recording(far, tmp_path / "recording", rgb="png")
-    found = read_recording(tmp_path / "recording")
-    np.testing.assert_array_equal(found.cam_from_world, poses)
-    assert found.depth_m is not None
-    assert far.depth_m is not None
-    np.testing.assert_allclose(found.depth_m, far.depth_m, atol=0.51e-3)
-
-
-def test_colours_only(folder: Path):
-    shutil.rmtree(folder / "depth")
-    assert read_recording(folder).depth_m is None
-
-
-def test_arguments_override_the_folder(folder: Path, tmp_path: Path, clip: Clip):
+    edit_camera(folder, pixel_centre="integer")
+    assert read_recording(folder).camera.cx == clip.camera.cx + 0.5
+    edit_camera(folder, pixel_centre=None, stamp_s=None, fps=10)
+    for path in (folder / "rgb").iterdir():
+        path.rename(path.with_name(f"frame{int(path.stem)}.png"))
+    found = read_recording(folder)
+    assert found.camera.cy == clip.camera.cy + 0.5
+    np.testing.assert_allclose(found.stamp_s, np.arange(FRAMES) / 10)
+    np.testing.assert_array_equal(found.rgb, clip.rgb)
     (folder / "depth").rename(tmp_path / "elsewhere")
+    assert read_recording(folder).depth_m is None
     (folder / "camera.json").unlink()
     found = read_recording(folder / "rgb", depth=tmp_path / "elsewhere", camera=clip.camera, depth_scale_m=1e-4)
     np.testing.assert_array_equal(found.depth_m, clip.depth_m)
@@ -113,22 +85,42 @@ def test_arguments_override_the_folder(folder: Path, tmp_path: Path, clip: Clip)
     np.testing.assert_array_equal(found.cam_from_world, np.tile(np.eye(4), (FRAMES, 1, 1)))
 
 
-def test_pixel_centres_at_integers_gain_half_a_pixel(folder: Path, clip: Clip):
-    edit_camera(folder, pixel_centre="integer")
-    assert read_recording(folder).camera.cx == clip.camera.cx + 0.5
-    edit_camera(folder, pixel_centre=None)
-    assert read_recording(folder).camera.cy == clip.camera.cy + 0.5
+@pytest.mark.parametrize("size", [(64, 48), (63, 47)])
+def test_video_comes_back_closely(tmp_path: Path, size: tuple[int, int]):
+    clip = replace(make_take(frames=FRAMES, views=1, size=size).views[0].clip, name="video")
+    write_recording(clip, tmp_path / "video")
+    source = open_recording(tmp_path / "video")
+    assert (source.length, source.exact) == (FRAMES, False)
+    found = source.clip()
+    assert_same(replace(found, rgb=clip.rgb), clip)
+    off = found.rgb.astype(int) - clip.rgb
+    assert np.abs(off @ [0.299, 0.587, 0.114]).mean() < 2
+    # Chroma has half the resolution, so single pixels may be off, but not the colours of the picture.
+    assert np.abs(off.mean(axis=(0, 1, 2))).max() < 1.5
+    for t, frame in enumerate(source):  # every pass begins anew
+        np.testing.assert_array_equal(frame.rgb, found.rgb[t])
+    alone = read_recording(tmp_path / "video" / "rgb.mp4")
+    assert alone.name == "rgb"
+    np.testing.assert_array_equal(alone.rgb, found.rgb)
+    assert alone.depth_m is not None
+    (tmp_path / "video" / "depth" / "000007.png").unlink()
+    with pytest.raises(RecordingError, match="7 depth images for 8 colour frames"):
+        read_recording(tmp_path / "video")
+    shutil.copy(tmp_path / "video" / "depth" / "000006.png", tmp_path / "video" / "depth" / "000007.png")
+    shutil.copy(tmp_path / "video" / "depth" / "000006.png", tmp_path / "video" / "depth" / "000008.png")
+    with pytest.raises(RecordingError, match="9 depth images for 8 colour frames"):
+        read_recording(tmp_path / "video")
 
 
-def test_frame_rate_makes_stamps(folder: Path):
-    edit_camera(folder, stamp_s=None, fps=10)
-    np.testing.assert_allclose(read_recording(folder).stamp_s, np.arange(FRAMES) / 10)
-
-
-def test_frames_are_in_natural_order(folder: Path, clip: Clip):
-    for path in (folder / "rgb").iterdir():
-        path.rename(path.with_name(f"frame{int(path.stem)}.png"))
-    np.testing.assert_array_equal(read_recording(folder).rgb, clip.rgb)
+def test_moving_camera_and_far_depth(tmp_path: Path, clip: Clip):
+    poses = clip.cam_from_world.copy()
+    poses[:, 0, 3] += np.linspace(0, 1, FRAMES)
+    assert clip.depth_m is not None
+    write_recording(replace(clip, cam_from_world=poses, depth_m=clip.depth_m + 8), tmp_path / "recording", rgb="png")
+    found = read_recording(tmp_path / "recording")
+    np.testing.assert_array_equal(found.cam_from_world, poses)
+    assert found.depth_m is not None
+    np.testing.assert_allclose(found.depth_m, clip.depth_m + 8, atol=0.51e-3)
 
 
 def truncate(path: Path, *, keep: float = 0.6) -> None:
@@ -149,68 +141,43 @@ def resize(path: Path) -> None:
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no frames": (lambda f: empty(f / "rgb"), "no frames; expected images in .*rgb"),
     "no colours": (lambda f: shutil.rmtree(f / "rgb"), "no frames; expected images in .*rgb"),
-    "two videos": (
-        lambda f: (shutil.rmtree(f / "rgb"), (f / "a.mp4").touch(), (f / "b.mkv").touch()),
-        "expected one video, got a.mp4, b.mkv",
-    ),
-    "fewer depths": (lambda f: (f / "depth" / "000003.png").unlink(), "11 depth images for 12 colour frames"),
-    "fewer colours": (lambda f: (f / "rgb" / "000003.png").unlink(), "stamp_s .* 12 frames, expected 11"),
-    "no depths": (lambda f: empty(f / "depth"), "0 depth images for 12 colour frames"),
+    "two videos": (lambda f: (shutil.rmtree(f / "rgb"), (f / "a.mp4").touch(), (f / "b.mkv").touch()),
+                   "expected one video, got a.mp4, b.mkv"),
+    "fewer depths": (lambda f: (f / "depth" / "000003.png").unlink(), "7 depth images for 8 colour frames"),
+    "fewer colours": (lambda f: (f / "rgb" / "000003.png").unlink(), "stamp_s .* 8 frames, expected 7"),
+    "no depths": (lambda f: empty(f / "depth"), "0 depth images for 8 colour frames"),
     "torn colour": (lambda f: truncate(f / "rgb" / "000005.png"), "000005.png: cannot be read.*torn"),
     "torn depth": (lambda f: truncate(f / "depth" / "000005.png"), "000005.png: cannot be read.*torn"),
-    "no image": (
-        lambda f: (f / "rgb" / "000005.png").write_text("hello"),
-        "000005.png: cannot be.*cannot identify",
-    ),
-    "colour sizes differ": (
-        lambda f: resize(f / "rgb" / "000005.png"),
-        "000005.png: 32 x 24, but 000000.png is 64 x 48",
-    ),
-    "depth of another size": (
-        lambda f: resize(f / "depth" / "000005.png"),
-        "32 x 24, but colour frames are 64 x 48; align",
-    ),
-    "depth of 8 bits": (
-        lambda f: write_depth(f, 0.1, dtype=np.uint8),
-        "expected one channel of 16 bits or floats, got uint8",
-    ),
+    "no image": (lambda f: (f / "rgb" / "000005.png").write_text("x"), "000005.png: cannot be.*cannot identify"),
+    "sizes differ": (lambda f: resize(f / "rgb" / "000005.png"), "000005.png: 32 x 24, but 000000.png is 64 x 48"),
+    "depth of another size": (lambda f: resize(f / "depth" / "000005.png"), "32 x 24, but colour frames are 64 x 48"),
+    "depth of 8 bits": (lambda f: write_depth(f, 0.1, dtype=np.uint8), "one channel of 16 bits or floats, got uint8"),
     "depth missing everywhere": (lambda f: write_depth(f, 1e9), "every pixel is missing"),
-    "depth in millimetres read as tenths": (
-        lambda f: edit_camera(f, depth_scale_m=1.0),
-        "depth_scale_m = 0.0001 would give",
-    ),
-    "depth in centimetres read as mm": (
-        lambda f: (write_depth(f, 0.05), edit_camera(f, depth_scale_m=0.001)),
-        "median is 0.04 m with depth_scale_m = 0.001, expected 0.05 to 50 m; the units are wrong",
-    ),
+    "millimetres read as tenths": (lambda f: edit_camera(f, depth_scale_m=1.0), "depth_scale_m = 0.0001 would give"),
+    "centimetres read as mm": (lambda f: (write_depth(f, 0.05), edit_camera(f, depth_scale_m=0.001)),
+                               "median is 0.04 m with depth_scale_m = 0.001, expected 0.05 to 50 m; the units are"),
     "no camera": (lambda f: (f / "camera.json").unlink(), "depth but no camera.*camera.json beside the frames.*--fov"),
     "torn camera": (lambda f: truncate(f / "camera.json", keep=0.2), "camera.json: cannot be read"),
     "camera is a list": (lambda f: (f / "camera.json").write_text("[]"), "expected an object .* got list"),
     "camera lacks a field": (lambda f: edit_camera(f, fx=None), "lacks fx"),
-    "camera has a misspelt field": (lambda f: edit_camera(f, depth_scale=0.001), "has unknown depth_scale; known are"),
-    "camera of another size": (
-        lambda f: edit_camera(f, width=640, height=480, cx=320),
-        "64 x 48 but the camera is for 640 x 480",
-    ),
+    "a misspelt field": (lambda f: edit_camera(f, depth_scale=0.001), "has unknown depth_scale; known are"),
+    "another size": (lambda f: edit_camera(f, width=640, height=480, cx=320), "64 x 48 but the camera is for 640 x 48"),
     "focal length of nothing": (lambda f: edit_camera(f, fx=0), "of 0.01 to 1,000 times"),
     "focal length is a word": (lambda f: edit_camera(f, fx="wide"), "camera.json: cannot be read.*could not convert"),
     "without end": (lambda f: edit_camera(f, width=float("inf")), "Infinity is no number"),
     "lens without coefficients": (lambda f: edit_camera(f, distortion_model="fisheye"), "without distortion"),
+    "too few coefficients": (lambda f: edit_camera(f, distortion=[0.1]), "expected 4 or 5 coefficients, got 1"),
+    "depth of nowhere": (lambda f: edit_camera(f, colour_from_depth=np.eye(4).tolist()), "without depth_camera"),
+    "half a depth camera": (lambda f: edit_camera(f, depth_camera={"fx": 1}), "depth_camera must be an object of fx"),
     "half a pixel wide": (lambda f: edit_camera(f, width=64.5), "whole pixels"),
-    "unknown pixel centre": (
-        lambda f: edit_camera(f, pixel_centre="corner"),
-        "expected 'integer' .* or 'half-integer'",
-    ),
+    "unknown pixel centre": (lambda f: edit_camera(f, pixel_centre="corner"), "expected 'integer' .* or 'half-intege"),
     "scale of nothing": (lambda f: edit_camera(f, depth_scale_m=0), "depth_scale_m is 0, expected a positive number"),
     "rate of nothing": (lambda f: edit_camera(f, fps=-1), "fps is -1, expected a positive number"),
-    "times run backwards": (lambda f: edit_camera(f, stamp_s=list(range(12, 0, -1))), "do not decrease"),
+    "times run backwards": (lambda f: edit_camera(f, stamp_s=list(range(8, 0, -1))), "do not decrease"),
     "pose is not rigid": (lambda f: edit_camera(f, cam_from_world=(2 * np.eye(4)).tolist()), "not a rigid transform"),
     "pose is not a matrix": (lambda f: edit_camera(f, cam_from_world=[1, 2, 3]), "expected one 4 x 4 matrix"),
-    "too few poses": (
-        lambda f: edit_camera(f, cam_from_world=[np.eye(4).tolist()] * 3),
-        "cam_from_world .* 3 frames, expected 12",
-    ),
-}
+    "too few poses": (lambda f: edit_camera(f, cam_from_world=[np.eye(4).tolist()] * 3), "3 frames, expected 8"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("how", BAD)
@@ -242,24 +209,13 @@ def test_torn_videos(tmp_path: Path, clip: Clip, keep: float):
         read_recording(tmp_path / "recording")
 
 
-def test_video_and_depth_of_different_length(folder: Path, clip: Clip):
-    shutil.rmtree(folder / "rgb")
-    write_video(folder / "rgb.mp4", clip.rgb[:9], frames_per_s=30)
-    edit_camera(folder, stamp_s=None)
-    with pytest.raises(RecordingError, match="12 depth images for 9 colour frames"):
-        read_recording(folder)
-
-
-def test_a_file_that_is_no_video(folder: Path):
+def test_files_that_are_no_videos(folder: Path, tmp_path: Path):
     (folder / "notes.mp4").write_text("hello")
-    with pytest.raises(RecordingError, match="cannot be decoded at all"):
-        read_recording(folder / "notes.mp4")
-
-
-def test_video_of_no_frames(tmp_path: Path):
+    with pytest.raises(RecordingError, match=r"notes\.mp4: cannot be decoded at all .*corrupt or not a video"):
+        open_recording(folder / "notes.mp4")
     with pytest.raises(InputError, match="at least one frame"):
-        write_video(tmp_path / "empty.mp4", [], frames_per_s=30)
-    assert list(tmp_path.iterdir()) == []
+        write_video(tmp_path / "new" / "empty.mp4", [], frames_per_s=30)
+    assert list((tmp_path / "new").iterdir()) == []
 
 
 def test_nothing_is_overwritten(folder: Path, clip: Clip):
@@ -270,45 +226,18 @@ def test_nothing_is_overwritten(folder: Path, clip: Clip):
     assert not (folder / "new").exists()
 
 
-def test_clean_depth_keeps_what_is_valid():
-    np.testing.assert_array_equal(clean_depth(np.array([np.nan, -2.0, 0.0, 1.5, np.inf])), [0, 0, 0, 1.5, 0])
-
-
-def test_opencv_camera_has_its_centre_moved():
-    camera = Camera.from_opencv(np.array([[50.0, 0, 31.5], [0, 50, 23.5], [0, 0, 1]]), width=64, height=48)
-    assert (camera.cx, camera.cy) == (32, 24)
-
-
 def test_frames_come_one_by_one(folder: Path, clip: Clip):
     source = open_recording(folder)
     assert (source.length, source.exact, source.name, source.camera) == (FRAMES, True, "recording", clip.camera)
-    (folder / "rgb" / "000009.png").unlink()
-    (folder / "rgb" / "000009.png").write_bytes(b"torn")
+    (folder / "rgb" / "000005.png").write_bytes(b"torn")
     frames = iter(source)
-    for t in range(9):
+    for t in range(5):
         frame = next(frames)
         np.testing.assert_array_equal(frame.rgb, clip.rgb[t])
         np.testing.assert_array_equal(frame.cam_from_world, clip.cam_from_world[t])
         assert frame.stamp_s == clip.stamp_s[t]
-    with pytest.raises(RecordingError, match=r"000009\.png: cannot be read.*cannot identify"):
+    with pytest.raises(RecordingError, match=r"000005\.png: cannot be read.*cannot identify"):
         next(frames)
-
-
-def test_a_video_streams_as_it_is_read_whole(tmp_path: Path, clip: Clip):
-    write_recording(clip, tmp_path / "video")
-    source = open_recording(tmp_path / "video")
-    assert (source.length, source.exact) == (FRAMES, False)
-    whole = read_recording(tmp_path / "video")
-    for _ in range(2):  # every pass begins anew
-        for t, frame in enumerate(source):
-            np.testing.assert_array_equal(frame.rgb, whole.rgb[t])
-
-
-def test_a_video_with_more_frames_than_depth(tmp_path: Path, clip: Clip):
-    write_recording(clip, tmp_path / "video")
-    (tmp_path / "video" / "depth" / "000011.png").unlink()
-    with pytest.raises(RecordingError, match="11 depth images for 12 colour frames"):
-        read_recording(tmp_path / "video")
 
 
 def test_depth_of_another_camera_is_registered(folder: Path):
@@ -321,9 +250,6 @@ def test_depth_of_another_camera_is_registered(folder: Path):
     found = read_recording(folder)
     assert found.depth_m is not None
     assert (found.depth_m[:, 4:-4, 6:-6] == 2.0).all()
-    edit_camera(folder, depth_camera=None)
-    with pytest.raises(RecordingError, match="colour_from_depth is given without depth_camera"):
-        read_recording(folder)
 
 
 def test_distorted_frames_are_rectified(folder: Path, clip: Clip):
@@ -335,9 +261,6 @@ def test_distorted_frames_are_rectified(folder: Path, clip: Clip):
     assert found.depth_m is not None
     np.testing.assert_array_equal(found.rgb[3], rectifier.rgb(clip.rgb[3]))
     np.testing.assert_array_equal(found.depth_m[3], rectifier.depth(clip.depth_m[3]))
-    edit_camera(folder, distortion=[0.1])
-    with pytest.raises(RecordingError, match="expected 4 or 5 coefficients, got 1"):
-        read_recording(folder)
 
 
 def test_camera_files_come_back(tmp_path: Path, clip: Clip):
@@ -345,7 +268,7 @@ def test_camera_files_come_back(tmp_path: Path, clip: Clip):
     shift[1, 3] = -0.01
     small = Camera(30.0, 31.0, 15.5, 12.5, 32, 24)
     lens, other = Distortion("equidistant", (0.1, 0.0, 0.0, 0.0)), Distortion("plumb_bob", (0.1, 0.2, 0.0, 0.0, 0.3))
-    written = CameraFile(clip.camera, 0.001, 30.0, None, None, lens, small, other, shift)
+    written = CameraFile(clip.camera, lens, small, other, shift, depth_scale_m=0.001, frames_per_s=30.0)
     write_camera(written, tmp_path / "camera.json")
     found = read_camera(tmp_path / "camera.json")
     assert (found.distortion, found.depth_camera, found.depth_distortion) == (lens, small, other)
@@ -409,9 +332,3 @@ def test_takes_are_recordings_too(tmp_path: Path):
     np.testing.assert_array_equal(found.rgb, take.views[1].clip.rgb)
     with pytest.raises(RecordingError, match=r"--camera .* is for .* a LeRobot v3 dataset or .* and this is a take"):
         open_recording(store.root / "b.zarr", camera="c.json")
-
-
-def test_a_text_file_is_no_video(tmp_path: Path):
-    (tmp_path / "words.mp4").write_text("hello")
-    with pytest.raises(RecordingError, match=r"words\.mp4: cannot be decoded at all .*corrupt or not a video"):
-        open_recording(tmp_path / "words.mp4")

@@ -65,24 +65,17 @@ def test_known_scene(camera: Camera):
     assert (np.abs(found[board] - 1.0) < 0.02).mean() > 0.98, "the wall must not shine through"
 
 
-def test_magnification_leaves_no_holes():
+def test_magnification_leaves_no_holes_and_the_nearer_of_two_wins():
     depth_m = np.full((SMALL.height, SMALL.width), 1.5, np.float32)
     found = register_depth(depth_m, SMALL, COLOUR, transform((0, 0, 0), (0.02, 0, 0)))
     assert (found[10:-10, 20:-20] == np.float32(1.5)).all()
-
-
-def test_the_nearer_of_two_wins():
     depth_m = np.zeros((COLOUR.height, COLOUR.width), np.float32)
     depth_m[120, 160], depth_m[120, 175] = 2.0, 1.0
     # 0.1 m to the left: 15 pixels at 2 m, 30 at 1 m, so both fall on one pixel.
     found = register_depth(depth_m, COLOUR, COLOUR, transform((0, 0, 0), (-0.1, 0, 0)))
     assert found[120, 145] == 1.0
-
-
-def test_behind_and_outside_is_missing():
-    depth_m = np.ones((COLOUR.height, COLOUR.width), np.float32)
-    assert (register_depth(depth_m, COLOUR, COLOUR, transform((0, 0, 0), (0, 0, -2))) == 0).all()
-    assert (register_depth(depth_m, COLOUR, COLOUR, transform((0, 0, 0), (9, 0, 0))) == 0).all()
+    for away in ((0, 0, -2), (9, 0, 0)):  # behind and outside
+        assert (register_depth(np.ones_like(depth_m), COLOUR, COLOUR, transform((0, 0, 0), away)) == 0).all()
 
 
 @given(
@@ -108,15 +101,11 @@ def test_rig_passes_aligned_depth_through():
 
 
 def test_rig_rectifies_depth_before_it_registers():
-    lens = Distortion("plumb_bob", (-0.3, 0.1, 0.0, 0.0))
-    rig = Rig(COLOUR, depth_camera=SMALL, depth_distortion=lens)
+    rig = Rig(COLOUR, depth_camera=SMALL, depth_distortion=Distortion("plumb_bob", (-0.3, 0.1, 0.0, 0.0)))
     found = rig.depth(np.full((SMALL.height, SMALL.width), 2.0, np.float32))
     assert found.shape == (COLOUR.height, COLOUR.width)
     assert (found[60:-60, 60:-60] == 2.0).all()
-
-
-def test_rig_refuses_other_sizes():
     with pytest.raises(InputError, match="depth: 320 x 240, but the camera is for 160 x 120"):
-        Rig(COLOUR, depth_camera=SMALL).depth(np.ones((240, 320), np.float32))
+        rig.depth(np.ones((240, 320), np.float32))
     with pytest.raises(InputError, match="colours: 160 x 120"):
-        Rig(COLOUR).rgb(np.zeros((120, 160, 3), np.uint8))
+        rig.rgb(np.zeros((120, 160, 3), np.uint8))

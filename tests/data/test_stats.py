@@ -62,14 +62,11 @@ def test_numbers(takes: list[Take], tmp_path: Path):
     assert set(asdict(found)["motion"]) == {"n", "least", "low", "median", "high", "most"}
 
 
-def test_empty_store(tmp_path: Path):
+def test_nothing(tmp_path: Path):
     found = store_stats(TakeStore(tmp_path))
     assert (found.takes, found.frames, found.motion.n) == (0, 0, 0)
     assert math.isnan(found.visible_share)
     assert math.isnan(found.depth_missing_share)
-
-
-def test_spread():
+    assert math.isnan(found.motion.median)
     spread = Spread.of([np.arange(11.0), 100.0])
     assert (spread.n, spread.least, spread.median, spread.most) == (12, 0, 5.5, 100)
-    assert math.isnan(Spread.of([]).median)

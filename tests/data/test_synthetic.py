@@ -30,7 +30,7 @@ def test_points_ride_on_their_links(take: Take):
     np.testing.assert_allclose(local, np.broadcast_to(local[:1], local.shape), atol=1e-5)
 
 
-def test_depth_of_a_visible_point_is_its_own(take: Take):
+def test_depth_and_mask_of_a_visible_point_are_its_own(take: Take):
     seen = 0
     for view in take.views:
         assert view.clip.depth_m is not None
@@ -40,16 +40,9 @@ def test_depth_of_a_visible_point_is_its_own(take: Take):
             x, y = np.floor(view.uv_px[t, e]).astype(int)
             if e in take.tracked:
                 assert np.linalg.norm(world[t, y, x] - take.point_world[t, e]) < 0.1
+                assert (view.entity_id[t, y - 1 : y + 2, x - 1 : x + 2] == e + 1).any()
                 seen += 1
     assert seen > 100
-
-
-def test_masks_surround_their_visible_entities(take: Take):
-    for view in take.views:
-        for t, e in zip(*np.nonzero(view.visible), strict=True):
-            x, y = np.floor(view.uv_px[t, e]).astype(int)
-            if e in take.tracked:
-                assert (view.entity_id[t, y - 1 : y + 2, x - 1 : x + 2] == e + 1).any()
 
 
 def test_motion(take: Take):
@@ -60,9 +53,6 @@ def test_motion(take: Take):
     assert not take.moved[-2], "the hinge of a door rests"
     np.testing.assert_allclose(take.point_world[:-1] + take.flow_world[:-1], take.point_world[1:], atol=1e-6)
     np.testing.assert_allclose(take.joint_position[0], 0, atol=1e-9)
-
-
-def test_something_is_hidden_and_something_is_seen(take: Take):
     visible = np.concatenate([view.visible[:, take.tracked] for view in take.views])
     assert 0.5 < visible.mean() < 1
 

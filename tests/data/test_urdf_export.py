@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import quest
+from quest.data.cut import cut_clip
 from quest.data.urdf_export import write_urdf
 from quest.errors import InputError
 from quest.filter.joints import Joint, JointKind
@@ -73,15 +75,14 @@ def replayed(path: Path, link: str, q: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", list(JointKind))
-@pytest.mark.parametrize("seed", [0, 1])
-def test_other_programs_move_the_entity_where_its_joint_does(kind: JointKind, seed: int, tmp_path: Path):
-    joint = make_joint(kind, np.random.default_rng(seed))
-    tracks, point = make_tracks([joint], ["lid"])
-    names = write_urdf(tracks, tmp_path / "out" / "lid.urdf")
-    assert (names.link, names.left_out) == ({0: "lid"}, ())
-    q = np.linspace(-0.2, 2.8, FRAMES)
-    np.testing.assert_allclose(replayed(tmp_path / "out" / "lid.urdf", "lid", q), point[:, 0], atol=1e-4)
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["lid.urdf"]
+def test_other_programs_move_the_entity_where_its_joint_does(kind: JointKind, tmp_path: Path):
+    for seed in (0, 1):
+        tracks, point = make_tracks([make_joint(kind, np.random.default_rng(seed))], ["lid"])
+        path = tmp_path / str(seed) / "lid.urdf"
+        names = write_urdf(tracks, path)
+        assert (names.link, names.left_out) == ({0: "lid"}, ())
+        np.testing.assert_allclose(replayed(path, "lid", np.linspace(-0.2, 2.8, FRAMES)), point[:, 0], atol=1e-4)
+        assert list(path.parent.iterdir()) == [path]
 
 
 def test_limits_axes_and_uncertainty(tmp_path: Path):
@@ -143,28 +144,16 @@ def test_our_own_reader_takes_it(tmp_path: Path):
 
 @pytest.mark.slow
 def test_the_packaged_clip(tmp_path: Path):
-    import quest
-
-    clip = quest.read("sample")
-    frames = slice(0, 36)
-    cut = replace(
-        clip,
-        rgb=clip.rgb[frames],
-        depth_m=None if clip.depth_m is None else clip.depth_m[frames],
-        stamp_s=clip.stamp_s[frames],
-        cam_from_world=clip.cam_from_world[frames],
-    )
-    tracks = quest.load(device="cpu").track(cut, [Query.point(0, 450, 228, name="handle")])
+    clip = cut_clip(quest.read("sample"), slice(0, 36))
+    tracks = quest.load(device="cpu").track(clip, [Query.point(0, 450, 228, name="handle")])
     joints = tracks.joints
     assert joints is not None
     assert joints.kind[0] in ("revolute", "prismatic")
     write_urdf(tracks, tmp_path / "sample.urdf")
     known = np.isfinite(joints.q[:, 0])
     q = joints.q[known, 0].astype(np.float64)
-    rest, axis, origin = (
-        values[0].astype(np.float64)
-        for values in (joints.rest(tracks.point_world, tracks.state), joints.axis, joints.origin)
-    )
+    fields = joints.rest(tracks.point_world, tracks.state), joints.axis, joints.origin
+    rest, axis, origin = (values[0].astype(np.float64) for values in fields)
     origin = origin + axis * (axis @ (rest - origin))  # the axis' point nearest to it
     motion = Joint(JointKind(joints.kind[0]), axis, origin, rest, 0.0, 1.0, np.eye(4))
     places = replayed(tmp_path / "sample.urdf", "handle", q)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from quest.data.store import TakeStore
-from quest.data.verify import check_truth, check_view, has_sensed_depth, verify_store, verify_take
-from quest.types import Take, View
+from quest.data.verify import Check, check_truth, check_view, has_sensed_depth, verify_store, verify_take
+from quest.types import Clip, Take, View
 from tests.synthetic import make_take
+
+MIRROR = np.diag([-1.0, 1, 1, 1])
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +35,10 @@ def with_info(take: Take, **fields) -> Take:
     return replace(take, info=replace(take.info, **fields))
 
 
-def edited(array: np.ndarray, at, value) -> np.ndarray:
-    array = array.copy()
-    array[at] = value
-    return array
+def edited(array: np.ndarray | None, at, value) -> np.ndarray:
+    changed = np.array(array)
+    changed[at] = value
+    return changed
 
 
 def failed(take: Take, folder: Path) -> dict[str, str]:
@@ -46,6 +50,10 @@ def failed(take: Take, folder: Path) -> dict[str, str]:
     return {check.name: str(check) for check in report.checks if not check.passed}
 
 
+def bad(checks: Iterable[Check]) -> set[str]:
+    return {check.name for check in checks if not check.passed}
+
+
 def test_a_right_take_passes(take: Take, tmp_path: Path):
     assert failed(take, tmp_path) == {}
     report = verify_take(TakeStore(tmp_path), "panels")
@@ -54,56 +62,16 @@ def test_a_right_take_passes(take: Take, tmp_path: Path):
     worst = report.worst("reprojection")
     assert worst is not None
     assert worst.worst < 1e-3
+    assert json.loads(json.dumps(asdict(report)))["checks"][0]["name"] == "hash"
 
 
-@pytest.mark.parametrize("frames", [1, 2, 70])
+@pytest.mark.parametrize("frames", [1, 2, 62])
 def test_short_and_long_takes_pass(frames: int, tmp_path: Path):
-    assert failed(make_take(frames=frames, views=1, entities=1), tmp_path) == {}
+    assert failed(make_take(frames=frames, views=1, entities=1, size=(32, 32)), tmp_path) == {}
 
 
-def shifted_pixel(take: Take) -> Take:
-    return with_view(take, lambda v: replace(v, uv_px=v.uv_px + np.float32(0.4)))
-
-
-def jumping_point(take: Take) -> Take:
-    return replace(take, point_world=edited(take.point_world, (20, 2), take.point_world[20, 2] + 0.01))
-
-
-def half_joint(take: Take) -> Take:
-    return replace(take, joint_position=take.joint_position * 0.5, joint_velocity=take.joint_velocity * 0.5)
-
-
-def turned_axis(take: Take) -> Take:
-    return replace(take, joint_axis=np.roll(take.joint_axis, 1, axis=-1))
-
-
-def wrong_flow(take: Take) -> Take:
-    return replace(take, flow_world=take.flow_world[::-1].copy())
-
-
-def velocity_per_frame(take: Take) -> Take:
-    return replace(take, joint_velocity=take.joint_velocity / 30)
-
-
-def unseen(take: Take) -> Take:
-    return with_view(take, lambda v: replace(v, visible=edited(v.visible, (slice(0, 5), 0), False)))
-
-
-def seen_through_the_wall(take: Take) -> Take:
-    depth = lambda v: replace(v.clip, depth_m=edited(v.clip.depth_m, slice(10, 14), 0.5))  # noqa: E731
-    return with_view(take, lambda v: replace(v, clip=depth(v)))
-
-
-def strange_mask(take: Take) -> Take:
-    return with_view(take, lambda v: replace(v, entity_id=edited(v.entity_id, (3, 0, 0), 2)))
-
-
-def no_such_entity(take: Take) -> Take:
-    return with_view(take, lambda v: replace(v, entity_id=edited(v.entity_id, (3, 0, 0), 9)))
-
-
-def not_a_number(take: Take) -> Take:
-    return replace(take, joint_velocity=edited(take.joint_velocity, (4, 1), np.nan))
+def with_clip(take: Take, change: Callable[[Clip], dict[str, Any]]) -> Take:
+    return with_view(take, lambda view: replace(view, clip=replace(view.clip, **change(view.clip))))
 
 
 def stopped_clock(take: Take) -> Take:
@@ -112,41 +80,39 @@ def stopped_clock(take: Take) -> Take:
     return replace(take, stamp_s=stamp_s, views=views)
 
 
-def mirrored_camera(take: Take) -> Take:
-    mirror = np.diag([-1.0, 1, 1, 1])
-    return with_view(take, lambda v: replace(v, clip=replace(v.clip, cam_from_world=mirror @ v.clip.cam_from_world)))
+WRONG: dict[str, tuple[Callable[[Take], Take], str, str]] = {
+    "shifted pixels": (lambda t: with_view(t, lambda v: replace(v, uv_px=v.uv_px + np.float32(0.4))),
+                       "reprojection", "0.5657 px, at most 0.5 px (view 1, frame"),
+    "a jumping point": (lambda t: replace(t, point_world=edited(t.point_world, (20, 2), t.point_world[20, 2] + 0.01)),
+                        "rigid in link", "frame 20, link_2/rim"),
+    "half a joint": (lambda t: replace(t, joint_position=t.joint_position / 2, joint_velocity=t.joint_velocity / 2),
+                     "moves on joint", "joint 1 (joint_1)"),
+    "a turned axis": (lambda t: replace(t, joint_axis=np.roll(t.joint_axis, 1, axis=-1)), "moves on joint", "joint"),
+    "wrong flow": (lambda t: replace(t, flow_world=t.flow_world[::-1].copy()), "flow", "m, at most 1e-05 m"),
+    "velocity per frame": (lambda t: replace(t, joint_velocity=t.joint_velocity / 30), "velocity", "joint"),
+    "unseen": (lambda t: with_view(t, lambda v: replace(v, visible=edited(v.visible, (slice(0, 5), 0), False))),
+               "visibility", "%, at most 0.5 % (view 1, first frame 0, link_0/handle)"),
+    "through a wall": (lambda t: with_clip(t, lambda c: {"depth_m": edited(c.depth_m, slice(10, 14), 0.5)}),
+                       "visibility", "first frame 10"),
+    "a strange mask": (lambda t: with_view(t, lambda v: replace(v, entity_id=edited(v.entity_id, (3, 0, 0), 2))),
+                       "masks", "masks 1, at most 0 (view 1"),
+    "no such entity": (lambda t: with_view(t, lambda v: replace(v, entity_id=edited(v.entity_id, (3, 0, 0), 9))),
+                       "masks", "masks 1, at most 0 (view 1"),
+    "not a number": (lambda t: replace(t, joint_velocity=edited(t.joint_velocity, (4, 1), np.nan)),
+                     "finite", "finite 1, at most 0 (joint_velocity)"),
+    "a stopped clock": (stopped_clock, "stamps", "after frame 6"),
+    "a mirrored camera": (lambda t: with_clip(t, lambda c: {"cam_from_world": MIRROR @ c.cam_from_world}),
+                          "camera poses", "view 1, frame 0"),
+    "a stretched link": (lambda t: replace(t, link_pose=edited(t.link_pose, (5, 1, 0, 0), 1.01)),
+                         "link poses", "frame 5"),
+    "no such link": (lambda t: with_info(t, entities=(replace(t.info.entities[0], link=7), *t.info.entities[1:])),
+                     "indices", "link_0/handle is on link 7 of 3"),
+}  # fmt: skip
 
 
-def stretched_link(take: Take) -> Take:
-    return replace(take, link_pose=edited(take.link_pose, (5, 1, 0, 0), 1.01 * take.link_pose[5, 1, 0, 0]))
-
-
-def no_such_link(take: Take) -> Take:
-    entities = (replace(take.info.entities[0], link=7), *take.info.entities[1:])
-    return with_info(take, entities=entities)
-
-
-@pytest.mark.parametrize(
-    ("change", "name", "said"),
-    [
-        (shifted_pixel, "reprojection", "0.5657 px, at most 0.5 px (view 1, frame"),
-        (jumping_point, "rigid in link", "frame 20, link_2/rim"),
-        (half_joint, "moves on joint", "joint 1 (joint_1)"),
-        (turned_axis, "moves on joint", "joint"),
-        (wrong_flow, "flow", "m, at most 1e-05 m"),
-        (velocity_per_frame, "velocity", "joint"),
-        (unseen, "visibility", "%, at most 0.5 % (view 1, first frame 0, link_0/handle)"),
-        (seen_through_the_wall, "visibility", "first frame 10"),
-        (strange_mask, "masks", "masks 1, at most 0 (view 1"),
-        (no_such_entity, "masks", "masks 1, at most 0 (view 1"),
-        (not_a_number, "finite", "finite 1, at most 0 (joint_velocity)"),
-        (stopped_clock, "stamps", "after frame 6"),
-        (mirrored_camera, "camera poses", "view 1, frame 0"),
-        (stretched_link, "link poses", "frame 5"),
-        (no_such_link, "indices", "link_0/handle is on link 7 of 3"),
-    ],
-)
-def test_contradictions_are_found(change: Callable, name: str, said: str, take: Take, tmp_path: Path):
+@pytest.mark.parametrize("how", WRONG)
+def test_contradictions_are_found(how: str, take: Take, tmp_path: Path):
+    change, name, said = WRONG[how]
     found = failed(change(take), tmp_path)
     assert said in found[name]
     assert "hash" not in found
@@ -191,36 +157,27 @@ def test_joints_on_moving_links(take: Take):
     axis[:, 1, :3] = np.einsum("tij,tj->ti", carried[:, :3, :3], axis[:, 1, :3]) + carried[:, :3, 3]
     axis[:, 1, 3:] = np.einsum("tij,tj->ti", carried[:, :3, :3], axis[:, 1, 3:])
     nested = replace(take, link_pose=pose.astype(np.float32), joint_axis=axis.astype(np.float32))
-    checks = {check.name: check for check in check_truth(nested)}
-    assert not checks["rigid in link"].passed  # the points were left behind
+    assert "rigid in link" in bad(check_truth(nested))  # the points were left behind
     local = np.linalg.inv(take.link_pose[0, 1]) @ [*take.point_world[0, 1], 1]
     point = take.point_world.copy()
     point[:, 1] = (pose[:, 1] @ local)[:, :3]
-    checks = {check.name: check for check in check_truth(replace(nested, point_world=point))}
-    assert checks["rigid in link"].passed
-    assert checks["moves on joint"].passed
+    assert not {"rigid in link", "moves on joint"} & bad(check_truth(replace(nested, point_world=point)))
     still = replace(nested, point_world=point, joint_axis=take.joint_axis)
-    assert not {check.name: check for check in check_truth(still)}["moves on joint"].passed
+    assert "moves on joint" in bad(check_truth(still))
 
 
 def test_moving_camera(take: Take):
     """Every frame has a pose of its own: the same pictures, if camera and things move together."""
     turn = np.linspace(0, 0.8, len(take))
     moved = np.tile(np.eye(4), (len(take), 1, 1))
-    moved[:, 0, 0], moved[:, 0, 1], moved[:, 1, 0], moved[:, 1, 1] = (
-        np.cos(turn),
-        -np.sin(turn),
-        np.sin(turn),
-        np.cos(turn),
-    )
+    moved[:, :3, :3] = Rotation.from_euler("z", turn[:, None]).as_matrix()
     moved[:, :3, 3] = turn[:, None] * [0.3, -0.2, 0.5]
     view = take.views[0]
     point = np.einsum("tij,tej->tei", moved[:, :3, :3], take.point_world) + moved[:, None, :3, 3]
     following = replace(view.clip, cam_from_world=view.clip.cam_from_world @ np.linalg.inv(moved))
     truth = replace(take, point_world=point.astype(np.float32))
-    assert all(check.passed for check in check_view(truth, replace(view, clip=following), 0))
-    checks = {check.name: check for check in check_view(truth, view, 0)}
-    assert not checks["reprojection"].passed
+    assert not bad(check_view(truth, replace(view, clip=following), 0))
+    assert "reprojection" in bad(check_view(truth, view, 0))
 
 
 def test_sensed_depth_is_forgiven_what_a_sensor_does(take: Take):
@@ -239,22 +196,21 @@ def test_sensed_depth_is_forgiven_what_a_sensor_does(take: Take):
     assert has_sensed_depth(told.info)
     assert not has_sensed_depth(colours_only.info)
     for candidate, passes in ((told, True), (colours_only, False)):
-        checks = {check.name: check for check in check_view(candidate, candidate.views[0], 0)}
-        assert checks["visibility"].passed == passes
+        assert ("visibility" not in bad(check_view(candidate, candidate.views[0], 0))) == passes
     hidden = with_view(told, lambda v: replace(v, link_id=np.zeros_like(v.link_id)), 0)
-    assert not {c.name: c for c in check_view(hidden, hidden.views[0], 0)}["visibility"].passed
+    assert "visibility" in bad(check_view(hidden, hidden.views[0], 0))
 
 
 def test_without_depth_links_decide(take: Take):
     bare = with_view(take, lambda v: replace(v, clip=replace(v.clip, depth_m=None)), 0)
-    assert all(check.passed for check in check_view(bare, bare.views[0], 0))
+    assert not bad(check_view(bare, bare.views[0], 0))
     ghost = with_view(bare, lambda v: replace(v, link_id=np.zeros_like(v.link_id)), 0)
-    assert not {c.name: c for c in check_view(ghost, ghost.views[0], 0)}["visibility"].passed
+    assert "visibility" in bad(check_view(ghost, ghost.views[0], 0))
 
 
 def test_entities_fixed_in_the_base(take: Take):
     entities = (replace(take.info.entities[0], joint=-1), *take.info.entities[1:])
-    assert all(check.passed for check in check_truth(with_info(take, entities=entities)))
+    assert not bad(check_truth(with_info(take, entities=entities)))
 
 
 def test_points_behind_the_camera(take: Take):
@@ -262,15 +218,5 @@ def test_points_behind_the_camera(take: Take):
     uv = np.full_like(view.uv_px, np.nan)
     away = replace(view.clip, cam_from_world=np.diag([-1.0, 1, -1, 1]) @ view.clip.cam_from_world)
     behind = replace(view, clip=away, uv_px=uv, visible=np.zeros_like(view.visible))
-    checks = {check.name: check for check in check_view(take, behind, 0)}
-    assert checks["reprojection"].passed
-    assert checks["visibility"].passed
-    assert not {c.name: c for c in check_view(take, replace(view, uv_px=uv), 0)}["reprojection"].passed
-
-
-def test_reports_are_json(take: Take, tmp_path: Path):
-    from dataclasses import asdict
-
-    store = TakeStore(tmp_path)
-    store.write(take)
-    assert json.loads(json.dumps(asdict(verify_take(store, "panels"))))["checks"][0]["name"] == "hash"
+    assert not {"reprojection", "visibility"} & bad(check_view(take, behind, 0))
+    assert "reprojection" in bad(check_view(take, replace(view, uv_px=uv), 0))

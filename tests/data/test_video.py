@@ -55,29 +55,21 @@ def test_turned_videos_are_upright_as_in_opencv(suffix: str, angle: int, turns: 
 
 
 def test_depth_beside_a_turned_video_is_refused(tmp_path: Path):
-    folder = tmp_path / "recording"
-    write_recording(make_take(frames=4, views=1, size=(64, 48)).views[0].clip, folder)
-    write_with(folder / "rgb.mp4", RGB[:4], turned=180)
-    with pytest.raises(RecordingError, match=r"rgb\.mp4.*their depth is not turned with them"):
-        read_recording(folder)
+    folder, dataset, take = tmp_path / "recording", tmp_path / "set", make_take(frames=4, views=1, size=(64, 48))
+    write_recording(take.views[0].clip, folder)
+    export_lerobot([Episode.of_take(take)], dataset)
+    (colours,) = dataset.glob("videos/observation.images.view_0/*/*.mp4")
+    for path, where in ((folder / "rgb.mp4", folder), (colours, dataset)):
+        write_with(path, RGB[:4], turned=180)
+        with pytest.raises(RecordingError, match=rf"{path.name}.*their depth is not turned with them"):
+            read_recording(where)
     (folder / "depth").rename(tmp_path / "depth")
     assert len(read_recording(folder)) == 4
 
 
-def test_depth_beside_a_turned_video_of_a_dataset_is_refused(tmp_path: Path):
-    folder = tmp_path / "set"
-    export_lerobot([Episode.of_take(make_take(frames=4, views=1, size=(64, 48)))], folder)
-    (colours,) = folder.glob("videos/observation.images.view_0/*/*.mp4")
-    write_with(colours, RGB[:4], turned=180)
-    with pytest.raises(RecordingError, match=rf"{colours.name} of .*view_0: .*their depth is not turned with them"):
-        read_recording(folder)
-
-
-@pytest.mark.parametrize("suffix", [".mkv", ".webm"])
-def test_torn_videos_without_a_number_of_frames(suffix: str, tmp_path: Path):
-    path = tmp_path / f"torn{suffix}"
-    write_video(tmp_path / "whole.mkv", RGB, frames_per_s=30)
-    path.write_bytes((tmp_path / "whole.mkv").read_bytes())
+def test_torn_videos_without_a_number_of_frames(tmp_path: Path):
+    path = tmp_path / "torn.mkv"
+    write_video(path, RGB, frames_per_s=30)
     assert probe_video(path).frames == 0
     assert len(list(play_video(path))) == FRAMES
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
@@ -133,19 +125,16 @@ def test_two_writers_of_one_video(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_other_systems_leave_beside_a_video_is_no_video(tmp_path: Path):
+def test_names_that_others_stumble_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     clip = make_take(frames=3, views=1, size=(64, 48)).views[0].clip
     write_recording(clip, tmp_path / "clip")
-    (tmp_path / "clip" / "._rgb.mp4").write_bytes(b"Mac OS X")
+    (tmp_path / "clip" / "._rgb.mp4").write_bytes(b"Mac OS X")  # what other systems leave beside a video
     assert len(read_recording(tmp_path / "clip")) == 3
-
-
-def test_a_colon_is_part_of_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path / "clip")
     path = Path("drawer:3.mp4")
     write_video(path, RGB, frames_per_s=30)
     assert len(list(play_video(path))) == FRAMES
-    assert [file.name for file in tmp_path.iterdir()] == ["drawer:3.mp4"]
+    assert path.exists()
 
 
 def test_where_nothing_can_be_sought(tmp_path: Path):

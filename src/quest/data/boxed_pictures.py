@@ -57,14 +57,15 @@ def read_boxed_pictures(path: Path) -> list[BoxedPicture]:
     Raises:
         InputError: it is none of these, or a label cannot be understood.
     """
+    config = next((file for name in ("data.yaml", "data.yml") if (file := path / name).is_file()), None)
     if path.suffix == ".json" and path.is_file():
         found = list(_coco(path))
     elif path.suffix in (".yaml", ".yml") and path.is_file():
         found = list(_yolo(path.parent, path))
     elif (path / "labels.csv").is_file():
         found = list(_table(path))
-    elif any((path / name).is_file() for name in ("data.yaml", "data.yml")):
-        found = list(_yolo(path, next(path / name for name in ("data.yaml", "data.yml") if (path / name).is_file())))
+    elif config is not None:
+        found = list(_yolo(path, config))
     else:
         raise InputError(f"pictures {path}: {EXPECTED}")
     if not found:
@@ -133,40 +134,29 @@ def _coco(path: Path) -> Iterator[BoxedPicture]:
 
 
 def _yolo(folder: Path, config: Path) -> Iterator[BoxedPicture]:
-    try:
-        raw = yaml.safe_load(config.read_text(encoding="utf-8"))
-        names = raw["names"]
+    with reading(config, InputError, "expected the names of the classes under 'names'"):
+        names = yaml.safe_load(config.read_text(encoding="utf-8"))["names"]
         names = {int(k): str(v) for k, v in (names.items() if isinstance(names, dict) else enumerate(names))}
-    except (yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{config}: expected the names of the classes under 'names' ({error!r})") from error
     images = sorted(p for p in (folder / "images").rglob("*") if p.suffix.lower() in PICTURES)
     images = images or sorted(p for p in folder.rglob("images/*") if p.suffix.lower() in PICTURES)
     for path in images:
         parts = list(path.parts)
         at = len(parts) - 1 - parts[::-1].index("images")
         labels = Path(*parts[:at], "labels", *parts[at + 1 :]).with_suffix(".txt")
+        with reading(path, InputError), Image.open(path) as image:
+            size = (upright(image) if is_turned(image) else image).size
         own: list[tuple[str, list[float]]] = []
-        try:
-            with Image.open(path) as image:
-                width, height = (upright(image) if is_turned(image) else image).size
+        with reading(labels, InputError):
             lines = labels.read_text(encoding="utf-8").splitlines() if labels.is_file() else []
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: it or its labels {labels} cannot be read ({error}); copy them again") from error
-        for line in lines:
-            if not line.strip():
-                continue
-            try:
+        for line in filter(str.strip, lines):
+            with reading(f"{labels}: {line!r}", InputError, "expected a class and its box"):
                 number, *values = line.split()
                 xy = np.array([float(value) for value in values])
                 if len(xy) == 4:
                     low, high = xy[:2] - xy[2:] / 2, xy[:2] + xy[2:] / 2
                 else:  # an outline
                     low, high = xy.reshape(-1, 2).min(axis=0), xy.reshape(-1, 2).max(axis=0)
-                own.append(
-                    (names[int(number)], (np.concatenate((low, high)) * [width, height, width, height]).tolist())
-                )
-            except (ValueError, KeyError) as error:
-                raise InputError(f"{labels}: expected a class and its box, got {line!r} ({error!r})") from error
+                own.append((names[int(number)], [*(low * size).tolist(), *(high * size).tolist()]))
         yield BoxedPicture(path, tuple(name for name, _ in own), _stacked([box for _, box in own]))
 
 

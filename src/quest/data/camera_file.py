@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.data.distortion import Distortion
-from quest.data.frame_source import Notes, ReadOptions
+from quest.data.frame_source import Notes, ReadOptions, naming
 from quest.data.registration import Rig
-from quest.errors import InputError, RecordingError
+from quest.errors import RecordingError
 from quest.geometry.poses import is_rigid
 from quest.types import Camera
 from quest.untrusted import read_json, reading
@@ -24,23 +24,15 @@ EXAMPLE = '{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 _LENS = ("distortion_model", "distortion")
 _OPTIONAL = (
-    "pixel_centre",
-    "depth_scale_m",
-    "fps",
-    "stamp_s",
-    "cam_from_world",
-    *_LENS,
-    "depth_camera",
-    "colour_from_depth",
+    *("pixel_centre", "depth_scale_m", "fps", "stamp_s", "cam_from_world"),
+    *(*_LENS, "depth_camera", "colour_from_depth"),
 )
 
 
 @dataclass(frozen=True)
-class CameraFile:
-    """The content of ``camera.json``."""
+class CameraFile(Rig):
+    """The content of ``camera.json``; pixel centres at half-integers whatever the file's convention."""
 
-    camera: Camera
-    """Intrinsics, pixel centres at half-integers whatever the file's convention."""
     depth_scale_m: float | None = None
     """Metres per unit of the depth images, or None if the file does not tell."""
     frames_per_s: float | None = None
@@ -49,24 +41,11 @@ class CameraFile:
     """Time of every frame in seconds, or None."""
     cam_from_world: Float[np.ndarray, "4 4"] | Float[np.ndarray, "P 4 4"] | None = None
     """One pose, or one per frame; None if unknown. Numbers of frames are checked by the reader."""
-    distortion: Distortion = field(default_factory=Distortion)
-    """Lens of the colour frames."""
-    depth_camera: Camera | None = None
-    """Intrinsics of the depth images where they are not aligned to the colours."""
-    depth_distortion: Distortion = field(default_factory=Distortion)
-    """Their lens."""
-    colour_from_depth: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
-    """Rigid transform from the depth camera's axes to the colour camera's, metres."""
 
     @property
     def unit_m(self) -> float:
         """Metres per unit of depth images of integers."""
         return DEFAULT_DEPTH_SCALE_M if self.depth_scale_m is None else self.depth_scale_m
-
-    @property
-    def rig(self) -> Rig:
-        """Makes RGB-D frames of a pinhole camera from the pictures."""
-        return Rig(self.camera, self.distortion, self.depth_camera, self.depth_distortion, self.colour_from_depth)
 
     @property
     def lengths(self) -> list[tuple[str, int]]:
@@ -104,19 +83,16 @@ def read_camera(path: Path) -> CameraFile:
         raise RecordingError(f"{where}: no such file; write one such as {EXAMPLE}, or name another one")
     fields = read_json(path, RecordingError, remedy)
     if not isinstance(fields, dict):
-        raise RecordingError(f"camera file {path}: expected an object such as {EXAMPLE}, got {type(fields).__name__}")
+        raise RecordingError(f"{where}: expected an object such as {EXAMPLE}, got {type(fields).__name__}")
     missing = [name for name in _INTRINSICS if name not in fields]
     unknown = sorted(set(fields) - {*_INTRINSICS, *_OPTIONAL})
     if missing or unknown:
         said = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"has unknown {', '.join(unknown)}"] * bool(unknown)
         raise RecordingError(
-            f"camera file {path}: {' and '.join(said)}; known are {', '.join((*_INTRINSICS, *_OPTIONAL))}, "
-            f"for example {EXAMPLE}"
+            f"{where}: {' and '.join(said)}; known are {', '.join((*_INTRINSICS, *_OPTIONAL))}, for example {EXAMPLE}"
         )
     with reading(where, RecordingError, remedy):
-        setup = _parse(fields)
-        assert setup.rig  # which checks how both cameras go together
-        return setup
+        return _parse(fields)
 
 
 def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None = None) -> CameraFile:
@@ -133,17 +109,13 @@ def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None =
 
 def completed(setup: CameraFile, own: CameraFile) -> CameraFile:
     """A camera with the units, times, poses and depth camera that it leaves out, as the recording has them."""
-    depth = own if setup.depth_camera is None else setup
-    return replace(
-        setup,
-        depth_scale_m=own.depth_scale_m if setup.depth_scale_m is None else setup.depth_scale_m,
-        frames_per_s=own.frames_per_s if setup.frames_per_s is None else setup.frames_per_s,
-        stamp_s=own.stamp_s if setup.stamp_s is None and setup.frames_per_s is None else setup.stamp_s,
-        cam_from_world=own.cam_from_world if setup.cam_from_world is None else setup.cam_from_world,
-        depth_camera=depth.depth_camera,
-        depth_distortion=depth.depth_distortion,
-        colour_from_depth=depth.colour_from_depth,
-    )
+    names = ["depth_scale_m", "frames_per_s", "cam_from_world"]
+    if setup.frames_per_s is None:  # a rate of the user's tells the times
+        names.append("stamp_s")
+    missing = [name for name in names if getattr(setup, name) is None]
+    if setup.depth_camera is None:
+        missing += ["depth_camera", "depth_distortion", "colour_from_depth"]
+    return replace(setup, **{name: getattr(own, name) for name in missing})
 
 
 def find_setup(
@@ -180,10 +152,8 @@ def find_setup(
             f"recording {where}: it has depth but no camera, and depth needs intrinsics; give a camera file such as "
             f"{EXAMPLE} (camera.json beside the frames, or --camera FILE), or the field of view with --fov DEGREES"
         )
-    try:
+    with naming(f"recording {where}: --fov"):
         camera = Camera.from_fov(*size, options.fov_deg)
-    except InputError as error:
-        raise RecordingError(f"recording {where}: --fov: {error}") from error
     if options.fov_deg is None:
         notes.say(
             f"no camera file: guessed a focal length of {camera.fx:.0f} px, the longer side of the image (a field of "
@@ -222,40 +192,34 @@ def _parse(fields: dict[str, Any]) -> CameraFile:
     if convention not in ("integer", "half-integer"):
         raise ValueError(f"pixel_centre is {convention!r}, expected 'integer' (OpenCV, ROS) or 'half-integer'")
     shift = 0.5 if convention == "integer" else 0.0
-    depth = fields.get("depth_camera")
-    if depth is not None:
-        _check_depth_camera(depth)
+    depth, known = fields.get("depth_camera"), {*_INTRINSICS, *_LENS}
     if depth is None and "colour_from_depth" in fields:
         raise ValueError("colour_from_depth is given without depth_camera; give the intrinsics of the depth images too")
+    if depth is not None and not (isinstance(depth, dict) and known >= set(depth) >= set(_INTRINSICS)):
+        raise ValueError(f"depth_camera must be an object of {', '.join(_INTRINSICS)}, and may have {', '.join(_LENS)}")
+    parsed: dict[str, Any] = {
+        "depth_scale_m": check_depth_scale,
+        "fps": lambda value: _positive("fps", value),
+        "stamp_s": _parse_stamps,
+        "cam_from_world": lambda value: _parse_poses("cam_from_world", value, (2, 3)),
+        "colour_from_depth": lambda value: _parse_poses("colour_from_depth", value, (2,)),
+    }
+    given = {name: parse(fields[name]) for name, parse in parsed.items() if name in fields}
     return CameraFile(
         camera=_parse_intrinsics(fields, shift),
-        depth_scale_m=None if "depth_scale_m" not in fields else check_depth_scale(fields["depth_scale_m"]),
-        frames_per_s=None if "fps" not in fields else _positive("fps", fields["fps"]),
-        stamp_s=None if "stamp_s" not in fields else _parse_stamps(fields["stamp_s"]),
-        cam_from_world=None
-        if "cam_from_world" not in fields
-        else _parse_poses("cam_from_world", fields["cam_from_world"]),
+        frames_per_s=given.pop("fps", None),
         distortion=_parse_lens(fields),
         depth_camera=None if depth is None else _parse_intrinsics(depth, shift),
         depth_distortion=_parse_lens(depth or {}),
-        colour_from_depth=_parse_poses(
-            "colour_from_depth", fields.get("colour_from_depth", np.eye(4).tolist()), one=True
-        ),
+        **given,
     )
 
 
 def _parse_intrinsics(fields: dict[str, Any], shift: float) -> Camera:
-    fx, fy, cx, cy = (float(fields[name]) for name in _INTRINSICS[:4])
-    width, height = fields["width"], fields["height"]
+    fx, fy, cx, cy, width, height = (float(fields[name]) for name in _INTRINSICS)
     if width != int(width) or height != int(height):
         raise ValueError(f"width and height are {width} and {height}, expected whole pixels")
     return Camera(fx, fy, cx + shift, cy + shift, int(width), int(height))
-
-
-def _check_depth_camera(fields: Any) -> None:
-    known = {*_INTRINSICS, *_LENS}
-    if not isinstance(fields, dict) or not known >= set(fields) >= set(_INTRINSICS):
-        raise ValueError(f"depth_camera must be an object of {', '.join(_INTRINSICS)}, and may have {', '.join(_LENS)}")
 
 
 def _parse_lens(fields: dict[str, Any]) -> Distortion:
@@ -285,10 +249,10 @@ def _parse_stamps(value: Any) -> np.ndarray:
     return stamps
 
 
-def _parse_poses(name: str, value: Any, *, one: bool = False) -> np.ndarray:
+def _parse_poses(name: str, value: Any, dimensions: tuple[int, ...]) -> np.ndarray:
     poses = np.asarray(value, dtype=np.float64)
-    if poses.shape[-2:] != (4, 4) or poses.ndim not in ((2,) if one else (2, 3)):
-        expected = "one 4 x 4 matrix" if one else "one 4 x 4 matrix or one per frame"
+    if poses.shape[-2:] != (4, 4) or poses.ndim not in dimensions:
+        expected = "one 4 x 4 matrix" + " or one per frame" * (3 in dimensions)
         raise ValueError(f"{name} has shape {poses.shape}, expected {expected}")
     if not is_rigid(poses):
         raise ValueError(f"{name} is not a rigid transform (rotation, translation in metres, last row 0 0 0 1)")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,21 +32,35 @@ class _Colours:
     """Of frames; for a video by its header."""
     size: tuple[int, int]
     """Width and height, upright."""
-    turned: bool = False
+    turned: bool
     """Whether the pixels of the video are not upright."""
-    paired: bool = False
-    """Whether depth images of the same pixels go with them."""
 
-    def __iter__(self) -> Iterator[tuple[np.ndarray, float]]:
-        """Upright pictures and their times; those of images follow a nominal rate of 30 a second."""
+    @classmethod
+    def of(cls, source: Path, layout: Layout) -> _Colours:
+        if not layout.colours:
+            raise RecordingError(
+                f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
+            )
+        first = layout.colours[0]
+        if source.is_file() or first.suffix.lower() in SUFFIXES:
+            info = probe_video(first)
+            return cls((), first, info.frames or None, (info.width, info.height), info.turns != 0)
+        return cls(layout.colours, None, len(layout.colours), upright(open_image(first)).size, False)
+
+    def pictures(self, *, paired: bool) -> Iterator[tuple[np.ndarray, float]]:
+        """Upright pictures and their times; those of images follow a nominal rate of 30 a second.
+
+        Args:
+            paired: whether depth images of the same pixels go with them, which must not be turned then.
+        """
         if self.video is not None:
-            if self.turned and self.paired:
+            if self.turned and paired:
                 raise RecordingError(f"video {self.video}: {TURNED}")
             yield from play_video(self.video)
             return
         for t, path in enumerate(self.images):
             pixels = open_image(path)
-            if self.paired and is_turned(pixels):
+            if paired and is_turned(pixels):
                 raise RecordingError(f"image {path}: {TURNED}")
             image = upright(pixels)
             if image.size != self.size:
@@ -67,7 +81,7 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     layout = find_layout(source)
     if options.depth is not None:
         layout = replace(layout, depth_folder=options.depth, depths=list_depth(options.depth), paired=False)
-    colours, depths = _find_colours(source, layout), layout.depths
+    colours, depths = _Colours.of(source, layout), layout.depths
     own = layout.setup(colours.size)
     setup = find_setup(where, options, own, size=colours.size, depth=depths is not None, notes=notes)
     for note in layout.notes:
@@ -77,28 +91,21 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
             f"recording {source}: frames are {colours.size[0]} x {colours.size[1]} but the camera is for "
             f"{setup.camera.width} x {setup.camera.height}; give the intrinsics of these frames in the camera file"
         )
-    if colours.video is None and layout.numbered:
-        assert colours.number is not None
-        _check_numbers(source, setup, colours.number)
+    exact = colours.video is None and layout.numbered
+    if exact:
+        _check_counts(source, setup, layout, len(colours.images), partners=True)
+    elif depths is not None and not depths:
+        raise _unequal(layout.depth_folder, 0, colours.number or 0)
+    first = next((path for path in depths or () if path is not None), None)
     unit_m = setup.unit_m
-    if depths is not None:
-        if colours.video is None and layout.numbered:
-            if not layout.paired:
-                _check_partners(layout.depth_folder, [path for path in depths if path is not None], colours.images)
-            _check_depth_number(layout.depth_folder, len(depths), len(colours.images))
-        if not depths:
-            _check_depth_number(layout.depth_folder, 0, colours.number or 0)
-        first = next((path for path in depths if path is not None), None)
-        # Floats are metres, unless the user says otherwise.
-        if first is not None and read_depth_file(first).dtype.kind == "f":
-            unit_m = options.depth_scale_m or 1.0
-    paired = replace(colours, paired=depths is not None)
+    if first is not None and read_depth_file(first).dtype.kind == "f":
+        unit_m = options.depth_scale_m or 1.0  # floats are metres, unless the user says otherwise
     return FrameSource(
         source.stem if source.is_file() else source.resolve().name,
         setup.camera,
-        lambda: _frames(source, setup, paired, layout, unit_m, notes),
+        lambda: _frames(source, setup, colours, layout, unit_m, notes),
         length=colours.number,
-        exact=colours.video is None and layout.numbered,
+        exact=exact,
         notes=notes,
         units=(str(layout.depth_folder), unit_m),
     )
@@ -113,37 +120,23 @@ READER = Reader(
 )
 
 
-def _find_colours(source: Path, layout: Layout) -> _Colours:
-    if not layout.colours:
-        raise RecordingError(
-            f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
-        )
-    first = layout.colours[0]
-    if source.is_file() or first.suffix.lower() in SUFFIXES:
-        info = probe_video(first)
-        return _Colours((), first, info.frames or None, (info.width, info.height), info.turns != 0)
-    return _Colours(layout.colours, None, len(layout.colours), upright(open_image(first)).size)
-
-
 def _frames(
     source: Path, setup: CameraFile, colours: _Colours, layout: Layout, unit_m: float, notes: Notes
 ) -> Iterator[Frame]:
-    rig, number, first_s, depths = setup.rig, 0, 0.0, layout.depths
+    number, first_s, depths = 0, 0.0, layout.depths
     known = [length for _, length in setup.lengths] + ([] if depths is None else [len(depths)])
-    for t, (rgb, time_s) in enumerate(colours):
+    for t, (rgb, time_s) in enumerate(colours.pictures(paired=depths is not None)):
         number, first_s = t + 1, time_s if t == 0 else first_s
         if known and t >= min(known):
             continue  # only counted, so that the message can say how many there are
         depth_m = None
         if depths is not None and (path := depths[t]) is not None:
-            depth_m = rig.depth(_read_depth(path, rig, unit_m))
+            depth_m = setup.depth(_read_depth(path, setup, unit_m))
         elif depths is not None:
             notes.count("no depth", t)
-        yield Frame(rig.rgb(rgb), depth_m, setup.stamp(t, fallback_s=time_s - first_s), setup.pose(t))
+        yield Frame(setup.rgb(rgb), depth_m, setup.stamp(t, fallback_s=time_s - first_s), setup.pose(t))
     if layout.numbered:
-        _check_numbers(source, setup, number)
-        if depths is not None:
-            _check_depth_number(layout.depth_folder, len(depths), number)
+        _check_counts(source, setup, layout, number)
     elif any(length != number for length in known):
         least, most = min(*known, number), max(*known, number)
         notes.say(
@@ -151,30 +144,33 @@ def _frames(
         )
 
 
-def _check_numbers(source: Path, setup: CameraFile, frames: int) -> None:
+def _check_counts(source: Path, setup: CameraFile, layout: Layout, frames: int, *, partners: bool = False) -> None:
+    """Raise RecordingError unless whatever goes by frames is for as many as there are colours."""
     for what, number in setup.lengths:
         if number != frames:
             raise RecordingError(f"recording {source}: {what} of the camera is for {number} frames, expected {frames}")
+    if layout.depths is None:
+        return
+    if partners and not layout.paired:
+        # Where depth images are named as colours are, each must have its own; where none is, they go in order.
+        depth_of = {path.stem for path in layout.depths if path is not None}
+        colour_of = {path.stem for path in layout.colours}
+        alone = sorted(depth_of ^ colour_of)
+        if alone and depth_of & colour_of:
+            raise RecordingError(
+                f"depth {layout.depth_folder}: {len(layout.depths)} depth images for {frames} colour frames, and "
+                f"{alone[0]} has no {'colours' if alone[0] in depth_of else 'depth'}; expected one for each, drop "
+                "frames without a partner"
+            )
+    if len(layout.depths) != frames:
+        raise _unequal(layout.depth_folder, len(layout.depths), frames)
 
 
-def _check_partners(folder: Path, depths: Sequence[Path], images: Sequence[Path]) -> None:
-    """Where depth images are named as colours are, each must have its own; where none is, they go in order."""
-    depth_of, colour_of = ({path.stem for path in paths} for paths in (depths, images))
-    alone = sorted(depth_of ^ colour_of)
-    if alone and depth_of & colour_of:
-        what = "colours" if alone[0] in depth_of else "depth"
-        raise RecordingError(
-            f"depth {folder}: {len(depths)} depth images for {len(images)} colour frames, and {alone[0]} has no "
-            f"{what}; expected one for each, drop frames without a partner"
-        )
-
-
-def _check_depth_number(folder: Path, depths: int, frames: int) -> None:
-    if depths != frames:
-        raise RecordingError(
-            f"depth {folder}: {depths} depth images for {frames} colour frames; expected one for each, "
-            "cut the longer one or drop frames without a partner"
-        )
+def _unequal(folder: Path, depths: int, frames: int) -> RecordingError:
+    return RecordingError(
+        f"depth {folder}: {depths} depth images for {frames} colour frames; expected one for each, cut the longer one "
+        "or drop frames without a partner"
+    )
 
 
 def _read_depth(path: Path, rig: Rig, unit_m: float) -> np.ndarray:

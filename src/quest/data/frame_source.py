@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 import numpy as np
 
 from quest.depth import check_units
-from quest.errors import QuestError, RecordingError
+from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Clip, Frame
 from quest.untrusted import reading
 
@@ -73,6 +74,17 @@ class Reader:
     """The frames, which are read when they are asked for."""
     options: tuple[str, ...] = ()
     """Fields of :class:`ReadOptions` that mean something here; others are refused."""
+
+
+@contextmanager
+def naming(where: str) -> Iterator[None]:
+    """What is wrong with an input becomes an error of the recording that names where it stands."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except InputError as error:
+        raise RecordingError(f"{where}: {error}") from error
 
 
 class Notes:

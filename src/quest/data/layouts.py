@@ -84,7 +84,7 @@ def find_layout(source: Path) -> Layout:
         raise RecordingError(f"recording {source}: .r3d is compressed as LZFSE; export it from Record3D as EXR + RGB")
     if source.is_file():
         root, depth = source.parent, source.parent / "depth"
-        found = Layout((source,), depth, _depths(depth), setup=_own_camera(root))
+        found = Layout((source,), depth, list_depth(depth) if depth.exists() else None, setup=_own_camera(root))
     else:
         root = source / "EXR_RGBD" if (source / "EXR_RGBD" / "metadata.json").is_file() else source
         found = _of_folder(root)
@@ -110,6 +110,11 @@ def _of_folder(root: Path) -> Layout:
     if {"odometry.csv", "camera_matrix.csv"} <= there:
         return _stray(root)
     return _side_by_side(root) or _folders(root)
+
+
+def _first_of(root: Path, *names: str) -> Path | None:
+    """The first of some files that is there."""
+    return next((path for name in names if (path := root / name).is_file()), None)
 
 
 def is_layout(folder: Path) -> bool:
@@ -151,17 +156,8 @@ def _folders(root: Path) -> Layout:
     colours = tuple(videos or list_images(inner, PICTURES))
     depth = root / "depth"
     poses, notes = (None, ()) if videos else _beside(root, colours)
-    return Layout(
-        colours,
-        depth,
-        _depths(depth),
-        setup=_own_camera(root, cam_from_world=poses),
-        notes=notes,
-    )
-
-
-def _depths(folder: Path) -> tuple[Path, ...] | None:
-    return list_depth(folder) if folder.exists() else None
+    depths = list_depth(depth) if depth.exists() else None
+    return Layout(colours, depth, depths, setup=_own_camera(root, cam_from_world=poses), notes=notes)
 
 
 def list_depth(folder: Path) -> tuple[Path, ...]:
@@ -194,7 +190,7 @@ def _side_by_side(root: Path) -> Layout | None:
     own = _own_camera(root)
 
     def setup(size: Size) -> CameraFile | None:
-        info = next((path for name in ("_info.txt", "info.txt") if (path := root / name).is_file()), None)
+        info = _first_of(root, "_info.txt", "info.txt")
         known = own(size) or (None if info is None else _scan_info(info))
         if known is None and size == (640, 480) and colours.keys() == {s for s in colours if s.startswith("frame-")}:
             known = CameraFile(Camera(585.0, 585.0, 320.0, 240.0, *size))  # as the page of 7-Scenes has it
@@ -207,13 +203,12 @@ def _tum(root: Path) -> Layout:
     """TUM RGB-D and those who follow it: lists of pictures by time, and where the camera was."""
     colours = _timed_files(root, "rgb.txt")
     stamp_s = np.array([time for time, _ in colours])
-    depths: list[Path | None] | None = None
+    depths: list[Path | None] = []
     if (root / "depth.txt").is_file():
         listed = _timed_files(root, "depth.txt")
-        near = nearest(np.array([time for time, _ in listed]), stamp_s)
+        near = [listed[i] for i in nearest(np.array([time for time, _ in listed]), stamp_s)]
         depths = [
-            listed[i][1] if abs(listed[i][0] - time) <= Parts.sync_s else None
-            for i, time in zip(near, stamp_s, strict=True)
+            path if abs(at_s - t) <= Parts.sync_s else None for (at_s, path), t in zip(near, stamp_s, strict=True)
         ]
     poses, notes = None, list[str]()
     if (truth := root / "groundtruth.txt").is_file():
@@ -228,25 +223,14 @@ def _tum(root: Path) -> Layout:
 
     def setup(size: Size) -> CameraFile | None:
         values, lens = known or ((525.0, 525.0, 319.5, 239.5), ())
-        given = own(size)
-        if given is None and size != (640, 480):
-            return None
-        found = given or CameraFile(_camera(np.array(values), size), distortion=Distortion(coefficients=lens))
-        return replace(
-            found,
-            depth_scale_m=found.depth_scale_m or 1 / 5000,
-            stamp_s=stamp_s - stamp_s[0],
-            cam_from_world=poses,
-        )
+        found = own(size)
+        if found is None and size == (640, 480):
+            found = CameraFile(_camera(np.array(values), size), distortion=Distortion(coefficients=lens))
+        scale_m = (found and found.depth_scale_m) or 1 / 5000
+        return found and replace(found, depth_scale_m=scale_m, stamp_s=stamp_s - stamp_s[0], cam_from_world=poses)
 
-    return Layout(
-        tuple(path for _, path in colours),
-        root / "depth",
-        None if depths is None else _some(depths),
-        setup=setup,
-        paired=True,
-        notes=tuple(notes),
-    )
+    paths = tuple(path for _, path in colours)
+    return Layout(paths, root / "depth", _some(depths), setup=setup, paired=True, notes=tuple(notes))
 
 
 def _record3d(root: Path) -> Layout:
@@ -257,8 +241,8 @@ def _record3d(root: Path) -> Layout:
     with _asking(file):
         width, height = int(fields["w"]), int(fields["h"])
         lenses = np.array(fields.get("perFrameIntrinsicCoeffs") or [], np.float64).reshape(-1, 4)
-        matrix = np.array(fields["K"], np.float64).reshape(3, 3)  # column by column
-        values = np.median(lenses, 0) if len(lenses) else matrix[[0, 1, 2, 2], [0, 1, 0, 1]]
+        matrix = np.array(fields["K"], np.float64).reshape(3, 3).T  # column by column
+        values = np.median(lenses, 0) if len(lenses) else matrix
         depth_size = int(fields.get("dw") or width), int(fields.get("dh") or height)
         stamps = np.array(fields.get("frameTimestamps") or [], np.float64)
         poses = np.array(fields.get("poses") or [], np.float64).reshape(-1, 7)
@@ -280,7 +264,7 @@ def _stray(root: Path) -> Layout:
     file = root / "odometry.csv"
     layout = _folders(root)
     with _asking(file):
-        names = [name.strip() for name in _text(file).splitlines()[0].split(",")]
+        names = [name.strip() for name in _lines(file)[0].split(",")]
         table = _table(file, len(names), skip=1)
         column = dict(zip(names, table.T, strict=True))
         stamps = column["timestamp"]
@@ -332,19 +316,17 @@ def _own_camera(root: Path, *, cam_from_world: np.ndarray | None = None) -> Call
     """What a folder's own file says of the camera: Open3D's JSON, or a matrix as text."""
 
     def setup(size: Size) -> CameraFile | None:
-        if (open3d := next((p for name in _OPEN3D if (p := root / name).is_file()), None)) is not None:
-            found = _open3d_camera(open3d)
-        elif (matrix := next((p for name in _MATRICES if (p := root / name).is_file()), None)) is not None:
-            found = _matrix_camera(matrix, size)
-        else:
-            return None
-        return replace(found, cam_from_world=cam_from_world)
+        open3d, matrix = _first_of(root, *_OPEN3D), _first_of(root, *_MATRICES)
+        if open3d is not None:
+            return replace(_open3d_camera(open3d), cam_from_world=cam_from_world)
+        return None if matrix is None else replace(_matrix_camera(matrix, size), cam_from_world=cam_from_world)
 
     return setup
 
 
-def _camera(values: Float[np.ndarray, "4"], size: Size) -> Camera:
-    """A camera of fx, fy, cx and cy with pixel centres at integers."""
+def _camera(values: Float[np.ndarray, "..."], size: Size) -> Camera:
+    """A camera of fx, fy, cx and cy, or of a matrix, with pixel centres at integers."""
+    values = values[[0, 1, 0, 1], [0, 1, 2, 2]] if values.ndim == 2 else values
     fx, fy, cx, cy = values.tolist()
     return Camera(fx, fy, cx + 0.5, cy + 0.5, *size)
 
@@ -361,41 +343,33 @@ def _open3d_camera(file: Path) -> CameraFile:
         matrix = np.array(fields["intrinsic_matrix"], np.float64)
         matrix = matrix.reshape(3, 3).T if matrix.ndim == 1 else matrix  # column by column
         units = fields.get("depth_scale")
-        return CameraFile(
-            _camera(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (int(fields["width"]), int(fields["height"]))),
-            depth_scale_m=None if units is None else 1 / float(units),
-        )
+        camera = _camera(matrix, (int(fields["width"]), int(fields["height"])))
+        return CameraFile(camera, depth_scale_m=None if units is None else 1 / float(units))
 
 
 def _matrix_camera(file: Path, size: Size) -> CameraFile:
     """A camera whose matrix stands in a text, for pictures of a size; ScanNet's has the depth's beside it."""
     with _asking(file):
-        camera = _camera(_matrix(file)[[0, 1, 0, 1], [0, 1, 2, 2]], size)
-        depth, turned = file.with_name("intrinsic_depth.txt"), np.eye(4)
+        camera, turned = _camera(_matrix(file), size), np.eye(4)
+        depth, *sides = (file.with_name(f"{n}.txt") for n in ("intrinsic_depth", "extrinsic_color", "extrinsic_depth"))
         if file.name != "intrinsic_color.txt" or not depth.is_file():
             return CameraFile(camera)
-        sides = [
-            _matrix(path) for name in ("color", "depth") if (path := file.with_name(f"extrinsic_{name}.txt")).is_file()
-        ]
-        if len(sides) == 2 and all(map(is_rigid, sides)):
-            turned = np.linalg.inv(sides[0]) @ sides[1]
-        return CameraFile(
-            camera,
-            depth_camera=_camera(_matrix(depth)[[0, 1, 0, 1], [0, 1, 2, 2]], (640, 480)),
-            colour_from_depth=turned,
-        )
+        if all(path.is_file() for path in sides):
+            colour, other = map(_matrix, sides)
+            turned = np.linalg.inv(colour) @ other if is_rigid(colour) and is_rigid(other) else turned
+        return CameraFile(camera, depth_camera=_camera(_matrix(depth), (640, 480)), colour_from_depth=turned)
 
 
 def _scan_info(file: Path) -> CameraFile:
     """The calibration of 3RScan and BundleFusion: lines ``m_colorWidth = 960``."""
     with _asking(file):
-        lines = (line.partition("=") for line in _text(file).splitlines())
+        lines = (line.partition("=") for line in _lines(file))
         fields = {name.strip(): value.split() for name, _, value in lines}
 
         def camera(which: str) -> Camera:
             matrix = np.array(fields[f"m_calibration{which}Intrinsic"], np.float64).reshape(4, 4)
             size = (int(fields[f"m_{which.lower()}{side}"][0]) for side in ("Width", "Height"))
-            return _camera(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (next(size), next(size)))
+            return _camera(matrix, (next(size), next(size)))
 
         colours, depth = camera("Color"), camera("Depth")
         unit_m = 1 / float(fields.get("m_depthShift", ["1000"])[0])
@@ -412,12 +386,12 @@ def _beside(root: Path, colours: Sequence[Path]) -> tuple[np.ndarray | None, tup
         if len(files) == len(colours):
             return _poses_of_files(files)
         return None, (f"{len(files)} poses for {len(colours)} pictures: not used",)
-    log = next((p for name in ("trajectory.log", "scene/trajectory.log") if (p := root / name).is_file()), None)
+    log = _first_of(root, "trajectory.log", "scene/trajectory.log")
     if log is None:
         return None, ()
     with _asking(log):
-        lines = [line for line in _text(log).splitlines() if line.strip()]
-        rows = np.array([line.split() for t, line in enumerate(lines) if t % 5], np.float64).reshape(-1, 4, 4)
+        lines = [line.split() for t, line in enumerate(_lines(log)) if t % 5]
+        rows = np.array(lines, np.float64).reshape(-1, 4, 4)
         if len(rows) != len(colours):
             return None, (f"{len(rows)} poses for {len(colours)} pictures: not used",)
         return _cam_from_world(rows), ()
@@ -452,7 +426,7 @@ def _poses_at(table: Float[np.ndarray, "N 8"], at_s: Float[np.ndarray, " T"], fi
     """``cam_from_world`` at some times, of rows of time, place and quaternion; how many are far from any of them."""
     with _asking(file):
         table = table[np.argsort(table[:, 0], kind="stable")]
-        edge = Edge("world", False, [round(1e9 * time) for time in table[:, 0]], [*table[:, 1:4]], [*table[:, 4:]])
+        edge = Edge("world", False, [(round(1e9 * row[0]), row[1:4], row[4:]) for row in table])
         at_ns = [round(1e9 * time) for time in at_s]
         stale = sum(edge.gap(time) > STALE_S for time in at_ns)
         return _cam_from_world(np.stack([edge.at(time) for time in at_ns])), stale
@@ -479,15 +453,17 @@ def _object(file: Path) -> dict[str, Any]:
     return fields
 
 
-def _text(file: Path) -> str:
+def _lines(file: Path) -> list[str]:
+    """Lines of a text but for empty ones, and comments after #."""
     require_file(file, RecordingError, most=MOST_TEXT)
-    return file.read_text(encoding="utf-8")
+    lines = file.read_text(encoding="utf-8").splitlines()
+    return [line for line in lines if line.strip() and not line.startswith("#")]
 
 
 def _table(file: Path, columns: int, *, skip: int = 0) -> Float[np.ndarray, "N C"]:
     """Numbers in columns with spaces or commas between; lines that begin with # are left out."""
-    lines = [line for line in _text(file).splitlines()[skip:] if line.strip() and not line.startswith("#")]
-    table = np.array([line.replace(",", " ").split() for line in lines], np.float64).reshape(-1, columns)
+    rows = [line.replace(",", " ").split() for line in _lines(file)[skip:]]
+    table = np.array(rows, np.float64).reshape(-1, columns)
     if not len(table) or not np.isfinite(table).all():
         raise ValueError("expected rows of finite numbers")
     return table
@@ -496,7 +472,7 @@ def _table(file: Path, columns: int, *, skip: int = 0) -> Float[np.ndarray, "N C
 def _matrix(file: Path) -> np.ndarray:
     """A matrix of 3 × 3, 3 × 4 or 4 × 4 as text; may hold infinities, where a recorder lost its place."""
     with _asking(file):
-        rows = [line.replace(",", " ").split() for line in _text(file).splitlines() if line.strip()]
+        rows = [line.replace(",", " ").split() for line in _lines(file)]
         matrix = np.array(rows, np.float64)
         matrix = matrix.reshape(3, 3) if matrix.size == 9 else matrix
         if matrix.shape not in ((3, 3), (3, 4), (4, 4)):
@@ -505,10 +481,10 @@ def _matrix(file: Path) -> np.ndarray:
 
 
 def _timed_files(root: Path, name: str) -> list[tuple[float, Path]]:
-    """Times and files of a list, in its order."""
+    """Times and files of a list, by time."""
     file = root / name
     with _asking(file):
-        lines = [line.split() for line in _text(file).splitlines() if line.strip() and not line.startswith("#")]
+        lines = [line.split() for line in _lines(file)]
         found = [(float(time), _inside(root, path, file)) for time, path in lines]
         if not found or not np.isfinite([time for time, _ in found]).all():
             raise ValueError("expected lines with a time and a file")

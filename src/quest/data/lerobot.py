@@ -23,11 +23,11 @@ from jaxtyping import Float32, UInt16
 from PIL import Image
 
 from quest.data.camera_file import CameraFile, find_setup
-from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
+from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions, naming
 from quest.data.pictures import TURNED, colours_of, is_turned, upright
 from quest.data.video import play_video, probe_video
 from quest.depth import metres
-from quest.errors import InputError, RecordingError
+from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Frame
 from quest.untrusted import build, is_inside, read_json, reading, require_file, require_table
 
@@ -40,7 +40,6 @@ POSE, STAMP = "observation.cam_from_world", "observation.stamp_s"
 DEPTH_CODES = 4095
 """Depth videos have twelve bits."""
 
-_VISUAL = ("video", "image")
 _FIELD = re.compile(r"\{(?P<name>\w+)(:0?(?P<width>\d)d)?\}")
 """A field of a path's template, such as ``{chunk_index:03d}``."""
 
@@ -99,9 +98,19 @@ class _Episode:
     def feature(self, key: str) -> dict[str, Any]:
         return self.info["features"][key]
 
+    def details(self, key: str) -> list[dict[str, Any]]:
+        """What a feature says of its pictures, under the name of today and an older one."""
+        return [self.feature(key).get(name) or {} for name in ("info", "video_info")]
+
     @property
     def visual(self) -> list[str]:
-        return [key for key, feature in self.info["features"].items() if feature.get("dtype") in _VISUAL]
+        return [key for key, feature in self.info["features"].items() if feature.get("dtype") in ("video", "image")]
+
+    def is_depth(self, key: str) -> bool:
+        return any(told.get("is_depth_map") or told.get("video.is_depth_map") for told in self.details(key))
+
+    def error(self, words: str) -> RecordingError:
+        return RecordingError(f"dataset {self.root}: {words}")
 
     @property
     def data_path(self) -> Path:
@@ -112,22 +121,22 @@ class _Episode:
 
     def _path(self, template: str, of: str, **names: str) -> Path:
         """Where files of the episode are: the template's fields filled in, below the dataset."""
-        where = f"dataset {self.root}: {template} {self.info.get(template)!r:.120} of meta/info.json"
+        where = f"{template} {self.info.get(template)!r:.120} of meta/info.json"
         values: dict[str, Any] = dict(names)
         for part in ("chunk_index", "file_index"):
             values[part] = self.row.get(f"{of}/{part}")
             if type(values[part]) is not int or not 0 <= values[part] < 10**6:
-                raise RecordingError(f"dataset {self.root}: episode {self.index}: {of}/{part} is {values[part]!r}")
+                raise self.error(f"episode {self.index}: {of}/{part} is {values[part]!r}")
 
         def filled(found: re.Match[str]) -> str:
             value = values.get(found["name"])
             if value is None or (found["width"] and not isinstance(value, int)):
-                raise RecordingError(f"{where}: expected fields {', '.join(values)}, got {found[0]}")
+                raise self.error(f"{where}: expected fields {', '.join(values)}, got {found[0]}")
             return f"{value:0{int(found['width'] or 0)}d}" if isinstance(value, int) else value
 
         path = _FIELD.sub(filled, str(self.info.get(template)))
         if re.search(r"[{}]", path) or not is_inside(path):
-            raise RecordingError(f"{where}: expected a path below the dataset, with fields {', '.join(values)}")
+            raise self.error(f"{where}: expected a path below the dataset, with fields {', '.join(values)}")
         return self.root / path
 
 
@@ -137,39 +146,47 @@ def _accepts(where: str) -> bool:
 
 def _open(where: str, options: ReadOptions) -> FrameSource:
     """One camera of an episode; depth images are in millimetres, but floats in metres, unless it is said otherwise."""
-    root, episode = Path(where), options.episode
-    notes = Notes()
-    found = _read_episode(root, episode)
-    key = _colour_key(found, options.camera_key, notes)
-    depth_key = _depth_key(found, key)
+    notes, episode = Notes(), _read_episode(Path(where), options.episode)
+    key = _colour_key(episode, options.camera_key, notes)
+    depth_key = _depth_key(episode, key)
     if depth_key is None:
         notes.say(f"no depth feature beside {key}: colours only")
     setup = find_setup(
-        where, options, _own_setup(found, key), size=_size(found, key), depth=depth_key is not None, notes=notes
+        where, options, _own_setup(episode, key), size=_size(episode, key), depth=depth_key is not None, notes=notes
     )
-    units_m = _units_m(found, depth_key, setup, options.depth_scale_m)
-    rows = _Rows(found, key)
-    if not rows.posed and setup.cam_from_world is None:
+    shot = _Shot(episode, key, depth_key, setup, options.depth_scale_m)
+    if not shot.posed:
         notes.say("the dataset has no camera poses: the world is the camera")
     for what, number in setup.lengths:
-        if number != rows.number:
-            raise RecordingError(
-                f"dataset {root}: {what} of the camera is for {number} frames, expected {rows.number} of "
-                f"episode {episode}"
+        if number != shot.number:
+            raise episode.error(
+                f"{what} of the camera is for {number} frames, expected {shot.number} of episode {episode.index}"
             )
     return FrameSource(
-        f"{root.resolve().name}-{episode:06d}-{key.rpartition('.')[2]}",
+        f"{episode.root.resolve().name}-{episode.index:06d}-{_view(key)}",
         setup.camera,
-        lambda: _frames(found, rows, setup, key, depth_key, units_m),
-        length=rows.number,
+        shot.frames,
+        length=shot.number,
         notes=notes,
-        units=(f"{root} {depth_key}", units_m.integers),
+        units=(f"{episode.root} {depth_key}", shot.units_m[0]),
     )
+
+
+READER = Reader(
+    "a LeRobot v3 dataset",
+    "a folder with meta/info.json",
+    _accepts,
+    _open,
+    options=("episode", "camera_key", "camera", "depth_scale_m", "fov_deg"),
+)
+
+
+def _view(key: str) -> str:
+    return key.rpartition(".")[2]
 
 
 def _read_episode(root: Path, episode: int) -> _Episode:
-    info = _read_info(root)
-    seen = 0
+    info, seen = _read_info(root), 0
     for file in sorted((root / "meta" / "episodes").glob("*/*.parquet")):
         table = _read_table(file, [name for name in _columns(file) if not name.startswith("stats/")])
         with reading(file, RecordingError):
@@ -195,37 +212,24 @@ def _read_info(root: Path) -> dict[str, Any]:
             "convert_dataset_v21_to_v30"
         )
     with reading(f"dataset {root}: {path.name}", RecordingError, "restore it"):
-        build(_Info, {name: info[name] for name in ("features", "data_path", "fps")}, "it")
-        for name, feature in info["features"].items():
+        build(str, info["data_path"], "data_path")
+        if not 0 < build(float, info["fps"], "fps") < 1e6:
+            raise ValueError(f"fps: expected frames per second, got {info['fps']}")
+        for name, feature in build(dict[str, dict], info["features"], "features").items():
             for part in ("info", "video_info"):
                 build(dict[str, Any] | None, feature.get(part), f"features.{name}.{part}")
     return info
 
 
-@dataclass(frozen=True)
-class _Info:
-    """What of ``meta/info.json`` is relied on."""
-
-    features: dict[str, dict]
-    data_path: str
-    fps: float
-
-    def __post_init__(self) -> None:
-        if not 0 < self.fps < 1e6:
-            raise ValueError(f"fps: expected frames per second, got {self.fps}")
-
-
 def _colour_key(episode: _Episode, camera_key: str | None, notes: Notes) -> str:
-    keys = [key for key in episode.visual if not _is_depth(episode.feature(key))]
+    keys = [key for key in episode.visual if not episode.is_depth(key)]
     if camera_key is not None:
-        full = [key for key in keys if camera_key in (key, key.rpartition(".")[2])]
+        full = [key for key in keys if camera_key in (key, _view(key))]
         if not full:
-            raise RecordingError(f"dataset {episode.root}: no camera {camera_key!r}; its cameras are {', '.join(keys)}")
+            raise episode.error(f"no camera {camera_key!r}; its cameras are {', '.join(keys)}")
         return full[0]
     if not keys:
-        raise RecordingError(
-            f"dataset {episode.root}: no feature of images; its features are {', '.join(episode.info['features'])}"
-        )
+        raise episode.error(f"no feature of images; its features are {', '.join(episode.info['features'])}")
     if len(keys) > 1:
         notes.say(f"camera {keys[0]} of {', '.join(keys)}; choose another with --camera-key")
     return keys[0]
@@ -233,21 +237,16 @@ def _colour_key(episode: _Episode, camera_key: str | None, notes: Notes) -> str:
 
 def _depth_key(episode: _Episode, key: str) -> str | None:
     """The depth of a camera: named like it, or the only one of a dataset with one camera."""
-    depths = [name for name in episode.visual if _is_depth(episode.feature(name))]
+    depths = [name for name in episode.visual if episode.is_depth(name)]
     for name in (f"{key}_depth", key.replace("images.", "depth."), f"{key}.depth"):
         if name in depths:
             return name
     return depths[0] if len(depths) == 1 and len(episode.visual) == 2 else None
 
 
-def _is_depth(feature: dict[str, Any]) -> bool:
-    info, older = feature.get("info") or {}, feature.get("video_info") or {}
-    return bool(info.get("is_depth_map") or info.get("video.is_depth_map") or older.get("video.is_depth_map"))
-
-
 def _own_setup(episode: _Episode, key: str) -> CameraFile | None:
     """The intrinsics that this project wrote into the dataset; LeRobot itself keeps none."""
-    kept = episode.row.get(f"{CAMERA_COLUMN}/{key.rpartition('.')[2]}")
+    kept = episode.row.get(f"{CAMERA_COLUMN}/{_view(key)}")
     if kept is None:
         kept = (episode.feature(key).get("info") or {}).get(CAMERA_KEY)
     if kept is None:
@@ -255,136 +254,109 @@ def _own_setup(episode: _Episode, key: str) -> CameraFile | None:
     try:
         return CameraFile(build(Camera, kept, CAMERA_KEY))
     except (ValueError, TypeError) as error:
-        raise RecordingError(f"dataset {episode.root}: {CAMERA_KEY} of {key} makes no sense ({error})") from error
+        raise episode.error(f"{CAMERA_KEY} of {key} makes no sense ({error})") from error
 
 
 def _size(episode: _Episode, key: str) -> tuple[int, int]:
     """Width and height of a feature's images; channels are first or last."""
     shape = [int(n) for n in episode.feature(key).get("shape", ())]
     if len(shape) != 3:
-        raise RecordingError(f"dataset {episode.root}: {key} has shape {shape}, expected height, width and channels")
+        raise episode.error(f"{key} has shape {shape}, expected height, width and channels")
     height, width = shape[1:] if shape[0] in (1, 3) else shape[:2]
     return width, height
 
 
-@dataclass(frozen=True)
-class _Units:
-    """Metres per unit of depth images in integers and in floats."""
+class _Shot:
+    """The frames of one camera in one episode."""
 
-    integers: float = 1.0
-    floats: float = 1.0
-
-
-def _units_m(episode: _Episode, key: str | None, setup: CameraFile, depth_scale_m: float | None) -> _Units:
-    feature = {} if key is None else episode.feature(key)
-    if depth_scale_m is not None:
-        if feature.get("dtype") == "video":
-            raise RecordingError(
-                f"dataset {episode.root}: {key} is a video, whose metres info.json gives; omit --depth-scale-m"
-            )
-        return _Units(depth_scale_m, depth_scale_m)
-    in_metres = feature.get("dtype") == "video" or (feature.get("info") or {}).get("depth_unit") == "m"
-    return _Units() if in_metres else _Units(setup.unit_m)
-
-
-class _Rows:
-    """The rows of one episode, without its pictures."""
-
-    def __init__(self, episode: _Episode, key: str) -> None:
+    def __init__(
+        self, episode: _Episode, key: str, depth_key: str | None, setup: CameraFile, depth_scale_m: float | None
+    ) -> None:
+        self._episode, self._key, self._depth_key, self._setup = episode, key, depth_key, setup
+        feature = {} if depth_key is None else episode.feature(depth_key)
+        video = feature.get("dtype") == "video"
+        if video and depth_scale_m is not None:
+            raise episode.error(f"{depth_key} is a video, whose metres info.json gives; omit --depth-scale-m")
+        in_metres = video or (feature.get("info") or {}).get("depth_unit") == "m"
+        self.units_m = depth_scale_m or (1.0 if in_metres else setup.unit_m), depth_scale_m or 1.0
+        """Metres per unit of depth images in integers, and in floats."""
         path = episode.data_path
-        present = _columns(path)
-        pose = f"{POSE}.{key.rpartition('.')[2]}"
+        present, pose = _columns(path), f"{POSE}.{_view(key)}"
         wanted = [name for name in ("episode_index", "timestamp", STAMP, pose) if name in present]
         table = _read_table(path, wanted, filters=[("episode_index", "=", episode.index)])
         self.number = table.num_rows
         if self.number == 0:
-            raise RecordingError(f"dataset {episode.root}: {path.name} has no rows of episode {episode.index}")
+            raise episode.error(f"{path.name} has no rows of episode {episode.index}")
         length = episode.row.get("length", self.number)
         if length != self.number:
-            raise RecordingError(
-                f"dataset {episode.root}: {path.name} has {self.number} rows of episode {episode.index}, expected "
-                f"{length}; the file is corrupt, copy it again"
+            raise episode.error(
+                f"{path.name} has {self.number} rows of episode {episode.index}, expected {length}; the file is "
+                "corrupt, copy it again"
             )
-        self.timestamp = table["timestamp"].to_numpy().astype(np.float64)
-        self.stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else self.timestamp
-        self.posed = pose in wanted
-        self.pose = np.tile(np.eye(4), (self.number, 1, 1))
-        if self.posed:
-            self.pose = np.array(table[pose].to_pylist(), dtype=np.float64).reshape(-1, 4, 4)
+        self._timestamp = table["timestamp"].to_numpy().astype(np.float64)
+        self._stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else self._timestamp
+        self._pose = np.array(table[pose].to_pylist(), np.float64).reshape(-1, 4, 4) if pose in wanted else None
+        self.posed = self._pose is not None or setup.cam_from_world is not None
 
+    def frames(self) -> Iterator[Frame]:
+        setup = self._setup
+        colours = self._pictures(self._key, paired=self._depth_key is not None)
+        depths = None if self._depth_key is None else self._pictures(self._depth_key)
+        with naming(f"dataset {self._episode.root}: episode {self._episode.index}"):
+            for t, picture in enumerate(colours):
+                depth_m = None if depths is None else setup.depth(next(depths))
+                pose = setup.pose(t) if self._pose is None or setup.cam_from_world is not None else self._pose[t]
+                yield Frame(setup.rgb(picture), depth_m, setup.stamp(t, fallback_s=float(self._stamp_s[t])), pose)
 
-def _frames(
-    episode: _Episode, rows: _Rows, setup: CameraFile, key: str, depth_key: str | None, units_m: _Units
-) -> Iterator[Frame]:
-    rig = setup.rig
-    colours = _pictures(episode, rows, key, units_m, paired=depth_key is not None)
-    depths = None if depth_key is None else _pictures(episode, rows, depth_key, units_m)
-    try:
-        for t, picture in enumerate(colours):
-            depth_m = None if depths is None else rig.depth(next(depths))
-            pose = rows.pose[t] if setup.cam_from_world is None else setup.pose(t)
-            yield Frame(rig.rgb(picture), depth_m, setup.stamp(t, fallback_s=float(rows.stamp_s[t])), pose)
-    except RecordingError:
-        raise
-    except InputError as error:
-        raise RecordingError(f"dataset {episode.root}: episode {episode.index}: {error}") from error
+    def _pictures(self, key: str, *, paired: bool = False) -> Iterator[np.ndarray]:
+        """Colours of uint8, or depth in metres, one per row; ``paired`` are colours that depth goes with."""
+        if self._episode.feature(key)["dtype"] == "image":
+            return self._stored(key, paired=paired)
+        return self._filmed(key, paired=paired)
 
+    def _filmed(self, key: str, *, paired: bool) -> Iterator[np.ndarray]:
+        """Frames of a video at the times of the rows."""
+        episode, path = self._episode, self._episode.video_path(key)
+        if paired and probe_video(path).turns:
+            raise episode.error(f"video {path.name} of {key}: {TURNED}")
+        half_s = 0.5 / float(episode.info["fps"])
+        times = float(episode.row[f"videos/{key}/from_timestamp"]) + self._timestamp
+        scale = None
+        if episode.is_depth(key):
+            told = {name: value for details in episode.details(key) for name, value in details.items()}
+            named = {name: told.get(f"video.{name}") for name in DepthRange.__dataclass_fields__}
+            scale = DepthRange(**{name: value for name, value in named.items() if value is not None})
+        pixel_format, number = "rgb24" if scale is None else "gray12le", 0
+        for picture, time_s in play_video(path, pixel_format=pixel_format, start_s=times[0] - half_s):
+            if number < len(times) and abs(time_s - times[number]) < half_s:
+                yield picture if scale is None else scale.depth(picture)
+                number += 1
+            if number == len(times):
+                return
+        raise episode.error(
+            f"{path.name} of {key} has {number} of the {len(times)} frames of episode {episode.index}; the file is "
+            "corrupt, copy it again"
+        )
 
-def _pictures(
-    episode: _Episode, rows: _Rows, key: str, units_m: _Units, *, paired: bool = False
-) -> Iterator[np.ndarray]:
-    """Colours of uint8, or depth in metres, one per row; ``paired`` are colours that depth goes with."""
-    feature = episode.feature(key)
-    if feature["dtype"] == "image":
-        yield from _stored_images(episode, key, units_m, paired=paired)
-        return
-    info = (feature.get("info") or {}) | (feature.get("video_info") or {})
-    path = episode.video_path(key)
-    if paired and probe_video(path).turns:
-        raise RecordingError(f"dataset {episode.root}: video {path.name} of {key}: {TURNED}")
-    begin_s = float(episode.row[f"videos/{key}/from_timestamp"])
-    half_s = 0.5 / float(episode.info["fps"])
-    times = begin_s + rows.timestamp
-    if _is_depth(feature):
-        named = {name: info[f"video.{name}"] for name in DepthRange.__dataclass_fields__ if f"video.{name}" in info}
-        scale, video = DepthRange(**named), play_video(path, pixel_format="gray12le", start_s=times[0] - half_s)
-    else:
-        scale, video = None, play_video(path, start_s=times[0] - half_s)
-    number = 0
-    for picture, time_s in video:
-        if number < len(times) and abs(time_s - times[number]) < half_s:
-            yield picture if scale is None else scale.depth(picture)
-            number += 1
-        if number == len(times):
-            return
-    raise RecordingError(
-        f"dataset {episode.root}: {path.name} of {key} has {number} of the {len(times)} frames of episode "
-        f"{episode.index}; the file is corrupt, copy it again"
-    )
+    def _stored(self, key: str, *, paired: bool) -> Iterator[np.ndarray]:
+        """Pictures in the rows themselves, a few in memory at a time."""
+        episode, path = self._episode, self._episode.data_path
+        where = f"dataset {episode.root}: a picture of {key} in {path.name}"
+        with reading(f"dataset file {path}", RecordingError, known=QuestError), pq.ParquetFile(path) as file:
+            for batch in file.iter_batches(batch_size=8, columns=["episode_index", key]):
+                for row in batch.to_pylist():
+                    if row["episode_index"] == episode.index:
+                        yield self._decoded(row[key]["bytes"], key, where, paired=paired)
 
-
-def _stored_images(episode: _Episode, key: str, units_m: _Units, *, paired: bool) -> Iterator[np.ndarray]:
-    """Pictures in the rows themselves."""
-    depth, path = _is_depth(episode.feature(key)), episode.data_path
-    where = f"dataset {episode.root}: a picture of {key} in {path.name}"
-    for row in _read_rows(path, ["episode_index", key]):
-        if row["episode_index"] != episode.index:
-            continue
-        with reading(where, RecordingError), Image.open(io.BytesIO(row[key]["bytes"])) as image:
+    def _decoded(self, data: bytes, key: str, where: str, *, paired: bool) -> np.ndarray:
+        with reading(where, RecordingError), Image.open(io.BytesIO(data)) as image:
             if paired and is_turned(image):
                 raise RecordingError(f"{where}: {TURNED}")
-            pixels = np.asarray(image) if depth else colours_of(upright(image), where)
-        if depth:
-            unit_m = units_m.floats if np.issubdtype(pixels.dtype, np.floating) else units_m.integers
-            pixels = metres(pixels, unit_m)
-        yield pixels
-
-
-def _read_rows(path: Path, columns: list[str]) -> Iterator[dict[str, Any]]:
-    """Rows one by one, a few in memory at a time."""
-    with reading(f"dataset file {path}", RecordingError), pq.ParquetFile(path) as file:
-        for batch in file.iter_batches(batch_size=8, columns=columns):
-            yield from batch.to_pylist()
+            if not self._episode.is_depth(key):
+                return colours_of(upright(image), where)
+            pixels = np.asarray(image)
+        integers_m, floats_m = self.units_m
+        return metres(pixels, floats_m if pixels.dtype.kind == "f" else integers_m)
 
 
 def _columns(path: Path) -> list[str]:
@@ -397,12 +369,3 @@ def _read_table(path: Path, columns: list[str], *, filters: list[tuple[str, str,
     require_table(path, RecordingError)
     with reading(f"dataset file {path}", RecordingError):
         return pq.read_table(path, columns=columns, filters=filters)
-
-
-READER = Reader(
-    "a LeRobot v3 dataset",
-    "a folder with meta/info.json",
-    _accepts,
-    _open,
-    options=("episode", "camera_key", "camera", "depth_scale_m", "fov_deg"),
-)

@@ -94,8 +94,8 @@ def _accepts(where: str) -> bool:
 
 def _open(where: str, options: ReadOptions) -> FrameSource:
     device = where.removeprefix(_PREFIX)
-    with closing(_Grabber(device)) as grabber:
-        height, width = grabber.read().shape[:2]
+    with closing(_pictures(device)) as pictures:
+        height, width = next(pictures).shape[:2]
     notes = Notes()
     if options.camera is None and options.fov_deg is None:
         notes.say(GUESSED_CAMERA)
@@ -106,41 +106,35 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
             f"camera {device}: it sends {width} x {height} pixels, and the intrinsics are for {camera.width} x "
             f"{camera.height}; give those of this size"
         )
-    return FrameSource(where, camera, lambda: newest(lambda: _grab(device, setup), notes), notes=notes, live=True)
+    return FrameSource(where, camera, lambda: newest(lambda: _frames(device, setup), notes), notes=notes, live=True)
 
 
-class _Grabber:
-    """A camera that is open."""
-
-    def __init__(self, device: str) -> None:
-        self._device = device
-        said = cv2.utils.logging.getLogLevel()
-        cv2.utils.logging.setLogLevel(0)  # what cannot be opened is told below, in one line
-        self._capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
-        cv2.utils.logging.setLogLevel(said)
-        if not self._capture.isOpened():
-            raise RecordingError(
-                f"camera {device}: cannot be opened; check its number or address, that nothing else uses it, and that "
-                "this program may use cameras"
-            )
-
-    def read(self) -> np.ndarray:
-        """The next picture, sRGB."""
-        there, picture = self._capture.read()
-        if not there:
-            raise RecordingError(f"camera {self._device}: it sends no pictures any more; connect it again")
-        return np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-    def close(self) -> None:
-        self._capture.release()
-
-
-def _grab(device: str, setup: CameraFile) -> Iterator[Frame]:
-    begun_s = time.monotonic()
-    with closing(_Grabber(device)) as grabber:
+def _pictures(device: str) -> Generator[np.ndarray]:
+    """Pictures of a camera, sRGB, until it sends no more."""
+    said = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(0)  # what cannot be opened is told below, in one line
+    capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
+    cv2.utils.logging.setLogLevel(said)
+    if not capture.isOpened():
+        raise RecordingError(
+            f"camera {device}: cannot be opened; check its number or address, that nothing else uses it, and that "
+            "this program may use cameras"
+        )
+    try:
         while True:
-            rgb = setup.rig.rgb(grabber.read())
-            yield Frame(rgb, None, time.monotonic() - begun_s)
+            there, picture = capture.read()
+            if not there:
+                raise RecordingError(f"camera {device}: it sends no pictures any more; connect it again")
+            yield np.ascontiguousarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    finally:
+        capture.release()
+
+
+def _frames(device: str, setup: CameraFile) -> Iterator[Frame]:
+    begun_s = time.monotonic()
+    with closing(_pictures(device)) as pictures:
+        for picture in pictures:
+            yield Frame(setup.rgb(picture), None, time.monotonic() - begun_s)
 
 
 READER = Reader("a live camera", "camera:0, or camera: and an address", _accepts, _open, ("camera", "fov_deg"))

@@ -23,8 +23,8 @@ COLOUR, DEPTH, TRACKS = "/camera/color", "/camera/aligned_depth_to_color", "/que
 
 _MARKER_M = 0.015
 _COLOURS = ((0.90, 0.27, 0.22), (0.16, 0.55, 0.90), (0.20, 0.70, 0.35), (0.95, 0.65, 0.10), (0.60, 0.35, 0.80))
-_NO_TURN = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
-_NO_MOVE = {"x": 0.0, "y": 0.0, "z": 0.0}
+_ADD, _DELETE = 0, 2
+_SPHERE, _TEXT = 2, 9
 
 
 def export_mcap(
@@ -71,7 +71,7 @@ def export_mcap(
 
 
 def _sender(writer: Any) -> Callable[[str, str, dict, int], None]:
-    """Writes a message of a type, whose definition goes into the file with the first one."""
+    """Writes a message of a type, whose definition goes into the file with the first one; fields left out are zero."""
     typesys = require("rosbags.typesys")
     store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
     schemas: dict[str, Any] = {}
@@ -123,7 +123,6 @@ def _image(header: dict[str, Any], encoding: str, pixels: np.ndarray) -> dict[st
         "height": pixels.shape[0],
         "width": pixels.shape[1],
         "encoding": encoding,
-        "is_bigendian": 0,
         "step": little.strides[0],
         "data": little.tobytes(),
     }
@@ -132,7 +131,6 @@ def _image(header: dict[str, Any], encoding: str, pixels: np.ndarray) -> dict[st
 def _camera_info(camera: Camera, header: dict[str, Any]) -> dict[str, Any]:
     """CameraInfo, whose pixel centres lie at integers."""
     k = [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
-    no_roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
     return {
         "header": header,
         "height": camera.height,
@@ -142,9 +140,6 @@ def _camera_info(camera: Camera, header: dict[str, Any]) -> dict[str, Any]:
         "k": k,
         "r": np.eye(3).ravel().tolist(),
         "p": [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": no_roi,
     }
 
 
@@ -169,41 +164,16 @@ def _markers(tracks: Tracks, t: int, stamp_ns: int) -> dict[str, Any]:
         point = tracks.point_world[t, k]
         shown = bool(np.isfinite(point).all())
         x, y, z = (float(value) for value in (point if shown else np.zeros(3)))
-        alpha = 1.0 if tracks.visible[t, k] else 0.4
-        for number, words in ((2 * k, ""), (2 * k + 1, f"{name} {tracks.state[t, k]}")):
-            up = 0.0 if not words else 1.5 * _MARKER_M
-            marker = _marker(number, stamp_ns, (x, y, z + up), _COLOURS[k % len(_COLOURS)], alpha, words)
-            markers.append(marker | {"action": 0 if shown else 2})
+        colour = dict(zip("rgb", _COLOURS[k % len(_COLOURS)], strict=True))
+        both = {
+            "header": _header(WORLD, stamp_ns),
+            "action": _ADD if shown else _DELETE,
+            "scale": dict.fromkeys("xyz", _MARKER_M),
+            "color": colour | {"a": 1.0 if tracks.visible[t, k] else 0.4},
+        }
+        ball, above = {"x": x, "y": y, "z": z}, {"x": x, "y": y, "z": z + 1.5 * _MARKER_M}
+        pose = {"position": ball, "orientation": {"w": 1.0}}
+        markers.append(both | {"ns": "points", "id": 2 * k, "type": _SPHERE, "pose": pose})
+        words = {"text": f"{name} {tracks.state[t, k]}", "pose": pose | {"position": above}}
+        markers.append(both | {"ns": "names", "id": 2 * k + 1, "type": _TEXT} | words)
     return {"markers": markers}
-
-
-def _marker(
-    number: int,
-    stamp_ns: int,
-    place: tuple[float, float, float],
-    colour: tuple[float, float, float],
-    alpha: float,
-    words: str,
-) -> dict[str, Any]:
-    sphere, text = 2, 9
-    no_colour = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.0}
-    return {
-        "header": _header(WORLD, stamp_ns),
-        "ns": "names" if words else "points",
-        "id": number,
-        "type": text if words else sphere,
-        "pose": {"position": dict(zip("xyz", place, strict=True)), "orientation": _NO_TURN},
-        "scale": dict.fromkeys("xyz", _MARKER_M),
-        "color": no_colour | dict(zip("rgb", colour, strict=True)) | {"a": alpha},
-        "lifetime": {"sec": 0, "nanosec": 0},
-        "frame_locked": False,
-        "points": [],
-        "colors": [],
-        "texture_resource": "",
-        "texture": {"header": _header("", 0), "format": "", "data": b""},
-        "uv_coordinates": [],
-        "text": words,
-        "mesh_resource": "",
-        "mesh_file": {"filename": "", "data": b""},
-        "mesh_use_embedded_materials": False,
-    }

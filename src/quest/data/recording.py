@@ -11,6 +11,8 @@ import difflib
 import os
 import shutil
 import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
@@ -20,12 +22,7 @@ import cv2
 import numpy as np
 
 from quest.data.camera_file import CameraFile, check_depth_scale, write_camera
-from quest.data.frame_source import (
-    FrameSource,
-    Parts,
-    Reader,
-    ReadOptions,
-)
+from quest.data.frame_source import FrameSource, Parts, Reader, ReadOptions, naming
 from quest.data.video import frame_rate, write_video
 from quest.depth import clean_depth
 from quest.errors import InputError, QuestError, RecordingError
@@ -42,7 +39,7 @@ __all__ = [
     "write_recording",
 ]
 
-_READERS = ("live_camera", "realsense", "sample", "take_reader", "lerobot", "mcap_file", "rosbag", "folder")
+_READERS = ("live_camera", "realsense", "sample", "store", "lerobot", "mcap_file", "rosbag", "folder")
 """Modules of this room with a ``READER``; the first that accepts a path reads it. A new reader is a line here."""
 
 
@@ -88,7 +85,7 @@ def open_recording(
         **asdict(Parts() if parts is None else parts),
         depth=None if depth is None else Path(depth),
         camera=Path(camera) if isinstance(camera, str) else camera,
-        depth_scale_m=_checked_scale(where, depth_scale_m),
+        depth_scale_m=_checked_scale(where, depth_scale_m, RecordingError),
         fov_deg=fov_deg,
     )
     known = readers()
@@ -104,7 +101,7 @@ def open_recording(
             kinds = " or ".join(reader.kind for reader in known if name in reader.options)
             option = "--fov" if name == "fov_deg" else "--" + name.replace("_", "-")
             raise RecordingError(f"{where}: {option} {value} is for {kinds}, and this is {reader.kind}; omit {option}")
-    with reading(f"recording {where}", RecordingError, known=QuestError):
+    with reading(f"recording {where}", RecordingError, known=QuestError), naming(f"recording {where}"):
         return reader.open(where, options)
 
 
@@ -130,11 +127,11 @@ def _near(path: Path) -> str:
     return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
-def _checked_scale(where: str, depth_scale_m: float | int | None) -> float | None:
+def _checked_scale(where: str | Path, depth_scale_m: float | int | None, kind: type[QuestError]) -> float | None:
     try:
         return None if depth_scale_m is None else check_depth_scale(depth_scale_m)
     except ValueError as error:
-        raise RecordingError(f"recording {where}: {error}") from error
+        raise kind(f"recording {where}: {error}") from error
 
 
 def write_recording(
@@ -157,17 +154,8 @@ def write_recording(
     Raises:
         InputError: the folder has something in it, or the scale of depth is not a positive number.
     """
-    try:
-        scale = 1e-3 if depth_scale_m is None else check_depth_scale(depth_scale_m)
-    except ValueError as error:
-        raise InputError(f"recording {folder}: {error}") from None
-    target = Path(folder)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise InputError(f"recording {target}: exists and is not an empty folder; choose another one")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
-    try:
-        partial.mkdir()
+    scale = _checked_scale(folder, depth_scale_m, InputError) or 1e-3
+    with whole_folder(folder, "recording") as partial:
         if rgb == "video":
             write_video(partial / "rgb.mp4", clip.rgb, frames_per_s=frame_rate(clip.stamp_s), crf=crf, preset="slow")
         else:
@@ -183,8 +171,30 @@ def write_recording(
                 _write_png(partial / "depth" / f"{t:06d}.png", image)
         static = (clip.cam_from_world == clip.cam_from_world[0]).all()
         poses = clip.cam_from_world[0] if static else clip.cam_from_world
-        file = CameraFile(clip.camera, scale, frame_rate(clip.stamp_s), clip.stamp_s, poses)
+        file = CameraFile(
+            clip.camera,
+            depth_scale_m=scale,
+            frames_per_s=frame_rate(clip.stamp_s),
+            stamp_s=clip.stamp_s,
+            cam_from_world=poses,
+        )
         write_camera(file, partial / "camera.json")
+
+
+@contextmanager
+def whole_folder(folder: str | Path, what: str) -> Iterator[Path]:
+    """Where to write a folder that gets its name when all is written; a failure leaves nothing.
+
+    Raises:
+        InputError: the folder is there already and has something in it.
+    """
+    target = Path(folder)
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise InputError(f"{what} {target}: exists and is not an empty folder; choose another one")
+    partial = target.with_name(f".{target.name}.partial-{uuid.uuid4().hex[:8]}")
+    partial.mkdir(parents=True)
+    try:
+        yield partial
         if target.exists():
             target.rmdir()
         partial.rename(target)

@@ -16,12 +16,12 @@ import numpy as np
 
 from quest.data.camera_file import CameraFile, read_setup
 from quest.data.distortion import Distortion
-from quest.data.frame_source import FrameSource, Notes, Parts, ReadOptions
+from quest.data.frame_source import FrameSource, Notes, ReadOptions, naming
 from quest.data.registration import Rig
 from quest.data.ros_images import depth_of, header_ns, rgb_of, unit_of
 from quest.data.ros_topics import Chosen, Messages, base_of, choose
 from quest.data.transforms import STALE_S, Transforms, frame_name
-from quest.errors import InputError, RecordingError
+from quest.errors import RecordingError
 from quest.types import Camera, Frame
 
 _PATIENCE_NS = 500_000_000
@@ -43,30 +43,29 @@ CAMERA_CHANGED = "camera_info changes on the way: the first is used"
 
 
 @dataclass(frozen=True)
-class _Setting:
-    """Constants of all frames of a bag."""
+class _Bag:
+    """What holds for all frames of a bag."""
 
     messages: Messages
-    """The bag."""
     chosen: Chosen
-    """Its topics."""
     rig: Rig
-    """Cameras."""
-    parts: Parts
-    """The options of the user."""
+    options: ReadOptions
     colour_frame: str
     """Tf frame of the colours."""
     world: str | None
     """Tf frame that is the world; None without tf."""
-    scale_m: float | None
-    """Metres per unit of depth; None for the usual unit of ROS."""
     pose: np.ndarray | None
     """Of every frame, where the camera file gives one."""
     by_log: bool
     """Whether times are those of logging, because nobody set those of the headers."""
 
+    @property
+    def tolerance_ns(self) -> int:
+        """How far apart colours and depth may be."""
+        return round(self.options.sync_s * 1e9)
+
     def where(self, topic: str, number: int) -> str:
-        return f"bag {self.messages.path}: message {number} of {topic}"
+        return f"{self.messages.where}: message {number} of {topic}"
 
 
 def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
@@ -82,11 +81,9 @@ def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
         RecordingError: no colours, no intrinsics, unknown lens, or depth of a camera whose place is unknown.
     """
     setup = None if options.camera is None else read_setup(options.camera)
-    chosen = choose(messages, options)
-    where = f"bag {messages.path}"
-    notes = Notes()
+    chosen, where, notes = choose(messages, options), messages.where, Notes()
     transforms, now_ns = _scan_transforms(messages, chosen)
-    colour_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
+    colour_frame = _frame_of(messages, chosen.rgb)
     world = transforms.root(colour_frame)
     if options.world_frame is not None:
         world = frame_name(options.world_frame)
@@ -104,27 +101,28 @@ def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
         notes.say(NO_POSE)
     if chosen.depth is None:
         notes.say(NO_DEPTH)
-    try:
+    with naming(where):
         rig = _rig(messages, chosen, setup, transforms, now_ns)
-    except RecordingError:
-        raise
-    except InputError as error:
-        raise RecordingError(f"{where}: {error}") from error
     # A clock of a simulator may begin at 0, but does not stay there.
     by_log = all(header_ns(message) == 0 for _, _, message in islice(messages.read([chosen.rgb]), 2))
     if by_log:
         notes.say(NO_STAMP)
-    unit_m = 1.0 if chosen.depth is None else options.depth_scale_m or unit_of(chosen.first[chosen.depth])
-    setting = _Setting(messages, chosen, rig, options, colour_frame, world, options.depth_scale_m, pose, by_log)
+    unit_m = 1.0 if chosen.depth is None else options.depth_scale_m or unit_of(messages.first(chosen.depth))
+    bag = _Bag(messages, chosen, rig, options, colour_frame, world, pose, by_log)
     return FrameSource(
         messages.path.stem if messages.path.is_file() else messages.path.resolve().name,
         rig.camera,
-        lambda: _Play(setting, notes).frames(),
+        lambda: _Play(bag, notes).frames(),
         length=messages.topics[chosen.rgb].number,
         exact=False,
         notes=notes,
         units=(f"{messages.path}, {chosen.depth}", unit_m),
     )
+
+
+def _frame_of(messages: Messages, topic: str) -> str:
+    message: Any = messages.first(topic)
+    return frame_name(message.header.frame_id)
 
 
 def _scan_transforms(messages: Messages, chosen: Chosen) -> tuple[Transforms, int]:
@@ -137,43 +135,41 @@ def _scan_transforms(messages: Messages, chosen: Chosen) -> tuple[Transforms, in
         if log_ns - begun_ns > _SCAN_NS:
             break
         transforms.add(message, static=False, log_ns=log_ns)
-    return transforms, header_ns(chosen.first[chosen.rgb]) or begun_ns or 0
+    return transforms, header_ns(messages.first(chosen.rgb)) or begun_ns or 0
 
 
 def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transforms: Transforms, now_ns: int) -> Rig:
-    where = f"bag {messages.path}"
-    rgb_size = rgb_of(chosen.first[chosen.rgb], f"{where}: first message of {chosen.rgb}").shape[:2]
+    where = messages.where
+    size = rgb_of(messages.first(chosen.rgb), f"{where}: first message of {chosen.rgb}").shape[:2]
     if setup is not None:
         camera, lens = setup.camera, setup.distortion
-    elif chosen.info is None:
+    elif chosen.info is not None:
+        camera, lens = camera_of(messages.first(chosen.info), chosen.rgb, size, where)
+    else:
         raise RecordingError(
             f"{where}: no camera_info for {chosen.rgb}; name its topic with --topic-info, or give the intrinsics with "
             "--camera FILE"
         )
-    else:
-        camera, lens = camera_of(chosen.first[chosen.info], chosen.rgb, rgb_size, where)
-    if (camera.height, camera.width) != rgb_size:
+    if (camera.height, camera.width) != size:
         raise RecordingError(
-            f"{where}: {chosen.rgb} is {rgb_size[1]} x {rgb_size[0]} but its camera is for {camera.width} x "
+            f"{where}: {chosen.rgb} is {size[1]} x {size[0]} but its camera is for {camera.width} x "
             f"{camera.height}; give the intrinsics of these images with --camera FILE"
         )
     if setup is not None and setup.depth_camera is not None:
-        return setup.rig
+        return setup
     if chosen.depth is None:
         return Rig(camera, lens)
-    depth = chosen.first[chosen.depth]
-    depth_size = depth_of(depth, f"{where}: first message of {chosen.depth}").shape
-    rgb_frame = frame_name(chosen.first[chosen.rgb].header.frame_id)
-    depth_frame = frame_name(depth.header.frame_id)
-    same_pixels = depth_frame == rgb_frame and depth_size == rgb_size
-    if same_pixels and (chosen.depth_info is None or (setup is not None and _same_camera(chosen))):
+    depth_size = depth_of(messages.first(chosen.depth), f"{where}: first message of {chosen.depth}").shape
+    rgb_frame, depth_frame = _frame_of(messages, chosen.rgb), _frame_of(messages, chosen.depth)
+    same_pixels = depth_frame == rgb_frame and depth_size == size
+    if same_pixels and (chosen.depth_info is None or (setup is not None and _same_camera(messages, chosen))):
         return Rig(camera, lens)
     if chosen.depth_info is None:
         raise RecordingError(
             f"{where}: no camera_info for {chosen.depth}; name its topic with --topic-depth-info, give depth_camera in "
             "--camera FILE, or omit the depth with --topic-depth none"
         )
-    depth_camera, depth_lens = camera_of(chosen.first[chosen.depth_info], chosen.depth, depth_size, where)
+    depth_camera, depth_lens = camera_of(messages.first(chosen.depth_info), chosen.depth, depth_size, where)
     colour_from_depth = transforms.lookup(rgb_frame, depth_frame, now_ns)
     if colour_from_depth is None:
         raise RecordingError(
@@ -184,11 +180,11 @@ def _rig(messages: Messages, chosen: Chosen, setup: CameraFile | None, transform
     return Rig(camera, lens, depth_camera, depth_lens, colour_from_depth)
 
 
-def _same_camera(chosen: Chosen) -> bool:
+def _same_camera(messages: Messages, chosen: Chosen) -> bool:
     """Whether a bag says the same of the cameras of colours and depth: what overrules the one overrules the other."""
     if chosen.info is None or chosen.depth_info is None or chosen.depth is None:
         return False
-    (k, d, _), (depth_k, depth_d, _) = (_numbers(chosen.first[topic]) for topic in (chosen.info, chosen.depth_info))
+    (k, d, _), (depth_k, depth_d, _) = (_numbers(messages.first(name)) for name in (chosen.info, chosen.depth_info))
     straight = _is_rectified(chosen.rgb) == _is_rectified(chosen.depth) or not d.any()
     return straight and np.array_equal(k, depth_k) and np.array_equal(d, depth_d)
 
@@ -233,26 +229,26 @@ def _window(info: Any, whole: tuple[int, ...]) -> tuple[tuple[int, int], tuple[i
 class _Play:
     """One pass over a bag."""
 
-    def __init__(self, setting: _Setting, notes: Notes) -> None:
-        self._it, self._notes = setting, notes
-        self._transforms = _scan_transforms(setting.messages, setting.chosen)[0]
+    def __init__(self, bag: _Bag, notes: Notes) -> None:
+        self._bag, self._notes = bag, notes
+        self._transforms = _scan_transforms(bag.messages, bag.chosen)[0]
         self._colours: deque[tuple[int, int, Any]] = deque()
         self._depths: deque[tuple[int, int, Any]] = deque()
         self._newest_ns = 0
         self._emitted_ns: int | None = None
         self._frame = 0
-        self._numbers = {name: 0 for name in (setting.chosen.rgb, setting.chosen.depth) if name is not None}
+        self._numbers = {name: 0 for name in (bag.chosen.rgb, bag.chosen.depth) if name is not None}
 
     def frames(self) -> Iterator[Frame]:
-        chosen = self._it.chosen
+        chosen, messages = self._bag.chosen, self._bag.messages
         wanted = {*self._numbers, *chosen.moving, *([chosen.info] if chosen.info else [])}
-        for topic, log_ns, message in self._it.messages.read(sorted(wanted)):
+        for topic, log_ns, message in messages.read(sorted(wanted)):
             if topic in self._numbers:
                 self._take(topic, log_ns, message)
-            elif topic == chosen.info:
-                self._compare(message)
-            else:
+            elif topic != chosen.info:
                 self._transforms.add(message, static=False, log_ns=log_ns)
+            elif not np.allclose(_numbers(message)[0], _numbers(messages.first(topic))[0]):
+                self._notes.say(CAMERA_CHANGED)
             while self._colours and self._ready(self._colours[0][0]):
                 yield self._frame_of(*self._colours.popleft())
         while self._colours:
@@ -261,11 +257,11 @@ class _Play:
     def _take(self, topic: str, log_ns: int, message: Any) -> None:
         number = self._numbers[topic]
         self._numbers[topic] += 1
-        at_ns = log_ns if self._it.by_log else header_ns(message)
-        if topic == self._it.chosen.depth:
+        at_ns = log_ns if self._bag.by_log else header_ns(message)
+        if topic == self._bag.chosen.depth:
             self._depths.append((at_ns, number, message))
             # Without colours nothing else would make room.
-            oldest_ns = max(self._newest_ns, at_ns) - _PATIENCE_NS - round(self._it.parts.sync_s * 1e9)
+            oldest_ns = max(self._newest_ns, at_ns) - _PATIENCE_NS - self._bag.tolerance_ns
             while not self._colours and self._depths[0][0] < oldest_ns:
                 self._depths.popleft()
         else:
@@ -273,8 +269,8 @@ class _Play:
             if last_ns is not None and at_ns < last_ns:
                 if last_ns - at_ns > _LATE_NS:
                     raise RecordingError(
-                        f"{self._it.where(topic, number)}: time goes back by {(last_ns - at_ns) * 1e-9:.3f} s; cut the "
-                        "bag there"
+                        f"{self._bag.where(topic, number)}: time goes back by {(last_ns - at_ns) * 1e-9:.3f} s; cut "
+                        "the bag there"
                     )
                 self._notes.count(LATE, number)
                 return
@@ -285,58 +281,40 @@ class _Play:
         """Whether nothing better can come for colours of a time."""
         if self._newest_ns - at_ns > _PATIENCE_NS:
             return True
-        depth = self._it.chosen.depth is None or (bool(self._depths) and self._depths[-1][0] >= at_ns)
-        return depth and (self._it.world is None or self._gap(at_ns) == 0)
-
-    def _gap(self, at_ns: int) -> float:
-        assert self._it.world is not None
-        return self._transforms.gap(self._it.colour_frame, self._it.world, at_ns)
+        depth = self._bag.chosen.depth is None or (bool(self._depths) and self._depths[-1][0] >= at_ns)
+        world = self._bag.world
+        return depth and (world is None or self._transforms.gap(self._bag.colour_frame, world, at_ns) == 0)
 
     def _frame_of(self, at_ns: int, number: int, message: Any) -> Frame:
-        setting, t = self._it, self._frame
+        bag, t = self._bag, self._frame
         self._frame, self._emitted_ns = t + 1, at_ns
-        where = setting.where(setting.chosen.rgb, number)
-        try:
-            rgb = setting.rig.rgb(rgb_of(message, where))
-        except RecordingError:
-            raise
-        except InputError as error:
-            raise RecordingError(f"{where}: {error}") from error
+        where = bag.where(bag.chosen.rgb, number)
+        with naming(where):
+            rgb = bag.rig.rgb(rgb_of(message, where))
         return Frame(rgb, self._depth_of(at_ns, t), at_ns * 1e-9, self._pose_of(at_ns, t))
 
     def _depth_of(self, at_ns: int, t: int) -> np.ndarray | None:
-        setting = self._it
-        if setting.chosen.depth is None:
+        bag, topic = self._bag, self._bag.chosen.depth
+        if topic is None:
             return None
-        tolerance_ns = round(setting.parts.sync_s * 1e9)
-        while self._depths and self._depths[0][0] < at_ns - tolerance_ns:
+        while self._depths and self._depths[0][0] < at_ns - bag.tolerance_ns:
             self._depths.popleft()
         nearest = min(self._depths, key=lambda depth: abs(depth[0] - at_ns), default=None)
-        if nearest is None or abs(nearest[0] - at_ns) > tolerance_ns:
-            self._notes.count(f"no depth within {setting.parts.sync_s:g} s of the colours", t)
+        if nearest is None or abs(nearest[0] - at_ns) > bag.tolerance_ns:
+            self._notes.count(f"no depth within {bag.options.sync_s:g} s of the colours", t)
             return None
-        where = setting.where(setting.chosen.depth, nearest[1])
-        try:
-            return setting.rig.depth(depth_of(nearest[2], where, scale_m=setting.scale_m))
-        except RecordingError:
-            raise
-        except InputError as error:
-            raise RecordingError(f"{where}: {error}") from error
+        where = bag.where(topic, nearest[1])
+        with naming(where):
+            return bag.rig.depth(depth_of(nearest[2], where, scale_m=bag.options.depth_scale_m))
 
     def _pose_of(self, at_ns: int, t: int) -> np.ndarray:
-        setting = self._it
-        if setting.pose is not None:
-            return setting.pose
-        if setting.world is None:
+        bag = self._bag
+        if bag.pose is not None:
+            return bag.pose
+        if bag.world is None:
             return np.eye(4)
-        if self._gap(at_ns) > STALE_S:
+        if self._transforms.gap(bag.colour_frame, bag.world, at_ns) > STALE_S:
             self._notes.count(STALE, t)
-        pose = self._transforms.lookup(setting.colour_frame, setting.world, at_ns)
+        pose = self._transforms.lookup(bag.colour_frame, bag.world, at_ns)
         self._transforms.forget(at_ns)
         return np.eye(4) if pose is None else pose
-
-    def _compare(self, info: Any) -> None:
-        first = self._it.chosen.first[self._it.chosen.info or ""]
-        here, there = (np.asarray(getattr(message, "k", getattr(message, "K", ()))) for message in (info, first))
-        if not np.allclose(here, there):
-            self._notes.say(CAMERA_CHANGED)

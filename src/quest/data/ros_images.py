@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -25,54 +25,39 @@ DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
 
 _MILLIMETRE_M = 1e-3
 _HEADER = struct.Struct("<iff")
-_BAYER = {"rggb": "RGGB", "bggr": "BGGR", "gbrg": "GBRG", "grbg": "GRBG"}
 
 
 @dataclass(frozen=True)
 class _Layout:
-    """How pixels lie in a message: element type, channels, and the conversion to RGB."""
+    """How pixels lie in a message: element type, channels, and the conversion of their bytes to RGB."""
 
     dtype: str
     channels: int
     to_rgb: Callable[[np.ndarray], np.ndarray]
 
 
-def _converted(code: int) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda image: np.asarray(cv2.cvtColor(image, code))
-
-
-def _bayer(pattern: str, *, wide: bool) -> _Layout:
-    code = getattr(cv2, f"COLOR_Bayer{_BAYER[pattern]}2RGB")
-    if wide:
-        return _Layout("u2", 1, lambda image: np.asarray(cv2.cvtColor(_to_bytes(image), code)))
-    return _Layout("u1", 1, _converted(code))
-
-
-def _to_bytes(image: np.ndarray) -> np.ndarray:
-    return (image >> 8).astype(np.uint8)
+def _converted(code: str) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda image: np.asarray(cv2.cvtColor(image, getattr(cv2, f"COLOR_{code}")))
 
 
 _RGB = _Layout("u1", 3, lambda image: image)
 _BGR = _Layout("u1", 3, lambda image: image[..., ::-1])
 _BGRA = _Layout("u1", 4, lambda image: image[..., 2::-1])
 _GREY = _Layout("u1", 1, lambda image: np.repeat(image[..., None], 3, axis=-1))
+_UYVY, _YUYV = (_Layout("u1", 2, _converted(f"YUV2RGB_{order}")) for order in ("UYVY", "YUY2"))
+_BAYER = {pattern: _converted(f"Bayer{pattern.upper()}2RGB") for pattern in ("rggb", "bggr", "gbrg", "grbg")}
 _COLOURS = {
     "rgb8": _RGB,
-    "bgr8": _BGR,
-    "8UC3": _BGR,
-    "rgba8": _Layout("u1", 4, lambda image: image[..., :3]),
-    "bgra8": _BGRA,
-    "8UC4": _BGRA,
-    "rgb16": _Layout("u2", 3, _to_bytes),
-    "bgr16": _Layout("u2", 3, lambda image: _to_bytes(image[..., ::-1])),
-    "mono8": _GREY,
-    "8UC1": _GREY,
-    "yuv422": _Layout("u1", 2, _converted(cv2.COLOR_YUV2RGB_UYVY)),
-    "uyvy": _Layout("u1", 2, _converted(cv2.COLOR_YUV2RGB_UYVY)),
-    "yuv422_yuy2": _Layout("u1", 2, _converted(cv2.COLOR_YUV2RGB_YUY2)),
-    "yuyv": _Layout("u1", 2, _converted(cv2.COLOR_YUV2RGB_YUY2)),
-    **{f"bayer_{pattern}8": _bayer(pattern, wide=False) for pattern in _BAYER},
-    **{f"bayer_{pattern}16": _bayer(pattern, wide=True) for pattern in _BAYER},
+    "rgba8": replace(_RGB, channels=4, to_rgb=lambda image: image[..., :3]),
+    "rgb16": replace(_RGB, dtype="u2"),
+    "bgr16": replace(_BGR, dtype="u2"),
+    **dict.fromkeys(("bgr8", "8UC3"), _BGR),
+    **dict.fromkeys(("bgra8", "8UC4"), _BGRA),
+    **dict.fromkeys(("mono8", "8UC1"), _GREY),
+    **dict.fromkeys(("yuv422", "uyvy"), _UYVY),
+    **dict.fromkeys(("yuv422_yuy2", "yuyv"), _YUYV),
+    **{f"bayer_{pattern}8": _Layout("u1", 1, to_rgb) for pattern, to_rgb in _BAYER.items()},
+    **{f"bayer_{pattern}16": _Layout("u2", 1, to_rgb) for pattern, to_rgb in _BAYER.items()},
 }
 
 
@@ -121,7 +106,9 @@ def rgb_of(message: Any, where: str) -> UInt8[np.ndarray, "H W 3"]:
             f"{where}: encoding {message.encoding!r} is not one of colours; known are {', '.join(_COLOURS)}; name "
             "another topic"
         )
-    return np.ascontiguousarray(layout.to_rgb(_pixels(message, layout.dtype, layout.channels, where)))
+    pixels = _pixels(message, layout.dtype, layout.channels, where)
+    pixels = (pixels >> 8).astype(np.uint8) if layout.dtype == "u2" else pixels
+    return np.ascontiguousarray(layout.to_rgb(pixels))
 
 
 def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float32[np.ndarray, "H W"]:

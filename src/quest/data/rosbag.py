@@ -9,13 +9,13 @@ from typing import Any
 
 from quest.data.frame_source import FrameSource, Reader, ReadOptions
 from quest.data.ros_frames import BAG_OPTIONS, open_messages
-from quest.data.ros_topics import Topic
+from quest.data.ros_topics import Messages, Topic
 from quest.errors import RecordingError
 from quest.extras import require
 from quest.untrusted import reading
 
 
-class BagMessages:
+class BagMessages(Messages):
     """The messages of a ROS bag. Bags that do not carry their message definitions are taken to be of ROS 2 Humble.
 
     Args:
@@ -27,21 +27,15 @@ class BagMessages:
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        require("rosbags")
-        self.topics = self._find_topics()
+        super().__init__(path, {})
+        with self._reader() as reader:
+            for name, info in reader.topics.items():
+                self.topics[name] = Topic((info.msgtype or "").replace("/msg/", "/"), info.msgcount)
         if not self.topics:
             raise RecordingError(f"bag {path}: it has no topics; record it again")
 
-    def _find_topics(self) -> dict[str, Topic]:
-        with self._reader() as reader:
-            return {
-                name: Topic((info.msgtype or "").replace("/msg/", "/"), info.msgcount)
-                for name, info in reader.topics.items()
-            }
-
     def read(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of logging in nanoseconds and message; as :class:`quest.data.ros_topics.Messages` says."""
+        """As :class:`quest.data.ros_topics.Messages` says."""
         with self._reader() as reader:
             wanted = [connection for connection in reader.connections if connection.topic in topics]
             if not wanted:

@@ -30,12 +30,9 @@ class ObjectSplit:
 @cache
 def object_split() -> ObjectSplit:
     """The split that the package ships."""
-    text = resources.files("quest.data").joinpath("split.json").read_text(encoding="utf-8")
-    raw = json.loads(text)
-    return ObjectSplit(
-        partnet_mobility={part: tuple(raw["partnet-mobility"][part]) for part in PARTS},
-        procedural_seeds={part: (raw["procedural_seeds"][part][0], raw["procedural_seeds"][part][1]) for part in PARTS},
-    )
+    raw = json.loads(resources.files("quest.data").joinpath("split.json").read_text(encoding="utf-8"))
+    ids, seeds = ({part: tuple(raw[kind][part]) for part in PARTS} for kind in ("partnet-mobility", "procedural_seeds"))
+    return ObjectSplit(ids, {part: (first, last) for part, (first, last) in seeds.items()})
 
 
 SplitPart = Literal["train", "validation", "test", "unlisted"]
@@ -49,10 +46,9 @@ def split_of(info: TakeInfo) -> Part:
         ObjectError: the object is in no part, so that neither training nor a reported number may use it.
     """
     split = object_split()
+    found: list[Part] = []
     if info.source == "partnet-mobility":
-        for part in PARTS:
-            if info.object_id in split.partnet_mobility[part]:
-                return part
+        found = [part for part in PARTS if info.object_id in split.partnet_mobility[part]]
     elif info.source == "procedural":
         match = re.fullmatch(r".+-(\d+)", info.object_id)
         if match is None:
@@ -60,10 +56,10 @@ def split_of(info: TakeInfo) -> Part:
                 f"object {info.object_id!r}: expected a procedural object to be called category-seed, such as "
                 f"'fridge-100003'; rename it so that its part of the split is known"
             )
-        for part in PARTS:
-            first, last = split.procedural_seeds[part]
-            if first <= int(match.group(1)) <= last:
-                return part
+        ranges = split.procedural_seeds
+        found = [part for part in PARTS if ranges[part][0] <= int(match[1]) <= ranges[part][1]]
+    if found:
+        return found[0]
     raise ObjectError(
         f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's objects "
         f"or a procedural seed in its ranges"

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -109,84 +109,73 @@ def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda
     Raises:
         TakeError: a take's arrays cannot be decoded.
     """
-    headers, tally = store.headers(), _Tally()
+    headers, parts, pixels = store.headers(), defaultdict[str, list[np.ndarray]](list), np.zeros(4, np.int64)
     for done, (name, header) in enumerate(headers.items(), start=1):
-        tally.add(header, store.read_small_arrays(name))
+        for what, values in _parts(header, store.read_small_arrays(name)):
+            parts[what].append(values)
         for v in np.flatnonzero(header.has_depth):
             for t in np.unique(np.linspace(0, header.frames - 1, _DEPTH_FRAMES).astype(int)):
                 view = store.read_view(name, int(v), frames=slice(int(t), int(t) + 1))
                 assert view.clip.depth_m is not None
-                tally.add_depth(view.clip.depth_m, view.link_id)
+                missing, on_object = view.clip.depth_m == 0, view.link_id > 0
+                pixels += [missing.size, missing.sum(), on_object.sum(), (missing & on_object).sum()]
         report(done, len(headers))
-    return tally.result(list(headers.values()), len(store.problems()))
+    return _stats(list(headers.values()), len(store.problems()), parts, pixels.tolist())
 
 
-class _Tally:
-    """Sums over takes."""
+def _parts(header: TakeHeader, arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
+    """What is measured of a take; what is seen by the label of the entities."""
+    labels = np.array([entity.label for entity in header.info.entities])
+    tracked = np.flatnonzero(np.isin(labels, LABELS))
+    point = arrays["point_world"][:, tracked].astype(np.float64)
+    moved_m = np.linalg.norm(point - point[:1], axis=-1).max(axis=0)
+    yield "motion_m", moved_m
+    yield "motion", moved_m / header.info.half_diagonal_m
+    for v in range(len(header.cameras)):
+        pose, visible = arrays[f"view_{v}/cam_from_world"], arrays[f"view_{v}/visible"]
+        yield "moving", np.array([not np.allclose(pose, pose[0], atol=1e-9)])
+        for label in LABELS:
+            yield label, visible[:, labels == label].ravel()
+        yield "ever", np.asarray(visible[:, tracked].any(axis=0))
+        pose, ends = pose[[0, -1]], point[[0, -1]]
+        in_camera = np.einsum("tij,tej->tei", pose[:, :3, :3], ends) + pose[:, None, :3, 3]
+        yield "distance_m", np.linalg.norm(in_camera, axis=-1)
 
-    def __init__(self) -> None:
-        self.seen: dict[str, list[np.ndarray]] = {label: [] for label in LABELS}
-        self.ever: list[np.ndarray] = []
-        self.motion: list[np.ndarray] = []
-        self.motion_m: list[np.ndarray] = []
-        self.distance_m: list[np.ndarray] = []
-        self.moving_cameras = 0
-        self.pixels = np.zeros(4, dtype=np.int64)  # all, missing, of the object, missing of those
 
-    def add(self, header: TakeHeader, arrays: Mapping[str, np.ndarray]) -> None:
-        labels = np.array([entity.label for entity in header.info.entities])
-        tracked = np.flatnonzero(np.isin(labels, LABELS))
-        point = arrays["point_world"][:, tracked].astype(np.float64)
-        moved_m = np.linalg.norm(point - point[:1], axis=-1).max(axis=0)
-        self.motion_m.append(moved_m)
-        self.motion.append(moved_m / header.info.half_diagonal_m)
-        for v in range(len(header.cameras)):
-            pose, visible = arrays[f"view_{v}/cam_from_world"], arrays[f"view_{v}/visible"]
-            self.moving_cameras += not np.allclose(pose, pose[0], atol=1e-9)
-            for label in LABELS:
-                self.seen[label].append(visible[:, labels == label].ravel())
-            self.ever.append(np.asarray(visible[:, tracked].any(axis=0)))
-            ends = [0, -1]
-            in_camera = np.einsum("tij,tej->tei", pose[ends, :3, :3], point[ends]) + pose[ends, None, :3, 3]
-            self.distance_m.append(np.linalg.norm(in_camera, axis=-1))
-
-    def add_depth(self, depth_m: np.ndarray, link_id: np.ndarray) -> None:
-        missing, on_object = depth_m == 0, link_id > 0
-        self.pixels += [missing.size, missing.sum(), on_object.sum(), (missing & on_object).sum()]
-
-    def result(self, headers: list[TakeHeader], unreadable: int) -> StoreStats:
-        infos = [header.info for header in headers]
-        every_motion = np.concatenate([np.zeros(0), *self.motion])
-        frames = [header.frames * len(header.cameras) for header in headers]
-        pixels, missing, on_object, missing_on_object = (int(n) for n in self.pixels)
-        objects = {(info.source, info.object_id): 2 * info.half_diagonal_m for info in infos}
-        return StoreStats(
-            takes=len(headers),
-            unreadable=unreadable,
-            objects=len(objects),
-            views=sum(len(header.cameras) for header in headers),
-            frames=sum(frames),
-            hours=sum(n / info.frames_per_s for n, info in zip(frames, infos, strict=True)) / 3600,
-            stored_bytes=sum(sum(header.files.values()) for header in headers),
-            sources=_counted(info.source for info in infos),
-            categories=_counted(info.category for info in infos),
-            levels=_counted(str(info.level) for info in infos),
-            suites=_counted(info.suite for info in infos),
-            labels=_counted(entity.label for info in infos for entity in info.entities),
-            moving_cameras=self.moving_cameras,
-            with_depth_sensor=sum(has_sensed_depth(info) for info in infos),
-            visible_share=_share([part for parts in self.seen.values() for part in parts]),
-            visible_share_by_label={label: _share(parts) for label, parts in self.seen.items() if sum(map(len, parts))},
-            never_seen=1 - _share(self.ever),
-            moved_share=_share([every_motion > 0.1]),
-            motion=Spread.of([every_motion]),
-            motion_m=Spread.of(self.motion_m),
-            diagonal_m=Spread.of(objects.values()),
-            distance_m=Spread.of(self.distance_m),
-            image_px=_counted(f"{h.cameras[0].width} x {h.cameras[0].height}" for h in headers if h.cameras),
-            depth_missing_share=_ratio(missing, pixels),
-            depth_missing_share_on_object=_ratio(missing_on_object, on_object),
-        )
+def _stats(
+    headers: list[TakeHeader], unreadable: int, parts: Mapping[str, list[np.ndarray]], pixels: list[int]
+) -> StoreStats:
+    infos = [header.info for header in headers]
+    frames = [header.frames * len(header.cameras) for header in headers]
+    objects = {(info.source, info.object_id): 2 * info.half_diagonal_m for info in infos}
+    every, missing, on_object, missing_on_object = pixels
+    return StoreStats(
+        takes=len(headers),
+        unreadable=unreadable,
+        objects=len(objects),
+        views=len(parts["moving"]),
+        frames=sum(frames),
+        hours=sum(n / info.frames_per_s for n, info in zip(frames, infos, strict=True)) / 3600,
+        stored_bytes=sum(sum(header.files.values()) for header in headers),
+        sources=_counted(info.source for info in infos),
+        categories=_counted(info.category for info in infos),
+        levels=_counted(str(info.level) for info in infos),
+        suites=_counted(info.suite for info in infos),
+        labels=_counted(entity.label for info in infos for entity in info.entities),
+        moving_cameras=sum(int(moving.sum()) for moving in parts["moving"]),
+        with_depth_sensor=sum(has_sensed_depth(info) for info in infos),
+        visible_share=_share([part for label in LABELS for part in parts[label]]),
+        visible_share_by_label={n: _share(parts[n]) for n in LABELS if sum(map(len, parts[n]))},
+        never_seen=1 - _share(parts["ever"]),
+        moved_share=_share([motion > 0.1 for motion in parts["motion"]]),
+        motion=Spread.of(parts["motion"]),
+        motion_m=Spread.of(parts["motion_m"]),
+        diagonal_m=Spread.of(objects.values()),
+        distance_m=Spread.of(parts["distance_m"]),
+        image_px=_counted(f"{h.cameras[0].width} x {h.cameras[0].height}" for h in headers if h.cameras),
+        depth_missing_share=_ratio(missing, every),
+        depth_missing_share_on_object=_ratio(missing_on_object, on_object),
+    )
 
 
 def _counted(values: Iterable[str]) -> dict[str, int]:
@@ -199,4 +188,4 @@ def _share(parts: list[np.ndarray]) -> float:
 
 
 def _ratio(part: int, whole: int) -> float:
-    return float(part / whole) if whole else float("nan")
+    return part / whole if whole else float("nan")

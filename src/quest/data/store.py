@@ -6,16 +6,18 @@ files. Writing is atomic: a take is there as a whole or not at all (:mod:`quest.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from quest.data.store_location import SUFFIX, Draft, LocalFolder, Location, StoreError, open_location
+from quest.data.frame_source import FrameSource, Reader, ReadOptions, source_of_clip
+from quest.data.store_location import SUFFIX, LocalFolder, Location, StoreError, open_location
 from quest.data.take_format import (
     HEADER_FILE,
     REMEDY,
@@ -23,7 +25,6 @@ from quest.data.take_format import (
     VIEW_ARRAYS,
     TakeHash,
     TakeHeader,
-    check_files,
     check_take,
     decode_depth,
     hash_take,
@@ -33,10 +34,9 @@ from quest.data.take_format import (
 from quest.errors import TakeError
 from quest.types import Clip, Take, TakeInfo, View
 from quest.untrusted import is_name, reading
+from quest.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import zarr
 
 FRAMES_PER_CHUNK = 4
@@ -44,6 +44,8 @@ FRAMES_PER_SHARD = 60
 PIXEL_ARRAYS = ("rgb", "depth", "link_id", "entity_id")
 _MOST_PACKED = 2**16
 """Bytes of an array per byte in its files: zstd packs equal bytes 2^15 times."""
+_NAMED = 8
+"""Takes of a store that a message names."""
 
 
 class TakeStore:
@@ -125,7 +127,11 @@ class TakeStore:
         if data is None and not self._location.is_there(name):
             raise TakeError(f"take {name!r}: no folder {where}; check the name, or generate the take")
         header = parse_header(name, where, data)
-        check_files(name, where, header.files, self._location.sizes(name, header.files))
+        there = self._location.sizes(name, header.files)
+        for path, size in header.files.items():
+            if there.get(path) != size:
+                found = f"has {there[path]} bytes, expected {size}" if path in there else "is missing"
+                raise TakeError(f"take {name!r} is torn: {where}/{path} {found}; {REMEDY}")
         return header
 
     def path(self, name: str) -> Path:
@@ -154,17 +160,15 @@ class TakeStore:
         Raises:
             TakeError: the take is missing, torn or of another format version, or has no such view or frame.
         """
-        header = self.header(name)
-        rows = _frames(name, header, frames)
-        with self._opened(name, header) as stored:
-            arrays = {key: stored.read(key, rows).astype(dtype, copy=False) for key, dtype in TAKE_ARRAYS.items()}
-            chosen = range(len(header.cameras)) if views is None else views
-            parts = tuple(_read_view(stored, name, header, view, rows, arrays["stamp_s"]) for view in chosen)
-        info = header.info
-        if rows.step > 1:
+        with self._opened(name, frames) as stored:
+            arrays = {key: stored.read(key).astype(dtype, copy=False) for key, dtype in TAKE_ARRAYS.items()}
+            chosen = range(len(stored.header.cameras)) if views is None else views
+            parts = tuple(stored.view(view) for view in chosen)
+        info, step = stored.header.info, stored.rows.step
+        if step > 1:
             point = arrays["point_world"]
             arrays["flow_world"] = np.diff(point, axis=0, append=point[-1:])
-            info = replace(info, frames_per_s=info.frames_per_s / rows.step)
+            info = replace(info, frames_per_s=info.frames_per_s / step)
         return Take(info=info, views=parts, **arrays)
 
     def read_view(self, name: str, view: int, *, frames: slice | None = None) -> View:
@@ -173,10 +177,8 @@ class TakeStore:
         Raises:
             TakeError: as :meth:`read`.
         """
-        header = self.header(name)
-        rows = _frames(name, header, frames)
-        with self._opened(name, header) as stored:
-            return _read_view(stored, name, header, view, rows, stored.read("stamp_s", rows))
+        with self._opened(name, frames) as stored:
+            return stored.view(view)
 
     def read_clip(self, name: str, view: int = 0, *, frames: slice | None = None) -> Clip:
         """One camera's frames of a take without any ground truth, loading nothing else.
@@ -184,10 +186,8 @@ class TakeStore:
         Raises:
             TakeError: as :meth:`read`.
         """
-        header = self.header(name)
-        rows = _frames(name, header, frames)
-        with self._opened(name, header) as stored:
-            return _read_clip(stored, name, header, view, rows, stored.read("stamp_s", rows))
+        with self._opened(name, frames) as stored:
+            return stored.clip(view)
 
     def read_small_arrays(self, name: str) -> dict[str, np.ndarray]:
         """Every array of a take but its pixels, by path in the group, such as ``view_0/visible``.
@@ -195,11 +195,12 @@ class TakeStore:
         Raises:
             TakeError: the take is missing, torn or of another format version.
         """
-        header = self.header(name)
         small = [key for key in ("cam_from_world", *VIEW_ARRAYS) if key not in PIXEL_ARRAYS]
-        paths = [*TAKE_ARRAYS, *(f"view_{view}/{key}" for view in range(len(header.cameras)) for key in small)]
-        with self._opened(name, header) as stored:
-            return {path: stored.read(path, slice(None)) for path in paths}
+        with self._opened(name) as stored:
+            views = range(len(stored.header.cameras))
+            return {
+                path: stored.read(path) for path in [*TAKE_ARRAYS, *(f"view_{v}/{k}" for v in views for k in small)]
+            }
 
     def verify(self, name: str) -> None:
         """Read every array of a take and compare with its recorded hash.
@@ -233,8 +234,7 @@ class TakeStore:
                 f"take {name!r}: {self._location.describe(name)} exists and takes are written once; delete it or "
                 "choose another name"
             )
-        with self._location.draft(name) as draft:
-            _write_take(take, draft)
+        self._location.write(name, lambda arrays_at: _take_files(take, arrays_at))
 
     def _folder(self) -> LocalFolder:
         if not isinstance(self._location, LocalFolder):
@@ -257,15 +257,22 @@ class TakeStore:
             return error
 
     @contextmanager
-    def _opened(self, name: str, header: TakeHeader) -> Iterator[_Arrays]:
+    def _opened(self, name: str, frames: slice | None = None) -> Iterator[_Stored]:
         """The open group; damage that only decoding shows becomes a TakeError."""
         import zarr
 
+        header = self.header(name)
+        rows = slice(None) if frames is None else frames
+        picked = range(header.frames)[rows]
+        if len(picked) == 0 or picked.step < 1:
+            raise TakeError(
+                f"take {name!r}: {rows} picks no frame, or runs backwards; it has frames 0 to {header.frames - 1}"
+            )
         where = self._location.describe(name)
         with reading(f"take {name!r}: {where} is torn: an array", TakeError, REMEDY), self._location.reaching():
             store, path = self._location.zarr_group(name, header.arrays_at)
             group = zarr.open_group(store, path=path, mode="r", zarr_format=3, use_consolidated=False)
-            yield _Arrays(group, header)
+            yield _Stored(group, header, slice(picked.start, picked.stop, picked.step))
 
 
 def locate_take(path: str | Path) -> tuple[TakeStore, str]:
@@ -297,25 +304,16 @@ def _check_name(name: str) -> None:
         raise TakeError(f"take {name!r}: a name must not be empty or long, start with a dot or contain a slash")
 
 
-def _frames(name: str, header: TakeHeader, frames: slice | None) -> slice:
-    rows = slice(None) if frames is None else frames
-    picked = range(header.frames)[rows]
-    if len(picked) == 0 or picked.step < 1:
-        raise TakeError(
-            f"take {name!r}: {rows} picks no frame, or runs backwards; it has frames 0 to {header.frames - 1}"
-        )
-    return slice(picked.start, picked.stop, picked.step)
-
-
 @dataclass(frozen=True)
-class _Arrays:
-    """The arrays of a take."""
+class _Stored:
+    """Some frames of an open take."""
 
     group: zarr.Group
     header: TakeHeader
+    rows: slice
 
-    def read(self, path: str, rows: slice) -> np.ndarray:
-        """Some frames of an array; nothing is allocated that its files cannot hold."""
+    def read(self, path: str) -> np.ndarray:
+        """The frames of an array; nothing is allocated that its files cannot hold."""
         array: Any = self.group[path]
         files = f"{self.header.arrays_at}/{path}/".removeprefix("/")
         stored = sum(size for file, size in self.header.files.items() if file.startswith(files))
@@ -324,44 +322,41 @@ class _Arrays:
                 f"take {self.header.info.name!r}: {path} has shape {array.shape} for {self.header.frames} frames in "
                 f"{stored} bytes; {REMEDY}"
             )
-        return np.asarray(array[rows])
+        return np.asarray(array[self.rows])
+
+    @cached_property
+    def stamp_s(self) -> np.ndarray:
+        return self.read("stamp_s")
+
+    def clip(self, view: int) -> Clip:
+        header = self.header
+        if not 0 <= view < len(header.cameras):
+            raise TakeError(f"take {header.info.name!r}: no view {view}; it has views 0 to {len(header.cameras) - 1}")
+        return Clip(
+            name=header.clip_names[view],
+            camera=header.cameras[view],
+            rgb=self.read(f"view_{view}/rgb"),
+            depth_m=decode_depth(self.read(f"view_{view}/depth")) if header.has_depth[view] else None,
+            stamp_s=self.stamp_s,
+            cam_from_world=self.read(f"view_{view}/cam_from_world"),
+        )
+
+    def view(self, view: int) -> View:
+        return View(clip=self.clip(view), **{key: self.read(f"view_{view}/{key}") for key in VIEW_ARRAYS})
 
 
-def _read_clip(arrays: _Arrays, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> Clip:
-    if not 0 <= view < len(header.cameras):
-        raise TakeError(f"take {name!r}: no view {view}; it has views 0 to {len(header.cameras) - 1}")
-    depth_m = decode_depth(arrays.read(f"view_{view}/depth", rows)) if header.has_depth[view] else None
-    return Clip(
-        name=header.clip_names[view],
-        camera=header.cameras[view],
-        rgb=arrays.read(f"view_{view}/rgb", rows),
-        depth_m=depth_m,
-        stamp_s=stamp_s,
-        cam_from_world=arrays.read(f"view_{view}/cam_from_world", rows),
-    )
-
-
-def _read_view(arrays: _Arrays, name: str, header: TakeHeader, view: int, rows: slice, stamp_s: np.ndarray) -> View:
-    clip = _read_clip(arrays, name, header, view, rows, stamp_s)
-    return View(clip=clip, **{key: arrays.read(f"view_{view}/{key}", rows) for key in VIEW_ARRAYS})
-
-
-def _write_take(take: Take, draft: Draft) -> None:
-    """Write all files of a take, the header last."""
+def _take_files(take: Take, arrays_at: str) -> Iterator[tuple[str, bytes | memoryview]]:
+    """All files of a take, the header last."""
     cameras = tuple(view.clip.camera for view in take.views)
     digest = TakeHash(take.info, cameras)
     files: dict[str, int] = {}
-
-    def add(path: str, data: bytes | memoryview) -> None:
-        place = f"{draft.arrays_at}/{path}" if draft.arrays_at else path
-        if place != HEADER_FILE and place not in files:  # every array brings the groups that it lies in
-            files[place] = len(data)
-            draft.add(place, data)
-
     for path, array in take_arrays(take):
         digest.add(path, array)
         for file, data in _encode_array(path, array):
-            add(file, data)
+            place = f"{arrays_at}/{file}" if arrays_at else file
+            if place != HEADER_FILE and place not in files:  # every array brings the groups that it lies in
+                files[place] = len(data)
+                yield place, data
     header = TakeHeader(
         info=take.info,
         frames=len(take),
@@ -370,9 +365,9 @@ def _write_take(take: Take, draft: Draft) -> None:
         has_depth=tuple(view.clip.depth_m is not None for view in take.views),
         data_hash=digest.hexdigest(),
         files=dict(sorted(files.items())),
-        arrays_at=draft.arrays_at,
+        arrays_at=arrays_at,
     )
-    draft.commit(header.to_json())
+    yield HEADER_FILE, header.to_json()
 
 
 def _encode_array(path: str, array: np.ndarray) -> Iterator[tuple[str, memoryview]]:
@@ -406,3 +401,24 @@ def _encode_array(path: str, array: np.ndarray) -> Iterator[tuple[str, memoryvie
         stored[rows] = array[rows]
         for file in list(files):
             yield file, memoryview(files.pop(file).as_numpy_array())
+
+
+def _accepts(where: str) -> bool:
+    """Takes by their name, there or not; and stores of takes, to say which takes are in them."""
+    return where.rstrip("/\\").endswith(SUFFIX) or "://" in where or any(Path(where).glob(f"*{SUFFIX}"))
+
+
+def _open(where: str, options: ReadOptions) -> FrameSource:
+    if where.rstrip("/\\").endswith(SUFFIX):
+        return source_of_clip(open_clip(where, view=options.view))
+    names = TakeStore(where).names()
+    if not names:
+        raise TakeError(f"store {where}: expected a take, and this store has none; generate takes into it")
+    listed = ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+    raise TakeError(
+        f"store {where}: expected a take, and this is a store of {counted(len(names), 'take')} ({listed}); name one, "
+        f"such as {where.rstrip('/')}/{names[0]}{SUFFIX}"
+    )
+
+
+READER = Reader("a take", "STORE/NAME.zarr", _accepts, _open, options=("view",))

@@ -1,7 +1,8 @@
 """Where takes lie: a folder of the file system, or a prefix of an object store.
 
-A location knows nothing of arrays. It lists takes, reads their headers, and receives the files of a new take as a draft
-that becomes a take all at once or not at all.
+A location knows nothing of arrays. It lists takes, reads their headers, and writes the files of a new take so that the
+take is there all at once or not at all. Files come as pairs of a path relative to the take and the content, the header
+last.
 
 An object store is S3 and what speaks its protocol, Google Cloud Storage, Azure, or this process's memory. There is no
 rename, so a take's header is its commit: it is put last, and only where there is none. Each writer puts its files under
@@ -18,7 +19,7 @@ import socket
 import time
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from datetime import timedelta
@@ -36,10 +37,15 @@ if TYPE_CHECKING:
     from zarr.storage import StoreLike
 
 SUFFIX = ".zarr"
+SCHEMES = ("s3", "gs", "az", "memory", "s3a", "adl", "abfs", "abfss")
+Files = Callable[[str], Iterator[tuple[str, bytes | memoryview]]]
+"""Makes the files of a take whose arrays go to a subgroup of some name, or with none directly into the group."""
 
 _TEMPORARY = ".tmp-"
 _ABANDONED_AFTER_S = 24 * 3600.0
 _SYNCS_AT_ONCE = 16
+_PUTS_AT_ONCE = 8
+_memories: dict[str, Any] = {}
 
 
 class StoreError(TakeError):
@@ -59,9 +65,7 @@ def open_location(root: str | Path) -> Location:
     if "://" not in text:
         return LocalFolder(Path(root))
     parts = urlsplit(text)
-    if parts.scheme == "file":
-        return LocalFolder(Path(url2pathname(parts.path)))
-    return ObjectPrefix(text)
+    return LocalFolder(Path(url2pathname(parts.path))) if parts.scheme == "file" else ObjectPrefix(text)
 
 
 class LocalFolder:
@@ -84,8 +88,6 @@ class LocalFolder:
 
     def names(self) -> list[str]:
         """Names of all folders that look like takes, sorted."""
-        if not self.exists():
-            return []
         found = (p for p in self.folder.glob(f"*{SUFFIX}") if p.is_dir() and p.name[0] != ".")
         return sorted(p.name.removesuffix(SUFFIX) for p in found)
 
@@ -123,48 +125,34 @@ class LocalFolder:
         """Zarr store and path in it of the group that holds a take's arrays."""
         return str(self.path(name)), arrays_at
 
-    @contextmanager
-    def draft(self, name: str) -> Iterator[_LocalDraft]:
-        """A new take; what was not committed at the end is removed."""
+    def write(self, name: str, files: Files) -> None:
+        """Write a new take.
+
+        Raises:
+            TakeError: another process wrote one of this name meanwhile.
+        """
         self.folder.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(self.folder)
         temporary = self.folder / f"{_TEMPORARY}{socket.gethostname()}-{os.getpid()}-{uuid.uuid4().hex[:8]}"
         try:
-            yield _LocalDraft(name, temporary, self.path(name))
+            for path, data in files(""):
+                file = temporary / path
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_bytes(data)
+            _sync(temporary)
+            try:
+                temporary.rename(self.path(name))
+            except OSError as error:
+                if self.path(name).exists():
+                    raise _written_meanwhile(self, name) from error
+                raise
+            _sync_folder(self.folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
     def reaching(self) -> AbstractContextManager[None]:
         """Nothing: what the file system says is said."""
         return nullcontext()
-
-
-class _LocalDraft:
-    """A take that is being written; nobody sees it before :meth:`commit`."""
-
-    arrays_at = ""
-    """Subgroup that the arrays go to; empty for the group itself."""
-
-    def __init__(self, name: str, temporary: Path, target: Path) -> None:
-        self._name, self._temporary, self._target = name, temporary, target
-
-    def add(self, path: str, data: bytes | memoryview) -> None:
-        file = self._temporary / path
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(data)
-
-    def commit(self, header: bytes) -> None:
-        self.add(HEADER_FILE, header)
-        _sync(self._temporary)
-        try:
-            self._temporary.rename(self._target)
-        except OSError as error:
-            if self._target.exists():
-                raise TakeError(
-                    f"take {self._name!r}: {self._target} was written by another process meanwhile"
-                ) from error
-            raise
-        _sync_folder(self._target.parent)
 
 
 def _remove_abandoned(root: Path) -> None:
@@ -188,7 +176,7 @@ def _is_running(pid: int) -> bool:
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
+        pass  # of another user
     return True
 
 
@@ -215,18 +203,12 @@ def _sync_folder(folder: Path) -> None:
         _sync_file(folder, os.O_RDONLY)
 
 
-SCHEMES = ("s3", "gs", "az", "memory", "s3a", "adl", "abfs", "abfss")
-
-_PUTS_AT_ONCE = 8
-_memories: dict[str, Any] = {}
-
-
 class ObjectPrefix:
     """Takes under a URL such as ``s3://bucket/takes``.
 
     Endpoint, region and credentials come from the environment, by the names that the provider's own tools use
     (``AWS_ENDPOINT_URL``, ``AWS_ACCESS_KEY_ID``, ``GOOGLE_APPLICATION_CREDENTIALS``, ``AZURE_STORAGE_ACCOUNT_NAME``).
-    ``memory://NAME`` lives as long as the process.
+    ``memory://NAME`` lives as long as the process. Methods are those of :class:`LocalFolder`.
 
     Args:
         url: the place.
@@ -246,7 +228,6 @@ class ObjectPrefix:
                 f"store {url}: expected a folder, file://PATH or {', '.join(SCHEMES[:4])}://BUCKET/PREFIX"
             )
         self._obstore = require("obstore")
-        self._committing: set[str] = set()
         if parts.scheme == "memory":
             self._store = _memories.setdefault(parts.netloc, require("obstore.store").MemoryStore())
             self._prefix = parts.path.strip("/")
@@ -307,10 +288,12 @@ class ObjectPrefix:
             except FileNotFoundError:
                 return None
 
-    def sizes(self, name: str, files: Mapping[str, int]) -> dict[str, int]:
+    def sizes(self, name: str, files: Mapping[str, int] | None = None) -> dict[str, int]:
         """Sizes in bytes of all objects of a take, by path relative to it; one request however many there are."""
         start = len(self._key(name)) + 1
-        return {path[start:]: size for path, size in self._listed(name)}
+        with self.reaching():
+            pages = self._obstore.list(self._store, self._key(name))
+            return {found["path"][start:]: found["size"] for page in pages for found in page}
 
     def zarr_group(self, name: str, arrays_at: str) -> tuple[StoreLike, str]:
         """Zarr store and path in it of the group that holds a take's arrays."""
@@ -318,20 +301,35 @@ class ObjectPrefix:
 
         return ObjectStore(self._store, read_only=True), self._key(name, arrays_at)
 
-    @contextmanager
-    def draft(self, name: str) -> Iterator[_ObjectDraft]:
-        """A new take; what was not committed at the end is removed, unless its header may have arrived all the same."""
+    def write(self, name: str, files: Files) -> None:
+        """Write a new take; what was not committed is removed, unless its header may have arrived all the same."""
         writer = f"written-{uuid.uuid4().hex[:12]}"
-        with self.reaching(), _Upload(self._obstore, self._store) as upload:
+        with self.reaching():
             try:
-                yield _ObjectDraft(self, name, writer, upload)
+                header = self._put_arrays(name, files(writer))
             except BaseException:
-                upload.cancel()
-                if writer not in self._committing:
-                    self._remove(name, lambda path: path.startswith(writer))
+                self._remove(name, lambda path: path.startswith(writer))
                 raise
-            finally:
-                self._committing.discard(writer)
+            self.commit(name, writer, header)
+
+    def _put_arrays(self, name: str, files: Iterator[tuple[str, bytes | memoryview]]) -> bytes:
+        """Put all but the header, which is handed back, a few at a time and no faster than they go."""
+        pending, header = deque[Future[Any]](), b""
+        with ThreadPoolExecutor(_PUTS_AT_ONCE, thread_name_prefix="quest-put") as pool:
+            try:
+                for path, data in files:
+                    if path == HEADER_FILE:
+                        header = bytes(data)
+                        continue
+                    if len(pending) >= 2 * _PUTS_AT_ONCE:
+                        pending.popleft().result()
+                    pending.append(pool.submit(self._obstore.put, self._store, self._key(name, path), data))
+                for put in pending:
+                    put.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)
+                raise
+        return header
 
     def commit(self, name: str, writer: str, header: bytes) -> None:
         """Put a take's header and remove what other writers left.
@@ -341,73 +339,32 @@ class ObjectPrefix:
         """
         errors = require("obstore.exceptions")
         key = self._key(name, HEADER_FILE)
-        self._committing.add(writer)
         try:
             self._obstore.put(self._store, key, header, mode="create")
         except errors.AlreadyExistsError as error:
             if self.header(name) != header:  # else it is ours: the answer to the first attempt was lost on its way
-                self._committing.discard(writer)
-                raise TakeError(
-                    f"take {name!r}: {self.describe(name)} was written by another process meanwhile"
-                ) from error
+                self._remove(name, lambda path: path.startswith(writer))
+                raise _written_meanwhile(self, name) from error
         except errors.NotSupportedError:
             # A store that cannot compare: the last of two writers wins, and neither may remove what the other has put.
             self._obstore.put(self._store, key, header)
             return
         self._remove(name, lambda path: path != HEADER_FILE and not path.startswith(writer))
 
-    def _remove(self, name: str, which: Any) -> None:
-        start = len(self._key(name)) + 1
+    def _remove(self, name: str, which: Callable[[str], bool]) -> None:
         try:
-            keys = [path for path, _ in self._listed(name) if which(path[start:])]
+            keys = [self._key(name, path) for path in self.sizes(name) if which(path)]
             if keys:
                 self._obstore.delete(self._store, keys)
         except (require("obstore.exceptions").BaseError, TakeError, OSError):
             pass  # rubbish in nobody's way; the take itself is either there or not
 
-    def _listed(self, name: str) -> list[tuple[str, int]]:
-        with self.reaching():
-            pages = self._obstore.list(self._store, self._key(name))
-            return [(found["path"], found["size"]) for page in pages for found in page]
-
     def _key(self, name: str, path: str = "") -> str:
         return "/".join(filter(None, (self._prefix, f"{name}{SUFFIX}", path)))
 
 
-class _ObjectDraft:
-    def __init__(self, place: ObjectPrefix, name: str, writer: str, upload: _Upload) -> None:
-        self._place, self._name, self.arrays_at, self._upload = place, name, writer, upload
-
-    def add(self, path: str, data: bytes | memoryview) -> None:
-        self._upload.add(self._place._key(self._name, path), data)
-
-    def commit(self, header: bytes) -> None:
-        self._upload.finish()
-        self._place.commit(self._name, self.arrays_at, header)
-
-
-class _Upload(AbstractContextManager["_Upload"]):
-    """Puts objects a few at a time, and no faster than they go."""
-
-    def __init__(self, obstore: Any, store: Any) -> None:
-        self._obstore, self._store = obstore, store
-        self._pool = ThreadPoolExecutor(_PUTS_AT_ONCE, thread_name_prefix="quest-put")
-        self._pending: deque[Future[Any]] = deque()
-
-    def add(self, key: str, data: bytes | memoryview) -> None:
-        if len(self._pending) >= 2 * _PUTS_AT_ONCE:
-            self._pending.popleft().result()
-        self._pending.append(self._pool.submit(self._obstore.put, self._store, key, data))
-
-    def finish(self) -> None:
-        while self._pending:
-            self._pending.popleft().result()
-
-    def cancel(self) -> None:
-        self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def __exit__(self, *exception: object) -> None:
-        self._pool.shutdown(wait=True)
+def _written_meanwhile(location: Location, name: str) -> TakeError:
+    return TakeError(f"take {name!r}: {location.describe(name)} was written by another process meanwhile")
 
 
 def _brief(error: Exception) -> str:
@@ -418,4 +375,3 @@ def _brief(error: Exception) -> str:
 
 
 Location = LocalFolder | ObjectPrefix
-Draft = _LocalDraft | _ObjectDraft

@@ -61,9 +61,9 @@ class TakeHeader:
     arrays_at: str = ""
     """Subgroup that holds the arrays; empty where they lie directly in the group."""
 
-    def to_attributes(self) -> dict[str, Any]:
-        """JSON-serialisable attributes of the group."""
-        return {
+    def to_json(self) -> bytes:
+        """The file :data:`HEADER_FILE` of the group."""
+        attributes = {
             "format": FORMAT,
             "version": 2 if self.arrays_at else 1,
             "depth_scale_m": DEPTH_SCALE_M,
@@ -77,34 +77,32 @@ class TakeHeader:
             "files": dict(self.files),
             **({"arrays_at": self.arrays_at} if self.arrays_at else {}),
         }
-
-    def to_json(self) -> bytes:
-        """The file :data:`HEADER_FILE` of the group."""
-        group = {"attributes": self.to_attributes(), "zarr_format": 3, "node_type": "group"}
-        return json.dumps(group, indent=2).encode()
-
-    @classmethod
-    def from_attributes(cls, attributes: Mapping[str, Any]) -> TakeHeader:
-        """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
-        views = build(list[dict], attributes["views"], "views")
-        header = cls(
-            info=info_from_json(attributes["info"]),
-            frames=build(int, attributes["frames"], "frames"),
-            cameras=tuple(build(Camera, view["camera"], "camera") for view in views),
-            clip_names=tuple(build(str, view["name"], "name of a view") for view in views),
-            has_depth=tuple(build(bool, view["has_depth"], "has_depth") for view in views),
-            data_hash=build(str, attributes["data_hash"], "data_hash"),
-            files=build(dict[str, int], attributes["files"], "files"),
-            arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
-        )
-        if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
-            raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
-        return header
+        return json.dumps({"attributes": attributes, "zarr_format": 3, "node_type": "group"}, indent=2).encode()
 
 
-def info_from_json(fields: Mapping[str, Any]) -> TakeInfo:
-    """The inverse of ``dataclasses.asdict`` on a :class:`TakeInfo` that went through JSON."""
-    return build(TakeInfo, fields, "info")
+@dataclass(frozen=True)
+class _View:
+    name: str
+    camera: Camera
+    has_depth: bool
+
+
+def _header(attributes: Mapping[str, Any]) -> TakeHeader:
+    """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
+    views = build(list[_View], attributes["views"], "views")
+    header = TakeHeader(
+        info=build(TakeInfo, attributes["info"], "info"),
+        frames=build(int, attributes["frames"], "frames"),
+        cameras=tuple(view.camera for view in views),
+        clip_names=tuple(view.name for view in views),
+        has_depth=tuple(view.has_depth for view in views),
+        data_hash=build(str, attributes["data_hash"], "data_hash"),
+        files=build(dict[str, int], attributes["files"], "files"),
+        arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
+    )
+    if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
+        raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
+    return header
 
 
 def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
@@ -133,28 +131,12 @@ def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
             f"{' or '.join(map(str, VERSIONS))}; generate it again, or use the version of quest that wrote it"
         )
     with reading(file, TakeError, REMEDY):
-        header = TakeHeader.from_attributes(attributes)
+        header = _header(attributes)
     if header.info.name != name or not is_name(name):
         raise TakeError(f"{file} is of a take of another name, {header.info.name!r}; give its folder that name")
     if outside := [path for path in header.files if not is_inside(path)]:
         raise TakeError(f"{file} lists files outside of the take, such as {outside[0]!r}; {REMEDY}")
     return header
-
-
-def check_files(name: str, where: str, files: Mapping[str, int], found: Mapping[str, int]) -> None:
-    """Raise TakeError unless every listed file is there with its listed size.
-
-    Args:
-        name: name of the take.
-        where: the take's folder or URL, for messages.
-        files: sizes that the header lists, by relative path.
-        found: sizes of the files that are there.
-    """
-    for path, size in files.items():
-        if path not in found:
-            raise TakeError(f"take {name!r} is torn: {where}/{path} is missing; {REMEDY}")
-        if found[path] != size:
-            raise TakeError(f"take {name!r} is torn: {where}/{path} has {found[path]} bytes, expected {size}; {REMEDY}")
 
 
 def encode_depth(depth_m: np.ndarray) -> np.ndarray:
@@ -219,26 +201,25 @@ def hash_take(take: Take) -> str:
 def check_take(take: Take) -> None:
     """Raise InputError if the arrays of a take contradict each other or its description."""
     frames, entities, joints = len(take), len(take.info.entities), len(take.info.joints)
-    expected = {
-        "point_world": (frames, entities, 3),
-        "flow_world": (frames, entities, 3),
-        "link_pose": (frames, take.link_pose.shape[1] if take.link_pose.ndim == 4 else -1, 4, 4),
-        "joint_position": (frames, joints),
-        "joint_velocity": (frames, joints),
-        "joint_axis": (frames, joints, 6),
-    }
-    found = {name: getattr(take, name).shape for name in expected}
+    links = take.link_pose.shape[1] if take.link_pose.ndim == 4 else -1
+    checked: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
+        ("point_world", take.point_world, (frames, entities, 3)),
+        ("flow_world", take.flow_world, (frames, entities, 3)),
+        ("link_pose", take.link_pose, (frames, links, 4, 4)),
+        ("joint_position", take.joint_position, (frames, joints)),
+        ("joint_velocity", take.joint_velocity, (frames, joints)),
+        ("joint_axis", take.joint_axis, (frames, joints, 6)),
+    ]
     for v, view in enumerate(take.views):
-        expected[f"view {v} rgb"] = (frames, *view.clip.rgb.shape[1:3], 3)
-        expected[f"view {v} uv_px"] = (frames, entities, 2)
-        expected[f"view {v} visible"] = (frames, entities)
-        expected[f"view {v} link_id"] = expected[f"view {v} entity_id"] = expected[f"view {v} rgb"][:3]
-        found[f"view {v} rgb"] = view.clip.rgb.shape
-        found |= {f"view {v} {name}": getattr(view, name).shape for name in VIEW_ARRAYS}
+        size = view.clip.rgb.shape[1:3]
+        shapes = {"uv_px": (frames, entities, 2), "visible": (frames, entities)}
+        shapes |= dict.fromkeys(("link_id", "entity_id"), (frames, *size))
+        checked.append((f"view {v} rgb", view.clip.rgb, (frames, *size, 3)))
+        checked += [(f"view {v} {name}", getattr(view, name), shape) for name, shape in shapes.items()]
         if not np.array_equal(view.clip.stamp_s, take.stamp_s):
             raise InputError(f"take {take.info.name!r}: view {v} has other time stamps than the take; views share them")
-    for name, shape in expected.items():
-        if found[name] != shape:
-            raise InputError(f"take {take.info.name!r}: {name} has shape {found[name]}, expected {shape}")
+    for name, array, shape in checked:
+        if array.shape != shape:
+            raise InputError(f"take {take.info.name!r}: {name} has shape {array.shape}, expected {shape}")
     if frames == 0 or not take.views:
         raise InputError(f"take {take.info.name!r}: expected at least one frame and one view")

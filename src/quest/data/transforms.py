@@ -5,7 +5,7 @@ Reference: Foote, "tf: the transform library", 2013.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, insort
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -22,47 +22,50 @@ _KEEP_NS = 30_000_000_000
 """How long what moved is remembered."""
 
 
+Sample = tuple[int, np.ndarray, np.ndarray]
+"""Time in nanoseconds, position, and quaternion x, y, z, w."""
+
+
+def _stamp_ns(sample: Sample) -> int:
+    return sample[0]
+
+
 @dataclass
 class Edge:
     """One frame in another over time."""
 
     parent: str
     static: bool
-    stamp_ns: list[int] = field(default_factory=list)
-    position: list[np.ndarray] = field(default_factory=list)
-    quaternion: list[np.ndarray] = field(default_factory=list)
+    samples: list[Sample] = field(default_factory=list)
+    """By time; one if it is static."""
 
-    def add(self, stamp_ns: int, position: np.ndarray, quaternion: np.ndarray) -> None:
+    def add(self, sample: Sample) -> None:
         """Take one more sample."""
         if self.static:
-            self.stamp_ns, self.position, self.quaternion = [stamp_ns], [position], [quaternion]
-            return
-        at = bisect_right(self.stamp_ns, stamp_ns)
-        self.stamp_ns.insert(at, stamp_ns)
-        self.position.insert(at, position)
-        self.quaternion.insert(at, quaternion)
+            self.samples.clear()
+        insort(self.samples, sample, key=_stamp_ns)
 
     def at(self, stamp_ns: int) -> np.ndarray:
         """``parent_from_child``: between two samples on the line and the shortest arc, outside that of the nearest."""
-        after = min(bisect_left(self.stamp_ns, stamp_ns), len(self.stamp_ns) - 1)
-        before = max(after - 1, 0) if self.stamp_ns[after] > stamp_ns else after
-        first_ns, last_ns = self.stamp_ns[before], self.stamp_ns[after]
+        after = min(bisect_left(self.samples, stamp_ns, key=_stamp_ns), len(self.samples) - 1)
+        before = max(after - 1, 0) if self.samples[after][0] > stamp_ns else after
+        (first_ns, *first), (last_ns, *last) = self.samples[before], self.samples[after]
         share = 0.0 if last_ns == first_ns else (stamp_ns - first_ns) / (last_ns - first_ns)
-        rotations = Rotation.from_quat(np.stack((self.quaternion[before], self.quaternion[after])))
         matrix = np.eye(4)
-        matrix[:3, :3] = Slerp([0.0, 1.0], rotations)(share).as_matrix()
-        matrix[:3, 3] = (1 - share) * self.position[before] + share * self.position[after]
+        matrix[:3, :3] = Slerp([0.0, 1.0], Rotation.from_quat(np.stack((first[1], last[1]))))(share).as_matrix()
+        matrix[:3, 3] = (1 - share) * first[0] + share * last[0]
         return matrix
 
     def gap(self, stamp_ns: int) -> float:
         """Seconds to the nearest sample if ``stamp_ns`` lies outside of them, else 0."""
-        return 0.0 if self.static else max(self.stamp_ns[0] - stamp_ns, stamp_ns - self.stamp_ns[-1], 0) * 1e-9
+        outside_ns = max(self.samples[0][0] - stamp_ns, stamp_ns - self.samples[-1][0], 0)
+        return 0.0 if self.static else outside_ns * 1e-9
 
     def forget(self, before_ns: int) -> None:
         """Drop samples that are not needed from a time on."""
-        old = bisect_left(self.stamp_ns, before_ns) - 1
+        old = bisect_left(self.samples, before_ns, key=_stamp_ns) - 1
         if old > 0 and not self.static:
-            del self.stamp_ns[:old], self.position[:old], self.quaternion[:old]
+            del self.samples[:old]
 
 
 class Transforms:
@@ -90,7 +93,7 @@ class Transforms:
             edge = self._edges.get(child)
             if edge is None or edge.parent != parent or edge.static != static:
                 edge = self._edges[child] = Edge(parent, static)
-            edge.add(header_ns(stamped) or log_ns, position, quaternion / norm)
+            edge.add((header_ns(stamped) or log_ns, position, quaternion / norm))
 
     def root(self, frame: str) -> str:
         """The frame that everything around ``frame`` hangs on; itself if nothing is known of it."""

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from quest.data.store import TakeStore
-from quest.data.take_format import DEPTH_SCALE_M, TakeHash, TakeHeader, take_arrays
+from quest.data.take_format import DEPTH_SCALE_M, TAKE_ARRAYS, TakeHash, TakeHeader, take_arrays
 from quest.errors import QuestError
 from quest.types import Joint, Take, TakeInfo, View
 
@@ -65,12 +65,11 @@ class Check:
 def check_truth(take: Take) -> Iterator[Check]:
     """Checks of what is true of the whole take; needs no views."""
     bad = _bad_indices(take)
-    yield _count("indices", len(bad), "; ".join(bad))
-    numbers = ("stamp_s", "point_world", "flow_world", "link_pose", "joint_position", "joint_velocity", "joint_axis")
-    broken = {name: int((~np.isfinite(getattr(take, name))).sum()) for name in numbers}
-    yield _count("finite", sum(broken.values()), ", ".join(name for name, n in broken.items() if n))
+    yield _check("indices", len(bad), where="; ".join(bad))
+    broken = {name: int((~np.isfinite(getattr(take, name))).sum()) for name in TAKE_ARRAYS}
+    yield _check("finite", sum(broken.values()), where=", ".join(name for name, n in broken.items() if n))
     backwards = np.flatnonzero(np.diff(take.stamp_s) <= 0)
-    yield _count("stamps", len(backwards), "" if not len(backwards) else f"after frame {backwards[0]}")
+    yield _check("stamps", len(backwards), where="" if not len(backwards) else f"after frame {backwards[0]}")
     if bad or sum(broken.values()) or len(backwards):
         return  # the others cannot be computed
     yield _check_rotations("link poses", take.link_pose.reshape(-1, 4, 4), len(take))
@@ -108,11 +107,7 @@ def _bad_indices(take: Take) -> list[str]:
     return bad + [f"moved joint {j} of {joints}" for j in take.info.moved_joints if not 0 <= j < joints]
 
 
-def _count(name: str, found: int, where: str) -> Check:
-    return Check(name, found == 0, float(found), 0.0, "", where)
-
-
-def _check(name: str, worst: float, limit: float, unit: str, where: str) -> Check:
+def _check(name: str, worst: float, limit: float = 0.0, unit: str = "", where: str = "") -> Check:
     return Check(name, bool(worst <= limit), float(worst), limit, unit, where)
 
 
@@ -289,7 +284,7 @@ def _check_masks(take: Take, view: View, number: int) -> Check:
     marked = view.entity_id > 0
     wrong = int((links[view.entity_id[marked]] != view.link_id[marked]).sum())
     wrong += int((view.link_id > take.link_pose.shape[1]).sum())
-    return _count("masks", wrong, f"view {number}, pixels that belong to another link" if wrong else f"view {number}")
+    return _check("masks", wrong, where=f"view {number}" + ", pixels that belong to another link" * (wrong > 0))
 
 
 def _place(take: Take, values: np.ndarray) -> str:
@@ -363,8 +358,7 @@ def verify_take(store: TakeStore, name: str) -> TakeReport:
     """Read a take, view by view, and check it."""
     try:
         header = store.header(name)
-        truth = store.read(name, views=[])
-        checks = tuple(_check_take(store, name, header, truth))
+        checks = tuple(_checks(store, name, header))
     except QuestError as error:
         return TakeReport(name, 0, 0, (), " ".join(str(error).split()))
     return TakeReport(name, header.frames, len(header.cameras), checks)
@@ -387,27 +381,20 @@ def verify_store(
     return StoreReport(tuple(done))
 
 
-def _check_take(store: TakeStore, name: str, header: TakeHeader, truth: Take) -> Iterator[Check]:
-    digest = TakeHash(header.info, header.cameras)
+def _checks(store: TakeStore, name: str, header: TakeHeader) -> list[Check]:
+    """All checks of a take, with one view in memory at a time."""
+    truth, digest = store.read(name, views=[]), TakeHash(header.info, header.cameras)
     for path, array in take_arrays(truth):
         digest.add(path, array)
     checks = list(check_truth(truth))
     computable = all(check.passed for check in checks if check.name in ("indices", "finite"))
     for v in range(len(header.cameras)):
         view = store.read_view(name, v)
-        for path, array in _view_arrays(truth, view):
-            digest.add(f"view_{v}/{path}", array)
+        for path, array in take_arrays(replace(truth, views=(view,))):
+            if path.startswith("view_0/"):
+                digest.add(path.replace("view_0", f"view_{v}"), array)
         if computable:
             checks += check_view(truth, view, v)
-    found = digest.hexdigest()
-    same = found == header.data_hash
-    yield Check(
-        "hash", same, float(not same), 0.0, "", "" if same else f"{found[:12]}, recorded {header.data_hash[:12]}"
-    )
-    yield from checks
-
-
-def _view_arrays(truth: Take, view: View) -> Iterator:
-    for path, array in take_arrays(replace(truth, views=(view,))):
-        if path.startswith("view_0/"):
-            yield path.removeprefix("view_0/"), array
+    found, recorded = digest.hexdigest(), header.data_hash
+    where = "" if found == recorded else f"{found[:12]}, recorded {recorded[:12]}"
+    return [_check("hash", found != recorded, where=where), *checks]

@@ -208,7 +208,7 @@ def write_video(
     """
     options = {"crf": str(crf), "preset": preset}
     options |= {} if keyframe_every is None else {"g": str(keyframe_every)}
-    return _encode(path, frames, frames_per_s, _Codec("libx264", options, "rgb24", "yuv420p", "yuv444p"))
+    return _encode(path, frames, frames_per_s, "libx264", options, ("rgb24", "yuv420p", "yuv444p"))
 
 
 def write_depth_video(
@@ -226,41 +226,33 @@ def write_depth_video(
         InputError: no pictures came, or pictures of different sizes.
     """
     options = {"x265-params": "lossless=1:log-level=error", "preset": preset}
-    return _encode(path, codes, frames_per_s, _Codec("libx265", options, "gray12le", "gray12le", "gray12le"))
+    return _encode(path, codes, frames_per_s, "libx265", options, ("gray12le", "gray12le", "gray12le"))
 
 
-@dataclass(frozen=True)
-class _Codec:
-    """How pictures become a video."""
-
-    encoder: str
-    """FFmpeg's name."""
-    options: dict[str, str]
-    """Of the encoder."""
-    source: str
-    """Format of the pictures as they come."""
-    even: str
-    """Format in the file."""
-    odd: str
-    """Format in the file where a side is odd."""
-
-
-def _encode(path: Path, frames: Iterable[np.ndarray], frames_per_s: float, codec: _Codec) -> int:
-    path.parent.mkdir(parents=True, exist_ok=True)
+def _encode(
+    path: Path,
+    frames: Iterable[np.ndarray],
+    frames_per_s: float,
+    encoder: str,
+    options: dict[str, str],
+    formats: tuple[str, str, str],
+) -> int:
+    """Write a video; ``formats`` are those of the pictures as they come, and in the file with even and odd sides."""
+    source, even, odd = formats
     written, size = 0, None
     with whole_file(path) as partial:
         with av.open(str(partial.resolve()), "w") as container:
             rate = Fraction(float(frames_per_s)).limit_denominator(1001)
-            stream = container.add_stream(codec.encoder, rate=rate, options=codec.options)
-            assert isinstance(stream, VideoStream), codec.encoder
+            stream = container.add_stream(encoder, rate=rate, options=options)
+            assert isinstance(stream, VideoStream), encoder
             for frame in frames:
                 if size is None:
                     size = frame.shape
                     stream.height, stream.width = size[:2]
-                    stream.pix_fmt = codec.odd if size[0] % 2 or size[1] % 2 else codec.even
+                    stream.pix_fmt = odd if size[0] % 2 or size[1] % 2 else even
                 if frame.shape != size:
                     raise InputError(f"video {path}: frame {written} is of shape {frame.shape}, the first was {size}")
-                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=codec.source)
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format=source)
                 container.mux(stream.encode(picture))
                 written += 1
             if written:
