@@ -7,7 +7,7 @@ import pytest
 
 from quest.filter.camera_motion import LEAST, estimate_pose, picture_motion
 from quest.filter.local_motion import corners, follow
-from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
+from quest.filter.patches import GRID_PX, patch_motion, tile_motion, tiles
 from quest.filter.rigid_motion import Seen, misfit_unsure, predicted_spread
 from quest.filter.view import View
 from tests.filter.scenes import SIZE, plain, shifted, texture
@@ -57,11 +57,10 @@ def test_a_pose_is_found_among_outliers() -> None:
     pose[:3, 3] = [0.1, -0.05, 0.2]
     uv_px, _ = View(matrix, pose, None).project(points)
     uv_px[:15] += 30
-    estimate = estimate_pose(points, uv_px, matrix, np.eye(4))
-    assert estimate is not None
-    np.testing.assert_allclose(estimate.cam_from_world, pose, atol=1e-3)
-    assert not estimate.inlier[:15].any()
-    assert estimate.inlier[15:].all()
+    estimated = estimate_pose(points, uv_px, matrix, np.eye(4))
+    assert estimated is not None
+    np.testing.assert_allclose(estimated[0], pose, atol=1e-3)
+    assert estimated[1].tolist() == [False] * 15 + [True] * 45
     assert estimate_pose(points[: LEAST - 1], uv_px[: LEAST - 1], matrix, np.eye(4)) is None
 
 
@@ -94,26 +93,11 @@ def test_at_a_seam_the_layer_under_the_query_counts(side: int) -> None:
     motion = patch_motion(plain(one), plain(other), at, at)
     assert np.isfinite(motion.variance).all()
     np.testing.assert_allclose(motion.step_px, [[4.0 if side < 0 else 0.0, 0.0]], atol=0.3)
-
-
-def test_points_that_do_not_belong_to_it_do_not_move_it() -> None:
-    one = shifted(WIDE, 100, 100)
-    other = one.copy()
-    other[:, 4:84] = one[:, :80]
-    at = np.array([[90.0, 60.0]])
-    right = (GRID_PX[:, 0] > 4).astype(float)[None]
-    one, other = plain(one), plain(other)
-    np.testing.assert_allclose(patch_motion(one, other, at, at, right).step_px, [[0, 0]], atol=0.3)
-    assert np.isinf(patch_motion(one, other, at, at, 0 * right).variance).all()
-
-
-def test_looks_correlate() -> None:
-    grey = shifted(WIDE, 100, 100)
-    one, other = (look(tiles(plain(grey), PLACES[i : i + 1])) for i in range(2))
-    assert (one * one).sum() == pytest.approx(1)
-    assert abs((one * other).sum()) < 0.5
-    brighter = (0.5 * grey + 20).astype(np.uint8)
-    assert (one * look(tiles(plain(brighter), PLACES[:1]))).sum() > 0.99
+    if side > 0:  # points that do not belong to it do not move it
+        right = (GRID_PX[:, 0] > 4).astype(float)[None]
+        motion = patch_motion(plain(one), plain(other), at - [8, 0], at - [8, 0], right)
+        np.testing.assert_allclose(motion.step_px, [[0, 0]], atol=0.3)
+        assert np.isinf(patch_motion(plain(one), plain(other), at, at, 0 * right).variance).all()
 
 
 def test_tiles_are_found_again_each_by_itself() -> None:

@@ -77,11 +77,3 @@ def test_queries_come_in_when_they_are_asked_for() -> None:
     np.testing.assert_allclose(tracks.uv_px[5, 0], [90.0, 50.0])
     alone = follow(clip, queries[1:])
     np.testing.assert_array_equal(alone.uv_px[:, 0], tracks.uv_px[:, 1])
-
-
-def test_frames_of_nothing_do_no_harm() -> None:
-    clip = scene(STILL)
-    blank = replace(clip, rgb=np.concatenate([clip.rgb[:4], np.zeros_like(clip.rgb[:6]), clip.rgb[10:]]))
-    tracks = follow(blank, [Query.point(0, *AT)])
-    np.testing.assert_allclose(tracks.uv_px[:, 0], np.tile(AT, (FRAMES, 1)), atol=1.0)
-    assert follow(clip, []).uv_px.shape == (FRAMES, 0, 2)

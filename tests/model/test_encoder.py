@@ -58,16 +58,10 @@ def test_tokens_after_several_blocks_of_pictures_of_any_size():
         read = encoder.depths(rgb.permute(0, 3, 1, 2) / 255, (0, 2))
         assert read.shape == (2, 64, 4, 4)
         torch.testing.assert_close(read[:, 32:].flatten(2).transpose(1, 2), encoder(rgb), **NETWORK)
+        torch.testing.assert_close(encoder(rgb)[1:], encoder(rgb[1:]), **NETWORK)
         assert not torch.allclose(read[:, :32], read[:, 32:], atol=0.1)
         torch.testing.assert_close(read[:, :32].mean(1), torch.zeros(2, 4, 4), **NETWORK)
         assert encoder.depths(torch.rand(1, 3, 32, 96), (1,)).shape == (1, 32, 2, 6)
-
-
-def test_images_of_a_batch_do_not_meet():
-    torch.manual_seed(0)
-    encoder = Encoder(CONFIG).eval()
-    rgb = torch.randint(0, 256, (3, 64, 64, 3), dtype=torch.uint8)
-    torch.testing.assert_close(encoder(rgb)[1:2], encoder(rgb[1:2]), rtol=1e-5, atol=1e-5)
 
 
 def test_same_sizes_stay_as_they_are():

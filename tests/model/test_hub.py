@@ -23,18 +23,20 @@ from tests.tiny import FINDER, make_finder
 ABOUT = "a test | of weights"
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def content(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Weights with everything that a file can hold."""
+    path = tmp_path_factory.mktemp("made") / "w.safetensors"
+    save_network(path, make_finder(), settings='{"bias": 0.1}', about=ABOUT, licence="Apache-2.0", version="1.2")
+    return path.read_bytes()
+
+
+@pytest.fixture
+def file(tmp_path: Path, content: bytes) -> Path:
+    """The same in a folder of a run."""
     path = tmp_path / "run" / "weights.safetensors"
-    save_network(
-        path,
-        make_finder(),
-        settings='{"bias": 0.1}',
-        about=ABOUT,
-        licence="Apache-2.0",
-        version="1.2",
-    )
+    path.parent.mkdir()
+    path.write_bytes(content)
     return path
 
 

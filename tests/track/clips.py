@@ -3,27 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import torch
 
-from quest.model.finder import OPENINGS, FinderConfig
+from quest.model.finder import OPENINGS
 from quest.model.found import LABELS_FOUND, Found, Panels
+from quest.model.xfeat import XFeat
 from quest.monitor import Calibration
 from quest.monitor.statistic import Cusum
-from quest.track import Tracker, TrackerConfig
+from quest.track import Stream, StreamState, Tracker, TrackerConfig
 from quest.track.settings import REVISION
-from quest.types import Clip
+from quest.types import Clip, Query
 from tests.synthetic import make_take
-from tests.tiny import FINDER, make_finder
+from tests.tiny import make_finder
 
 EAGER = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64)
 """Discovery takes whatever is found, which random weights need."""
 
 
-def make_tracker(network: FinderConfig = FINDER, config: TrackerConfig = EAGER, *, seed: int = 0) -> Tracker:
-    """A tracker without a monitor, whose network finds anything."""
-    return Tracker(make_finder(network, seed=seed), config, device=torch.device("cpu"))
+POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
+"""Of :func:`make_clip`."""
+
+finder, features = cache(make_finder), cache(XFeat.from_package)
+
+
+def make_tracker(config: TrackerConfig = EAGER, *, seed: int = 0, **calibrations: Calibration) -> Tracker:
+    """A tracker whose network finds anything; without calibrations nothing is watched."""
+    tracker = Tracker(finder(seed=seed), config, device=torch.device("cpu"), features=features())
+    tracker.calibrations = dict(calibrations)  # type: ignore[assignment]
+    return tracker
+
+
+def feed(stream: Stream, clip: Clip, frames: range, **changes: object) -> list[StreamState]:
+    """Answers to some frames of a clip."""
+    return [stream.step(**{**vars(clip.frame(t)), **changes}) for t in frames]  # type: ignore[arg-type]
 
 
 def make_found(*places: tuple[str, str, tuple[float, float]], p: tuple[float, ...] | None = None) -> Found:

@@ -10,24 +10,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
+from quest.filter.picture import Picture
+from quest.filter.queries import Queries
 from quest.monitor import Alarm, Budget
-from quest.track import Stream, StreamState, Tracker
+from quest.track import StreamState, Tracker
 from quest.track.events import Events
+from quest.track.preprocess import DEPTH_BEGINS_FLAG
+from quest.track.stream import reason
 from quest.types import Clip, Query, State
 from tests.filter.scenes import scene
 from tests.tolerances import PIXEL_MOVED, POINT
-from tests.track.clips import EAGER, make_calibration, make_clip, make_tracker, moved_world, without_depth
-
-POINTS = (Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b", label="knob"))
+from tests.track.clips import EAGER, POINTS, feed, make_calibration, make_clip, make_tracker, moved_world, without_depth
 
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    return make_clip(frames=8)
-
-
-def feed(stream: Stream, clip: Clip, frames: range, **changes) -> list[StreamState]:
-    return [stream.step(**{**vars(clip.frame(t)), **changes}) for t in frames]
+    return make_clip(frames=9)
 
 
 def assert_equal(got: StreamState, expected: StreamState) -> None:
@@ -39,9 +37,7 @@ def assert_equal(got: StreamState, expected: StreamState) -> None:
 
 def watched(alarming: bool = False) -> Tracker:
     """A tracker with a monitor, which finds everything or nothing suspicious."""
-    tracker = make_tracker()
-    tracker.calibrations = {"depth": make_calibration(alarming=alarming)}
-    return tracker
+    return make_tracker(depth=make_calibration(alarming=alarming))
 
 
 @pytest.mark.parametrize(("frame", "flag"), [(1, "late"), (3, "duplicate")])
@@ -57,13 +53,8 @@ def test_late_and_double_frames_repeat_the_answer(frame: int, flag: str, clip: C
 
 def test_double_frames_of_a_clip_are_counted(clip: Clip):
     twice = np.repeat(np.arange(3), 2)
-    assert clip.depth_m is not None
     double = replace(
-        clip,
-        rgb=clip.rgb[twice],
-        depth_m=clip.depth_m[twice],
-        stamp_s=clip.stamp_s[twice],
-        cam_from_world=clip.cam_from_world[twice],
+        clip, **{name: getattr(clip, name)[twice] for name in ("rgb", "depth_m", "stamp_s", "cam_from_world")}
     )
     assert make_tracker().track(double, POINTS).frame_flags == ("duplicate: 3 of 6 frames",)
 
@@ -86,6 +77,27 @@ def test_missing_depth_and_poses_are_flagged(clip: Clip):
     assert "pose" in feed(stream, clip, range(3, 4), cam_from_world=None)[0].flags[0]
     unposed = make_tracker().stream(clip.camera, POINTS)
     assert feed(unposed, clip, range(1), cam_from_world=None)[0].flags == ()
+
+
+def test_depth_that_begins_late_tells_places_from_there_on():
+    clip, tracker = scene(np.zeros(4)), make_tracker()
+    stream = tracker.stream(clip.camera, POINTS)
+    told = [*feed(stream, clip, range(1), depth_m=None), *feed(stream, clip, range(1, 4))]
+    assert np.isnan(told[0].point_world).all()
+    assert [DEPTH_BEGINS_FLAG in state.flags for state in told] == [False, True, False, False]
+    np.testing.assert_allclose(told[-1].point_world, tracker.track(clip, POINTS).point_world[-1], atol=0.01)
+
+
+def test_depth_that_is_not_in_metres(clip: Clip):
+    stream, millimetres = make_tracker().stream(clip.camera, POINTS), 1000 * clip.frame(0).depth_m  # type: ignore[operator]
+    with pytest.raises(InputError, match="expected depth in metres"):
+        feed(stream, clip, range(1), depth_m=millimetres)
+    feed(stream, clip, range(1))
+    state, after = feed(stream, clip, range(1, 2), depth_m=millimetres)[0], feed(stream, clip, range(2, 3))[0]
+    assert any(flag.startswith("depth ignored") for flag in state.flags)
+    assert not state.has_depth
+    assert not any("depth" in flag for flag in after.flags)
+    assert np.isfinite(after.point_world).all()
 
 
 def test_poses_that_begin_late_move_nothing():
@@ -166,8 +178,7 @@ def test_queries_that_are_not_there(clip: Clip):
 
 
 def test_a_label_is_looked_for_in_several_frames(clip: Clip):
-    tracker = make_tracker(config=replace(EAGER, prompt_threshold=1.0))
-    stream = tracker.stream(clip.camera, [Query.semantic("handle")])
+    stream = make_tracker(replace(EAGER, prompt_threshold=1.0)).stream(clip.camera, [Query.semantic("handle")])
     assert feed(stream, clip, range(2))[-1].query == ()
     stream._queries._config = EAGER
     assert feed(stream, clip, range(2, 3))[0].query == (0,)
@@ -180,6 +191,25 @@ def test_ignored_frames_use_up_no_patience(clip: Clip):
     for _ in range(9):
         assert "duplicate" in feed(stream, clip, range(1))[0].flags[0]
     assert feed(stream, clip, range(1, 2))[0].query == (0, number)
+
+
+def test_who_still_looks(clip: Clip):
+    stream = make_tracker(replace(EAGER, prompt_threshold=1.0)).stream(clip.camera, [Query.semantic("knob")])
+    asked = [stream.looking]
+    for t in range(9):
+        feed(stream, clip, range(t, t + 1))
+        asked.append(stream.looking)
+    assert asked == [True] * 9 + [False]
+    assert [q.label for q in stream.unbound] == ["knob"]
+    stream.add(Query.point(20, 9, 9))
+    assert stream.looking
+
+
+def test_a_camera_of_double_precision(clip: Clip):
+    numbers = {name: np.float64(getattr(clip.camera, name)) for name in ("fx", "fy", "cx", "cy")}
+    cameras = clip.camera, replace(clip.camera, **numbers)
+    one, other = (feed(make_tracker().stream(camera, POINTS), clip, range(2))[-1] for camera in cameras)
+    assert_equal(one, other)
 
 
 def test_joints_are_in_the_world(clip: Clip):
@@ -282,8 +312,7 @@ def test_without_alpha_there_are_no_alarms(clip: Clip):
     assert all(s.alarm == (None, None) for s in states)
 
 
-@pytest.mark.parametrize("alarming", [False, True])
-@pytest.mark.parametrize("after", [1, 5])
+@pytest.mark.parametrize(("after", "alarming"), [(1, False), (5, True)])
 def test_a_saved_stream_goes_on_to_the_bit(after: int, alarming: bool, clip: Clip):
     tracker = watched(alarming)
     stream = tracker.stream(clip.camera, [*POINTS, Query.semantic("handle"), Query.point(6, 9, 9, name="late")])
@@ -307,11 +336,25 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.Monk
     stream = tracker.stream(clip.camera, POINTS)
     feed(stream, clip, range(2))
     data = tracker.save(stream)
-    for torn in (b"", b"abc", data[:-7], data[: len(data) // 2]):
-        with pytest.raises(InputError, match="saved stream"):
-            tracker.restore(torn)
     with pytest.raises(InputError, match="other weights, settings"):
-        make_tracker(config=replace(EAGER, bias=0.2)).restore(data)
+        make_tracker(replace(EAGER, bias=0.2)).restore(data)
     monkeypatch.setattr("quest.track.tracker.REVISION", -1)
     with pytest.raises(InputError, match="another revision"):
         tracker.restore(data)
+
+
+def test_why_something_is_lost():
+    at = np.array([[30.0, 30.0]])
+    picture = Picture(np.zeros((64, 64), np.uint8), np.ones((2, 8, 8), np.float32))
+    named = Queries.named(picture, at, np.ones(1), np.zeros((1, 1, 3)), np.zeros((1, 3)))
+    queries = replace(named, rival_px=np.array([[33.0, 34.0]]))
+    for changes, words in (
+        ({"seen_log_odds": -4.0}, "behind something or out of view"),
+        (
+            {"seen_log_odds": -4.0, "unseen_s": 1.24, "rival_log_odds": -1.0},
+            "not seen for 1.2 s where it should be; looks more like what is 5 px away",
+        ),
+        ({"seen_log_odds": 0.5}, "looks little like its anchor"),
+    ):
+        changed = replace(queries, **{name: np.array([value]) for name, value in changes.items()})
+        assert reason(changed, 0, at[0]) == words

@@ -44,15 +44,6 @@ def gaussians(*sigma_m: float) -> np.ndarray:
     return np.array([sigma**2 * np.eye(3) for sigma in sigma_m])
 
 
-def test_one_view_is_believed_as_it_says():
-    point = np.array([[0.1, 0.2, 0.3]])
-    fused = fuse(point, gaussians(0.02), np.array([0.3]), NOISE)
-    np.testing.assert_allclose(fused.point_world, point[0])
-    np.testing.assert_allclose(fused.covariance, gaussians(0.02)[0], atol=1e-12)
-    assert fused.lost_p == pytest.approx(0.3)
-    assert fused.right_p == pytest.approx([0.7])
-
-
 def test_two_views_as_bayes_says():
     point, sigma = np.array([[0.0, 0.0, 1.0], [0.02, 0.0, 1.0]]), (0.01, 0.02)
     fused = fuse(point, gaussians(*sigma), np.array([0.1, 0.2]), NOISE)
@@ -75,13 +66,6 @@ def test_a_view_that_disagrees_is_outvoted():
     np.testing.assert_allclose(fused.point_world, [0.0025, 0, 1], atol=1e-3)
     assert fused.right_p[1] < 0.01
     assert fused.lost_p < 0.01
-
-
-def test_where_two_disagree_the_surer_one_is_believed_and_doubted():
-    point = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0]])
-    fused = fuse(point, gaussians(0.015, 0.015), np.array([0.2, 0.05]), NOISE)
-    np.testing.assert_allclose(fused.point_world, point[1], atol=1e-3)
-    assert 0.15 < fused.lost_p < 0.25
 
 
 def test_the_order_of_views_and_views_without_a_point_do_not_matter():
@@ -199,15 +183,13 @@ def test_frames_are_paired_by_their_stamps(take: Take, tracker: Tracker):
 
 
 def test_alpha_is_split_over_views_and_alarms_need_a_loss(take: Take):
-    tracker = make_tracker()
-    tracker.calibrations = {"depth": make_calibration(alarming=False)}
     clips = clips_of(take)[:2]
-    stream = ViewsStream(tracker, [clip.camera for clip in clips], asked(take), alpha=0.1)
+    calm, alarming = (make_tracker(depth=make_calibration(alarming=each)) for each in (False, True))
+    stream = ViewsStream(calm, [clip.camera for clip in clips], asked(take), alpha=0.1)
     assert [one.budget.alpha for one in stream.streams if one.budget is not None] == [0.05, 0.05]
-    tracker.calibrations = {"depth": make_calibration(alarming=True)}
-    made = track_views(tracker, clips, asked(take), alpha=0.5)
-    assert made.whole.alarm is not None
+    made = track_views(alarming, clips, asked(take), alpha=0.5)
     alarmed = made.whole.alarm
+    assert alarmed is not None
     assert alarmed[-1].all()
     assert (made.whole.state[alarmed] == State.LOST).all()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import torch
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.train.feature_cache import FeatureCache, encode_images
+from quest.viz.contact_sheet import contact_sheet
 from tests.paper.tiny import make_paper
 from tests.synthetic import make_take
 from tests.tolerances import PIXEL
@@ -56,6 +58,23 @@ def test_what_is_cached_is_what_the_take_holds(tmp_path: Path):
         with torch.no_grad():
             expected = make_paper().encode(torch.from_numpy(truth.clip.rgb)).numpy()
         assert np.abs(view.features - expected).max() < 0.1 * np.abs(expected).max()
+
+
+def test_what_is_fixed_in_the_base_has_no_joint(tmp_path: Path):
+    """The last joint is not taken for its."""
+    take, store = make_take(frames=4, views=1, entities=2), TakeStore(tmp_path / "takes")
+    first, second = take.info.entities[:2]
+    rim = replace(second, link=0, joint=-1)
+    assert (rim.fixed, rim.intent, first.fixed, first.intent) == (True, "lift", False, "open")
+    take = replace(take, info=replace(take.info, entities=(first, rim)))
+    store.write(take)
+    assert store.read(NAME).info.entities[1].fixed
+    build(cache := cache_in(tmp_path), store)
+    (view,) = cache.views([NAME])
+    assert view.revolute.tolist() == [False, False]
+    np.testing.assert_array_equal(view.axis_world[0], take.joint_axis[0, first.joint])
+    assert not view.axis_world[1].any()
+    assert contact_sheet(take, columns=2, tile_width_px=64).std() > 0
 
 
 def test_nothing_is_made_twice(tmp_path: Path):

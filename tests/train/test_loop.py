@@ -76,6 +76,7 @@ def test_it_trains(run: Run, tmp_path: Path, precision: str):
     after = weights_of(network)
     assert all(torch.equal(after[n], before[n]) for n in after if n.startswith("encoder."))
     assert any(not torch.equal(after[n], before[n]) for n in after)
+    assert all(p.grad is not None for p in network.trainable()), "DDP waits for the gradient of every parameter"
     assert load_checkpoint(tmp_path / "run" / "best", network, None).step == 2
     assert list((tmp_path / "run" / "curves").iterdir())
 
@@ -142,15 +143,9 @@ def test_micro_batches_add_up_to_the_batch(run: Run):
     whole, reports = run(out="whole")
     parts, same = run(replace(SHORT, accumulate=2), out="parts")
     assert [r.loss for r in same] == approx([r.loss for r in reports], TRAINED)
+    assert same[0].loss == pytest.approx(reports[0].loss, rel=1e-5), "before rounding has led the weights elsewhere"
     for name, tensor in weights_of(whole).items():
         assert torch.allclose(parts.state_dict()[name], tensor, atol=2e-3), name
-
-
-def test_one_step_of_micro_batches_is_exact(run: Run):
-    once = replace(SHORT, steps=1, warmup_steps=1)
-    (_, (whole,)), (_, (parts,)) = run(once, out="whole"), run(replace(once, accumulate=2), out="parts")
-    assert parts.loss == pytest.approx(whole.loss, rel=1e-5)
-    assert parts.best == pytest.approx(whole.best, rel=1e-4)
 
 
 def test_a_batch_that_cannot_be_divided(run: Run):
@@ -177,19 +172,15 @@ def test_deterministic_algorithms_end_with_the_run(run: Run):
     assert not torch.are_deterministic_algorithms_enabled()
 
 
-def test_every_trained_parameter_learns(run: Run):
-    """DDP waits for the gradient of every parameter."""
-    network, _ = run(replace(SHORT, steps=1))
-    assert all(p.grad is not None for p in network.trainable())
-
-
-def test_a_run_of_another_stage_is_not_resumed(run: Run):
+def test_a_run_of_another_stage_or_network_is_not_resumed(run: Run):
     class Other(PaperStageOne):
         name = "other"
 
     run(replace(SHORT, steps=1))
     with pytest.raises(WeightsError, match="paper-stage-1"):
         run(replace(SHORT, steps=1), objective=Other)
+    with pytest.raises(WeightsError):
+        run(network=replace(PAPER, slots=7))
 
 
 def test_a_finished_run_stays_as_it_is(run: Run, tmp_path: Path):
@@ -220,12 +211,6 @@ def test_what_is_set_anew_counts_when_a_run_goes_on(run: Run, monkeypatch: pytes
     assert {group["weight_decay"] for group in seen[0].param_groups} == {0.3}
 
 
-def test_a_run_of_another_network_is_not_resumed(run: Run):
-    run(replace(SHORT, steps=1))
-    with pytest.raises(WeightsError):
-        run(network=replace(PAPER, slots=7))
-
-
 @pytest.mark.parametrize(
     ("scores", "best_step", "stopped"),
     [([0.5, 0.6, 0.5, 0.4], 1, 3), ([0.5, 0.4, 0.6, 0.7], 2, 4), ([float("nan")] * 4, 1, 3)],
@@ -252,23 +237,6 @@ def test_schedule():
     assert rates[:10] == pytest.approx([s / 10 for s in range(1, 11)])
     assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
     assert rates[-1] == pytest.approx(0.05)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"steps": 0},
-        {"patience": 0},
-        {"precision": "16"},
-        {"validate_every": 0},
-        {"accumulate": 0},
-        {"devices": 0},
-        {"average_decay": 1.0},
-    ],
-)
-def test_settings_out_of_range(changes: dict):
-    with pytest.raises(ConfigError):
-        replace(SHORT, **changes)
 
 
 def test_validation_is_the_same_at_every_call(sampler: WindowSampler):

@@ -206,6 +206,13 @@ def test_manifold_loss():
     lives(loss, point)
 
 
+def test_manifold_of_what_is_fixed_is_its_place():
+    rest, ones = torch.tensor([[[0.1, 0.2, 0.3]]]), torch.ones(1, 1, 1) > 0
+    point = rest[:, None] + torch.tensor([0.3, 0.0, 0.4])
+    loss = losses.manifold_loss(point, rest, torch.zeros(1, 1, 6), ~ones[0], torch.tensor([2.0]), ones)
+    assert float(loss) == pytest.approx(0.25)
+
+
 def test_weights_come_from_the_table():
     table = {"near": losses.Loss(2.0, lambda _: torch.zeros(())), "far": losses.Loss(0.5, lambda _: torch.zeros(()))}
     assert losses.weights_of(table, {}) == {"near": 2.0, "far": 0.5}

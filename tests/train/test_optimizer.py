@@ -1,4 +1,4 @@
-"""The optimiser, and what it does with which parameters."""
+"""The optimiser, what it does with which parameters, and the running mean of the weights."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from quest.errors import ConfigError
-from quest.train.optimizer import SHARE, Muon, make_optimizer
+from quest.train.optimizer import SHARE, Muon, RunningMean, make_optimizer
 from quest.train.settings import TrainingConfig
 
 CONFIG = TrainingConfig(learning_rate=1e-2)
@@ -103,3 +103,32 @@ def test_what_is_refined_learns_at_its_share_of_the_rate_by_adamw() -> None:
     ).param_groups
     assert [id(p) for p in slow["params"]] == [id(network.inner.weight)]
     assert (rest[SHARE], slow[SHARE]) == (1, CONFIG.refined_rate)
+
+
+@pytest.mark.parametrize(
+    ("decay", "expected"),
+    [
+        (0.0, 4.0),
+        (0.1, 0.1 * (0.1 * 1 + 0.9 * 2) + 0.9 * 4),
+        # Young means forget faster: the second step keeps 2 / 11 and the third 3 / 12.
+        (0.9, 0.25 * (2 / 11 * 1 + 9 / 11 * 2) + 0.75 * 4),
+    ],
+)
+def test_the_mean_forgets_exponentially(decay: float, expected: float) -> None:
+    parameter = nn.Parameter(torch.zeros(3))
+    mean = RunningMean([parameter], torch.optim.AdamW([parameter]), decay)
+    with mean.applied():
+        assert parameter.tolist() == [0.0] * 3, "what was never learned has no mean"
+    for step, value in enumerate((1.0, 2.0, 4.0), start=1):
+        with torch.no_grad():
+            parameter.fill_(value)
+        mean.update(step)
+
+    def interrupted() -> None:
+        with mean.applied():
+            assert parameter.tolist() == pytest.approx([expected] * 3)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert parameter.tolist() == [4.0] * 3, "the weights come back, also after an error"

@@ -21,21 +21,24 @@ from quest.train.settings import TrainingConfig, WindowConfig
         (TrainingConfig(), "warmup_steps", -1),
         (TrainingConfig(), "seed", -1),
         (TrainingConfig(), "seed", 2**64),
+        (TrainingConfig(), "steps", 0),
+        (TrainingConfig(), "patience", 0),
+        (TrainingConfig(), "validate_every", 0),
+        (TrainingConfig(), "accumulate", 0),
+        (TrainingConfig(), "devices", 0),
+        (TrainingConfig(), "average_decay", 1.0),
+        (TrainingConfig(), "precision", "16"),
+        (TrainingConfig(), "accelerator", "abacus"),
         (WindowConfig(), "batch", 0),
         (WindowConfig(), "max_stride", -1),
         (WindowConfig(), "depth_drop_share", 1.5),
     ],
 )
 def test_settings_out_of_range_are_refused_before_anything_is_prepared(
-    settings: TrainingConfig | WindowConfig, name: str, value: float
+    settings: TrainingConfig | WindowConfig, name: str, value: float | str
 ) -> None:
-    with pytest.raises(ConfigError, match=f"{name} .*got {value}"):
+    with pytest.raises(ConfigError, match=f"(?s)(?=.*{name}).*got .*{value}"):
         replace(settings, **{name: value})
-
-
-def test_an_unknown_accelerator_is_refused() -> None:
-    with pytest.raises(ConfigError, match="abacus"):
-        TrainingConfig(accelerator="abacus")  # type: ignore[arg-type]
 
 
 def test_options_that_would_do_nothing_are_refused() -> None:

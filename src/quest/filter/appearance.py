@@ -46,13 +46,7 @@ class Likeness:
         return cls(picture, cosine.max(axis=1), patch)
 
     def at(self, uv_px: Float[np.ndarray, "K C 2"], noise: Noise, reach_px: int = _REACH_PX) -> Places:
-        """How like the anchor C places of each query are.
-
-        Args:
-            uv_px: pixels.
-            noise: parameters.
-            reach_px: how far off the best correlation may be.
-        """
+        """How like the anchor C places of each query are; the best correlation may be ``reach_px`` off."""
         best_px, wide, near = self.terms(uv_px, reach_px)
         return Places(best_px, noise.look_bias + noise.look_wide * wide + noise.look_near * near)
 

@@ -99,15 +99,10 @@ def update(
     dt_s: float,
     noise: Noise,
 ) -> Bodies:
-    """Take in a body's new pose, to which its prediction was added as a prior, and what the frame told of it.
+    """Take in a body's most probable pose, to which its prediction was added as a prior.
 
-    Args:
-        bodies: as predicted, each about the middle of what told the pose.
-        index: of the body.
-        pose: the most probable one.
-        information: of the frame alone, of a turn about the middle and a shift.
-        dt_s: time since the frame before, seconds.
-        noise: parameters.
+    Bodies are as predicted, each about the middle of what told the pose. The information is of the frame alone, of a
+    turn about the middle and a shift.
     """
     new = {name: value.copy() for name, value in vars(bodies).items()}
     predicted = bodies.covariance[index]
@@ -138,11 +133,7 @@ def at_arm(noise: Noise) -> Float[np.ndarray, "6"]:
 
 
 def on_joint(bodies: Bodies, index: int, noise: Noise) -> tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]]:
-    """How far a body's pose is off its joint's screw, and how firmly the joint holds it there.
-
-    Returns:
-        A turn about the middle and a shift that bring it back, and the information of that.
-    """
+    """A turn about the middle and a shift that bring a body back onto its joint's screw, and their information."""
     size = at_arm(noise)
     value, vector = np.linalg.eigh(bodies.moment[index] * np.outer(size, size))
     if value[-1] <= 0:

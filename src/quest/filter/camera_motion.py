@@ -7,8 +7,6 @@ Reference: Lepetit et al., EPnP, IJCV 2009; Fischler and Bolles, Random sample c
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
@@ -22,31 +20,15 @@ _LEAST_PX = 0.7
 """Error of points that drift together, under which a camera is not said to move."""
 
 
-@dataclass(frozen=True)
-class CameraEstimate:
-    """A pose and what speaks for it."""
-
-    cam_from_world: Float[np.ndarray, "4 4"]
-    inlier: Bool[np.ndarray, " N"]
-    """Points that agree with it."""
-
-
 def estimate_pose(
     point_world: Float[np.ndarray, "N 3"],
     uv_px: Float[np.ndarray, "N 2"],
     matrix: Float[np.ndarray, "3 3"],
     expected: Float[np.ndarray, "4 4"],
-) -> CameraEstimate | None:
-    """The camera's pose from where points of the still world are seen.
+) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " N"]] | None:
+    """The camera's pose from where points of the still world are seen, and which of them agree with it.
 
-    Args:
-        point_world: metres.
-        uv_px: pixels, centres at half-integers.
-        matrix: intrinsics.
-        expected: ``cam_from_world`` to begin with.
-
-    Returns:
-        None where fewer than :data:`LEAST` points agree.
+    The search begins at ``expected``; None where fewer than :data:`LEAST` points agree.
     """
     if len(point_world) < LEAST:
         return None
@@ -62,7 +44,7 @@ def estimate_pose(
     pose[:3, :3], pose[:3, 3] = cv2.Rodrigues(turn)[0], shift[:, 0]
     inlier = np.zeros(len(point_world), dtype=bool)
     inlier[agree] = True
-    return CameraEstimate(pose, inlier)
+    return pose, inlier
 
 
 def stands_still(
@@ -71,15 +53,9 @@ def stands_still(
     before: View,
     after: View,
 ) -> bool:
-    """Whether a new pose explains points no better than the old one.
+    """Whether a new pose explains where points are seen no better than the old one.
 
     It must fit most points at least as well, and all of them by more than six parameters may (Schwarz, 1978).
-
-    Args:
-        point_world: metres.
-        uv_px: pixels where they are seen.
-        before: view under the old pose.
-        after: view under the new one.
     """
     off = [((view.project(point_world)[0] - uv_px) ** 2).sum(axis=-1) for view in (before, after)]
     kept = [np.nan_to_num(each, nan=np.inf).clip(max=INLIER_PX**2) for each in off]
@@ -90,12 +66,7 @@ def stands_still(
 
 
 def picture_motion(from_px: Float[np.ndarray, "N 2"], to_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "3 3"]:
-    """The homography that most points agree on, where no depth says more; the identity where too few do.
-
-    Args:
-        from_px: pixels in one frame.
-        to_px: pixels of the same points in the next one.
-    """
+    """The homography that most points agree on, where no depth says more; the identity where too few do."""
     if len(from_px) < LEAST:
         return np.eye(3)
     motion, _ = cv2.findHomography(from_px, to_px, cv2.RANSAC, INLIER_PX)

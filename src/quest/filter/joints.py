@@ -17,7 +17,7 @@ from quest.filter.landmarks import Landmarks
 from quest.filter.noise import Noise
 from quest.filter.queries import Queries
 from quest.filter.surfaces import depth_error
-from quest.geometry.vectors import cross, perpendicular
+from quest.geometry.vectors import perpendicular
 
 
 class JointKind(StrEnum):
@@ -82,7 +82,7 @@ class Joint:
         if self.kind is JointKind.PRISMATIC:
             return self.rest + q[:, None] * self.axis
         arm = self.rest - self.origin
-        return self.origin + np.cos(q)[:, None] * arm + np.sin(q)[:, None] * cross(self.axis, arm)
+        return self.origin + np.cos(q)[:, None] * arm + np.sin(q)[:, None] * np.cross(self.axis, arm)
 
     def locate(self, points: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, " N"]:
         """Coordinate q of the nearest point of the curve; within [-pi, pi] for turning, 0 for a static point."""
@@ -92,7 +92,7 @@ class Joint:
             return (points - self.rest) @ self.axis
         arm = self.rest - self.origin
         offset = points - self.origin
-        return np.arctan2(offset @ cross(self.axis, arm), offset @ arm)
+        return np.arctan2(offset @ np.cross(self.axis, arm), offset @ arm)
 
     def moved(self, pose: Float[np.ndarray, "4 4"]) -> Joint:
         """The same joint in another world frame, by the rigid motion from this one to that."""

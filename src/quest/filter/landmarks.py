@@ -93,10 +93,7 @@ class Landmarks:
     ) -> Float[np.ndarray, "K B"]:
         """Variance of where each body brings some places, pixels squared.
 
-        Args:
-            place: on each body, metres.
-            error: standard deviation of the places, along the rays on which they were seen, metres in the world.
-            view: of the frame.
+        The error is a standard deviation of each place along the ray on which it was seen, metres in the world.
         """
         bodies, spread = self.bodies, []
         for b, pose in enumerate(bodies.pose):
@@ -105,11 +102,9 @@ class Landmarks:
         return self.world_px2 + np.trace(np.stack(spread, axis=1)[..., :2, :2], axis1=-2, axis2=-1) / 2
 
     def share(self, point: Float[np.ndarray, "K 3"], around: Float[np.ndarray, "N 3"]) -> Float[np.ndarray, "K B"]:
-        """Share of each body in the points near some places.
+        """Share of each body in the landmarks near some places, metres.
 
-        Args:
-            point: the places, metres.
-            around: where the landmarks are: :attr:`rest`, or :attr:`point_world` for what is seen for the first time.
+        The landmarks are ``around``: at :attr:`rest`, or at :attr:`point_world` for what is seen for the first time.
         """
         known = np.flatnonzero(np.isfinite(around).all(axis=-1))
         if len(known) <= _NEIGHBOURS:
@@ -122,16 +117,6 @@ class Landmarks:
         return total / total.sum(axis=1, keepdims=True)
 
 
-@dataclass(frozen=True)
-class CameraMotion:
-    """How the camera moved from one frame to the next."""
-
-    cam_from_world: Float[np.ndarray, "4 4"]
-    """The new pose."""
-    picture: Float[np.ndarray, "3 3"]
-    """Homography of the picture, for places without depth."""
-
-
 def observe(
     landmarks: Landmarks,
     previous: Picture,
@@ -141,18 +126,12 @@ def observe(
     given: Float[np.ndarray, "4 4"] | None,
     dt_s: float,
     noise: Noise,
-) -> tuple[Landmarks, CameraMotion]:
-    """Follow the landmarks into a new frame, and tell the motion of the camera and of the bodies from them.
+) -> tuple[Landmarks, Float[np.ndarray, "4 4"], Float[np.ndarray, "3 3"]]:
+    """Follow landmarks into a frame some time after the previous one, and tell the motion of camera and bodies.
 
-    Args:
-        landmarks: of the previous frame.
-        previous: its picture.
-        picture: that of the new one.
-        old: view of the previous frame.
-        depth_m: of the new one, metres; None without depth.
-        given: the new pose of the camera, where it is known.
-        dt_s: time between both, seconds.
-        noise: parameters.
+    Returns:
+        The landmarks; the camera's pose, which is ``given`` where it is known; and the homography of the picture from
+        the previous frame, for places without depth.
     """
     expected = old if given is None else replace(old, cam_from_world=given)
     landmarks = replace(landmarks, bodies=go_on(landmarks.bodies, dt_s, noise))
@@ -166,22 +145,22 @@ def observe(
     known = True
     if given is None and np.isfinite(moved.place).any():
         rests = (moved.body == 0) & (moved.log_weight[:, 0] > -1) & np.isfinite(moved.place[:, 0]).all(axis=-1)
-        estimate = estimate_pose(moved.place[rests, 0], moved.uv_px[rests], old.matrix, pose)
-        if estimate is None:
-            return landmarks.only(np.zeros(len(covariance), dtype=bool)), CameraMotion(pose, warp)
-        after = replace(old, cam_from_world=estimate.cam_from_world)
+        estimated = estimate_pose(moved.place[rests, 0], moved.uv_px[rests], old.matrix, pose)
+        if estimated is None:
+            return landmarks.only(np.zeros(len(covariance), dtype=bool)), pose, warp
+        after = replace(old, cam_from_world=estimated[0])
         known = stands_still(moved.place[rests, 0], moved.uv_px[rests], old, after)
         if not known:
             pose = after.cam_from_world
             refuted = rests.copy()
-            refuted[rests] = ~estimate.inlier
+            refuted[rests] = ~estimated[1]
             moved = moved.only(~refuted)
     view = View(old.matrix, pose, depth_m)
     if depth_m is not None:
         # What was sown without depth has no place; it is sown anew.
         placed = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
         moved = _observe_bodies(placed, view, known, dt_s, noise)
-    return moved, CameraMotion(pose, warp)
+    return moved, pose, warp
 
 
 def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
@@ -276,8 +255,8 @@ def _refit(
     middle = bodies.middle[index]
     known = np.linalg.inv(bodies.covariance[index][:6, :6])
     joint = on_joint(bodies, index, noise)
-    fitted = fit(place[mine], seen.only(mine), surface, view, bodies.pose[index], middle, known, joint, noise)
-    return update(bodies, index, fitted.pose, fitted.information, dt_s, noise)
+    pose, told = fit(place[mine], seen.only(mine), surface, view, bodies.pose[index], middle, known, joint, noise)
+    return update(bodies, index, pose, told, dt_s, noise)
 
 
 def sow(
@@ -287,15 +266,7 @@ def sow(
     around_px: Float[np.ndarray, "K 2"],
     noise: Noise,
 ) -> Landmarks:
-    """Add corners where there are none, closer together around some places; with depth only where there is any.
-
-    Args:
-        landmarks: of this frame.
-        picture: the frame.
-        view: of it.
-        around_px: where queries are.
-        noise: parameters.
-    """
+    """Add corners where there are none, closer together around the queries; with depth only where there is any."""
     near = np.zeros(picture.grey.shape, dtype=np.uint8)
     for x, y in around_px[np.isfinite(around_px).all(axis=-1)]:
         cv2.circle(near, (int(x), int(y)), _NEAR_PX, 1, -1)

@@ -47,14 +47,7 @@ def follow(
     uv_px: Float[np.ndarray, "N 2"],
     guess_px: Float[np.ndarray, "N 2"],
 ) -> LocalMotion:
-    """Follow points from one frame to the next.
-
-    Args:
-        previous: the frame in which the points are.
-        picture: the next one.
-        uv_px: pixels in ``previous``, centres at half-integers.
-        guess_px: where they are expected in ``picture``.
-    """
+    """Follow points of one frame to the next, where ``guess_px`` expects them; pixel centres are at half-integers."""
     if not len(uv_px):
         return LocalMotion(guess_px, np.zeros(0, dtype=bool), np.zeros((0, 2, 2)))
     there, found, off = _flow(previous.grey, picture.grey, uv_px, guess_px)
@@ -100,17 +93,9 @@ def _covariance(picture: Picture, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.n
 def corners(
     picture: Picture, allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
 ) -> Float[np.ndarray, "N 2"]:
-    """The best corners of a frame, at most ``count``, no two nearer than a cell is wide.
-
-    Args:
-        picture: the frame.
-        allowed: where corners are wanted.
-        cell_px: least distance.
-        count: how many at most.
-    """
-    if count < 1:
-        return np.zeros((0, 2))
-    found = cv2.goodFeaturesToTrack(picture.grey, count, 0.003, cell_px, mask=allowed.astype(np.uint8))
+    """The best corners where they are allowed, at most ``count``, no two nearer than a cell is wide."""
+    mask = allowed.astype(np.uint8)
+    found = None if count < 1 else cv2.goodFeaturesToTrack(picture.grey, count, 0.003, cell_px, mask=mask)
     if found is None:
         return np.zeros((0, 2))
     uv_px = np.asarray(found, dtype=np.float64)[:, 0] + 0.5

@@ -47,14 +47,9 @@ def patch_motion(
     guess_px: Float[np.ndarray, "K 2"],
     share: Float[np.ndarray, "K P"] | None = None,
 ) -> PatchMotion:
-    """Follow the patch around each place.
+    """Follow the patch around each place of ``previous`` to ``picture``, where ``guess_px`` expects it.
 
-    Args:
-        previous: the frame in which the places are.
-        picture: the frame in which they are looked for.
-        uv_px: places in ``previous``.
-        guess_px: where they are expected in ``picture``.
-        share: how far each point of :data:`GRID_PX` belongs to what is followed, 0 to 1; all do by default.
+    ``share`` says how far each point of :data:`GRID_PX` belongs to what is followed, 0 to 1; all do by default.
     """
     start, guess = ((each[:, None] + GRID_PX).reshape(-1, 2) for each in (uv_px, guess_px))
     motion = follow(previous, picture, start, guess)
@@ -91,13 +86,7 @@ def tiles(picture: Picture, uv_px: Float[np.ndarray, "K 2"]) -> UInt8[np.ndarray
 
 
 def tile_motion(tile: UInt8[np.ndarray, "K S S"], picture: Picture, guess_px: Float[np.ndarray, "K 2"]) -> PatchMotion:
-    """Find the middle of each tile again: how far it is from where it is expected.
-
-    Args:
-        tile: of :func:`tiles`, of any frames.
-        picture: the frame in which they are looked for.
-        guess_px: where they are expected.
-    """
+    """Find the middle of each tile, which may be of any frame, again: how far it is from where it is expected."""
     middle = np.stack([(np.arange(len(tile)) + 0.5) * _TILE_PX, np.full(len(tile), _TILE_PX / 2)], axis=-1)
     both = (tile, tiles(picture, guess_px))
     before, now = (Picture(np.hstack(tuple(each)), picture.descriptors) for each in both)

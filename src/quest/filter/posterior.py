@@ -56,13 +56,7 @@ class _Places:
 def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, dt_s: float, noise: Noise) -> Queries:
     """Which hypotheses explain the frame; what is out of question begins anew at the best.
 
-    Args:
-        queries: with their own patches followed into the frame.
-        landmarks: of it.
-        picture: what it shows.
-        view: of it.
-        dt_s: time since the frame before, seconds.
-        noise: parameters.
+    The queries' own patches are followed into the frame already.
     """
     likeness = Likeness.of(picture, queries.descriptor, queries.patch)
     places = _places(queries, landmarks, likeness, view, noise)

@@ -155,16 +155,6 @@ def follow_patches(
     """Where each query's own patch went: its motion since the previous frame, then the anchor's patch around there.
 
     A Kalman filter: what is followed from frame to frame gathers variance, what the anchor finds takes it away.
-
-    Args:
-        queries: as they were in the previous frame.
-        previous: its picture.
-        picture: the new one.
-        expected_px: where the patches are expected there.
-        old: view of the previous frame.
-        view: of the new one.
-        dt_s: time between both, seconds.
-        noise: parameters.
     """
     motion = patch_motion(previous, picture, queries.own_px, expected_px, _of_surface(queries, old, noise))
     depth_m = view.near_depth_at(queries.own_px + motion.step_px)

@@ -79,13 +79,8 @@ def misfit_unsure(
 ) -> Float[np.ndarray, " N"]:
     """The same where pose and places are known up to some error.
 
-    Args:
-        point_world: where the points should be.
-        middle: about which the pose turns.
-        covariance: of a turn about the middle and a shift.
-        error_world: standard deviation of each point's place, along the ray on which it was seen.
-        seen: where they are.
-        view: of the frame.
+    The covariance is of the pose: of a turn about the middle and a shift. ``error_world`` is the standard deviation of
+    each point's place, along the ray on which it was seen.
     """
     off, _ = _linearise(point_world, middle, seen, view)
     spread = seen.spread + predicted_spread(point_world, middle, covariance, error_world, view)
@@ -104,22 +99,10 @@ def predicted_spread(
     error_world: Float[np.ndarray, "N 3"],
     view: View,
 ) -> Float[np.ndarray, "N 3 3"]:
-    """Covariance of pixel and depth of points whose body's pose and places are known up to some error.
-
-    The arguments are those of :func:`misfit_unsure`.
-    """
+    """Covariance of pixel and depth of points, with errors of pose and place as of :func:`misfit_unsure`."""
     jacobian = _derivatives(point_world, middle, view)[1]
     own = (jacobian[..., 3:] @ error_world[..., None])[..., 0]
     return jacobian @ covariance @ np.swapaxes(jacobian, -1, -2) + own[:, :, None] * own[:, None]
-
-
-@dataclass(frozen=True)
-class Fitted:
-    """A pose and how well it is told."""
-
-    pose: Float[np.ndarray, "4 4"]
-    information: Float[np.ndarray, "6 6"]
-    """Inverse covariance of a rotation vector about the middle and a shift, by this frame alone."""
 
 
 @dataclass(frozen=True)
@@ -140,7 +123,7 @@ def fit(
     known: Float[np.ndarray, "6 6"],
     joint: tuple[Float[np.ndarray, "6"], Float[np.ndarray, "6 6"]],
     noise: Noise,
-) -> Fitted:
+) -> tuple[Float[np.ndarray, "4 4"], Float[np.ndarray, "6 6"]]:
     """The pose of a body, by Gauss-Newton with robust weights.
 
     Args:
@@ -153,6 +136,9 @@ def fit(
         known: information of ``expected``.
         joint: a turn and a shift from there that a joint asks for, and their information.
         noise: parameters.
+
+    Returns:
+        The pose, and the information of a turn about the middle and a shift by this frame alone.
     """
     pose, change = expected.copy(), np.zeros(6)
     inverse = np.linalg.inv(seen.spread)
@@ -165,16 +151,16 @@ def fit(
         pull = np.einsum("nij,nj->i", weighted, off)
         if len(surface.place):
             normal = surface.normal @ pose[:3, :3].T
-            flat = offsets(move(pose, surface.place), normal, middle + change[3:], view, noise)
-            light = noise.surface * (1 + flat.residual**2 / (scale * _SURFACE_GATE)) ** -2
-            told = told + (flat.jacobian * light[:, None]).T @ flat.jacobian
-            pull = pull + (flat.jacobian * light[:, None]).T @ flat.residual
+            residual, flat = offsets(move(pose, surface.place), normal, middle + change[3:], view, noise)
+            light = noise.surface * (1 + residual**2 / (scale * _SURFACE_GATE)) ** -2
+            told = told + (flat * light[:, None]).T @ flat
+            pull = pull + (flat * light[:, None]).T @ residual
         told, pull = told + joint[1], pull + joint[1] @ (joint[0] - change)
         delta = np.linalg.solve(told + known, pull - known @ change)
         turn = Rotation.from_rotvec(delta[:3]) * Rotation.from_rotvec(change[:3])
         change = np.concatenate([turn.as_rotvec(), change[3:] + delta[3:]])
         pose = _moved(expected, middle, change)
-    return Fitted(pose, told)
+    return pose, told
 
 
 def _moved(
@@ -231,16 +217,9 @@ def align(start: Float[np.ndarray, "*B N 3"], end: Float[np.ndarray, "*B N 3"]) 
 def common_motion(
     start_world: Float[np.ndarray, "N 3"], seen: Seen, view: View, noise: Noise
 ) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " N"]] | None:
-    """The rigid motion that most of some unexplained points share.
+    """The rigid motion from where unexplained points were to where they are seen, and the points that share it.
 
-    Args:
-        start_world: where they were, metres.
-        seen: where they are now, with depth.
-        view: of the frame.
-        noise: parameters.
-
-    Returns:
-        The motion and the points that agree; None where fewer than :data:`LEAST` do.
+    None where fewer than :data:`LEAST` points do.
     """
     count = len(start_world)
     if count < LEAST:
@@ -260,6 +239,6 @@ def common_motion(
     middle = end[inlier].mean(axis=0)
     free, nothing = 1e-6 * np.eye(6), Surface(np.zeros((0, 3)), np.zeros((0, 3)))
     still = np.zeros(6), np.zeros((6, 6))
-    motion = fit(start_world[inlier], seen.only(inlier), nothing, view, pose[best], middle, free, still, noise).pose
+    motion = fit(start_world[inlier], seen.only(inlier), nothing, view, pose[best], middle, free, still, noise)[0]
     inlier = misfit(move(motion, start_world), seen, view) < GATE
     return (motion, inlier) if inlier.sum() >= LEAST else None

@@ -43,13 +43,8 @@ def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterS
     """The state after the first frame, without queries."""
     nowhere = np.zeros((0, 2))
     landmarks = sow(Landmarks.none(), picture, view, nowhere, noise)
-    return FilterState(
-        picture,
-        view,
-        stamp_s,
-        landmarks,
-        Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3))),
-    )
+    queries = Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3)))
+    return FilterState(picture, view, stamp_s, landmarks, queries)
 
 
 def step(
@@ -60,35 +55,30 @@ def step(
     cam_from_world: Float[np.ndarray, "4 4"] | None,
     noise: Noise,
 ) -> FilterState:
-    """Take in a frame.
-
-    Args:
-        state: after the previous one.
-        picture: what it shows.
-        depth_m: metres, 0 where missing; None without depth.
-        stamp_s: time, seconds.
-        cam_from_world: the camera's pose; None to estimate it.
-        noise: parameters.
-    """
+    """Take in the next frame; depth is 0 where missing and None without any, the pose None to estimate it."""
     dt_s = stamp_s - state.stamp_s
-    landmarks, camera = observe(
+    landmarks, pose, warp = observe(
         state.landmarks, state.picture, picture, state.view, depth_m, cam_from_world, dt_s, noise
     )
-    view = View(state.view.matrix, camera.cam_from_world, depth_m)
+    view = View(state.view.matrix, pose, depth_m)
     queries = state.queries.meet(len(landmarks.pose))
     if len(queries):
         body = np.where(queries.rides, queries.body, 0)
-        expected_px = _carried(queries.own_px, body, state, landmarks, view, camera.picture)
+        expected_px = _carried(queries.own_px, body, state, landmarks, view, warp)
         queries = follow_patches(queries, state.picture, picture, expected_px, state.view, view, dt_s, noise)
         queries = weigh(queries, landmarks, picture, view, dt_s, noise)
-    landmarks = sow(landmarks, picture, view, _at(queries, landmarks, view), noise)
-    return FilterState(picture, view, stamp_s, landmarks, queries, camera.picture)
+    landmarks = sow(landmarks, picture, view, _at(queries, landmarks, view)[0], noise)
+    return FilterState(picture, view, stamp_s, landmarks, queries, warp)
 
 
-def _at(queries: Queries, landmarks: Landmarks, view: View) -> Float[np.ndarray, "K 2"]:
-    ride_px, _ = view.project(queries.point_world(landmarks.pose))
+def _at(
+    queries: Queries, landmarks: Landmarks, view: View
+) -> tuple[Float[np.ndarray, "K 2"], Bool[np.ndarray, " K"], Float[np.ndarray, "K 3"], Float[np.ndarray, " K"]]:
+    """Pixels of queries, which of them their bodies carry, and where those would be: world points and depths."""
+    ride = queries.point_world(landmarks.pose)
+    ride_px, ride_depth = view.project(ride)
     rides = queries.rides & np.isfinite(ride_px).all(axis=-1)
-    return np.where(rides[:, None], ride_px, queries.own_px)
+    return np.where(rides[:, None], ride_px, queries.own_px), rides, ride, ride_depth
 
 
 def ask(state: FilterState, uv_px: Float[np.ndarray, "K 2"], noise: Noise) -> FilterState:
@@ -116,11 +106,7 @@ def carry(
 ) -> Float[np.ndarray, "N 2"]:
     """Where pixels of an earlier frame are in a later one: where the body at each went, corrected by its patch.
 
-    Args:
-        old: state after the earlier frame.
-        new: state after the later one.
-        warp: homography of the picture from one to the other: the product of :attr:`FilterState.warp` in between.
-        uv_px: pixels of the earlier frame.
+    The homography from one picture to the other is the product of :attr:`FilterState.warp` in between.
     """
     if old is new or not len(uv_px):
         return uv_px
@@ -184,10 +170,7 @@ class Answer:
 def read_off(state: FilterState, noise: Noise) -> Answer:
     """The more probable place of every query; seen unless out of view, not found, or behind something."""
     queries, view = state.queries, state.view
-    ride = queries.point_world(state.landmarks.pose)
-    ride_px, ride_depth = view.project(ride)
-    rides = queries.rides & np.isfinite(ride_px).all(axis=-1)
-    uv_px = np.where(rides[:, None], ride_px, queries.own_px)
+    uv_px, rides, ride, ride_depth = _at(queries, state.landmarks, view)
     measured = view.near_depth_at(uv_px)
     point = np.where(rides[:, None], ride, view.lift(uv_px, measured))
     hidden = rides & (measured < ride_depth - 3 * depth_error(ride_depth, noise))

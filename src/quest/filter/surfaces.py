@@ -63,18 +63,15 @@ class Surfaces:
 
     def only(self, which: np.ndarray) -> Surfaces:
         """Some of the points."""
-        return Surfaces(self.place[which], self.normal[which], self.log_weight[which])
+        return Surfaces(*(value[which] for value in vars(self).values()))
 
 
 def depth_ratio(
     off_m: Float[np.ndarray, "*N"], spread_m: Float[np.ndarray, "*N"], noise: Noise
 ) -> Float[np.ndarray, "*N"]:
-    """Log-likelihood ratio of a depth that is some way off the predicted one, against any; 0 behind an occluder.
+    """Log-likelihood ratio of a depth against any depth; 0 behind an occluder.
 
-    Args:
-        off_m: measured less predicted depth; NaN where nothing was measured.
-        spread_m: its standard deviation.
-        noise: parameters.
+    ``off_m`` is measured less predicted depth, NaN where nothing was measured, and ``spread_m`` its standard deviation.
     """
     off = off_m / spread_m
     agrees = (1 - noise.stray) * np.exp(-(off**2) / 2) / (np.sqrt(2 * np.pi) * spread_m) + noise.stray / noise.depths_m
@@ -97,13 +94,7 @@ def measure(
 ) -> Surfaces:
     """Weigh the bodies by the depth where they bring each point; drop what is on none of them.
 
-    Args:
-        surfaces: the points.
-        pose: of the bodies.
-        share: how probable each body is there before depth is seen.
-        view: of the frame.
-        dt_s: time since the frame before, seconds.
-        noise: parameters.
+    ``share`` says how probable each body is there before depth is seen.
     """
     if view.depth_m is None or not len(surfaces.place):
         return surfaces
@@ -137,13 +128,8 @@ def sow_surfaces(surfaces: Surfaces, pose: Float[np.ndarray, "B 4 4"], view: Vie
     point, normal = (np.repeat(each[good][:, None], len(pose), axis=1) for each in (point, normal))
     turned = pose.copy()
     turned[:, :3, 3] = 0
-    new = Surfaces(move_back(pose, point), move_back(turned, normal), np.ones((int(good.sum()), len(pose))))
-    return Surfaces(
-        *(
-            np.concatenate([getattr(surfaces, name), getattr(new, name)])[-_MOST:]
-            for name in ("place", "normal", "log_weight")
-        )
-    )
+    new = (move_back(pose, point), move_back(turned, normal), np.ones((int(good.sum()), len(pose))))
+    return Surfaces(*(np.concatenate(each)[-_MOST:] for each in zip(vars(surfaces).values(), new, strict=True)))
 
 
 def _planes(
@@ -175,24 +161,17 @@ def _pixel(depth_m: Float[np.ndarray, "H W"], uv_px: Float[np.ndarray, "*N 2"]) 
     return np.where(inside & (value > 0), value, np.nan)
 
 
-@dataclass(frozen=True)
-class Offsets:
-    """How far M points are from the measured surface."""
-
-    residual: Float[np.ndarray, " M"]
-    """Along the normal, in standard deviations; 0 where nothing was measured."""
-    jacobian: Float[np.ndarray, "M 6"]
-    """By a turn about some middle and a shift."""
-
-
 def offsets(
     point: Float[np.ndarray, "M 3"],
     normal: Float[np.ndarray, "M 3"],
     middle: Float[np.ndarray, "3"],
     view: View,
     noise: Noise,
-) -> Offsets:
-    """Distances of points to the surface that is measured where they are seen."""
+) -> tuple[Float[np.ndarray, " M"], Float[np.ndarray, "M 6"]]:
+    """Distances of points to the measured surface, and their derivatives by a turn about the middle and a shift.
+
+    They are along the normal, in standard deviations; 0 where nothing was measured.
+    """
     assert view.depth_m is not None
     uv_px, depth_m = view.project(point)
     measured = _pixel(view.depth_m, uv_px)
@@ -202,4 +181,4 @@ def offsets(
     spread = depth_error(depth_m, noise) * np.maximum(slant, 0.2)
     told = np.isfinite(off) & (slant > 0)
     jacobian = np.concatenate([np.cross(point - middle, normal), normal], axis=-1) / spread[:, None]
-    return Offsets(np.where(told, off / spread, 0.0), np.where(told[:, None], jacobian, 0.0))
+    return np.where(told, off / spread, 0.0), np.where(told[:, None], jacobian, 0.0)

@@ -122,10 +122,7 @@ class Encoder(nn.Module):
         return x + resize_position(self.position, grid), grid
 
     def load_initial(self, state: Mapping[str, Tensor]) -> None:
-        """Load weights that may have another patch size or position grid; both are resized.
-
-        Args:
-            state: tensors named as in this module; ``patch.weight`` and ``position`` may differ in size.
+        """Load weights named as in this module; ``patch.weight`` and ``position`` may differ in size and are resized.
 
         Raises:
             WeightsError: a tensor is missing, unknown, or of a shape that cannot be resized.
@@ -150,11 +147,6 @@ class Encoder(nn.Module):
 
 def read_into(make: Callable[[], _Module], state: Mapping[str, Tensor], *, what: str) -> _Module:
     """A network with the weights of a file; nothing is allocated before their shapes are known to fit.
-
-    Args:
-        make: makes the network.
-        state: the weights.
-        what: they are, for messages.
 
     Raises:
         WeightsError: names or shapes differ from the network's, or no network can be of such a shape.

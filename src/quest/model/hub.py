@@ -115,50 +115,46 @@ def _answers(hub_id: HubId, token: str | bool | None) -> bool:
     return True
 
 
+_HERE = "(and no file or folder here is called so)"
+_EXPLAINED: tuple[tuple[type[Exception], str], ...] = (  # the first that fits: the second is the parent of the first
+    (GatedRepoError, "the repository is gated; accept the terms on {page}, then log in with `hf auth login`"),
+    (
+        RepositoryNotFoundError,
+        f"{{hub}} has no such model repository, or it is private {_HERE}; check the spelling, or log in with "
+        "`hf auth login`",
+    ),
+    (RevisionNotFoundError, "the repository has no such branch, tag or commit; see {page}"),
+    (
+        RemoteEntryNotFoundError,
+        f"expected a repository with {FILE}, it has none; other formats (pickles above all) are not loaded; write it "
+        "with `quest weights push`",
+    ),
+    (
+        LocalEntryNotFoundError,
+        f"{{hub}} cannot be reached, and the cache ({{cache}}) has no copy {_HERE}; connect once, or pass the path of "
+        "a file",
+    ),
+    (HFValidationError, "not an id of the hub ({said}); expected owner/name"),
+    (LocalTokenNotFoundError, "nobody is logged in; log in with `hf auth login`"),
+    (HfHubHTTPError, "the hub answered with status {status} ({said}); {advice}"),
+    # The connection broke on the way, or the disk is full.
+    (OSError, "cannot be fetched or sent ({said}); connect and try again"),
+    (TransportError, "cannot be fetched or sent ({said}); connect and try again"),
+)
+
+
 @contextmanager
 def explained(hub_id: HubId) -> Iterator[None]:
-    """Turn the hub's errors into ours, which say what to do.
-
-    Args:
-        hub_id: the repository that is spoken with.
-    """
+    """Turn errors of the hub about a repository into ours, which say what to do."""
     try:
         yield
-    except GatedRepoError as error:  # before its parent, RepositoryNotFoundError
-        advice = f"accept the terms on {hub_id.page}, then log in with `hf auth login`"
-        raise WeightsError(f"{hub_id}: the repository is gated; {advice}") from error
-    except RepositoryNotFoundError as error:
-        raise WeightsError(
-            f"{hub_id}: {constants.ENDPOINT} has no such model repository, or it is private (and no file or folder "
-            "here is called so); check the spelling, or log in with `hf auth login`"
-        ) from error
-    except RevisionNotFoundError as error:
-        raise WeightsError(f"{hub_id}: the repository has no such branch, tag or commit; see {hub_id.page}") from error
-    except RemoteEntryNotFoundError as error:
-        raise WeightsError(
-            f"{hub_id}: expected a repository with {FILE}, it has none; other formats (pickles above all) are not "
-            "loaded; write it with `quest weights push`"
-        ) from error
-    except LocalEntryNotFoundError as error:
-        raise WeightsError(
-            f"{hub_id}: {constants.ENDPOINT} cannot be reached, and the cache ({constants.HF_HUB_CACHE}) has no copy "
-            "(and no file or folder here is called so); connect once, or pass the path of a file"
-        ) from error
-    except HFValidationError as error:
-        raise WeightsError(f"{hub_id}: not an id of the hub ({error}); expected owner/name") from error
-    except LocalTokenNotFoundError as error:
-        raise WeightsError(f"{hub_id}: nobody is logged in; log in with `hf auth login`") from error
-    except HfHubHTTPError as error:
-        status = error.response.status_code
+    except tuple(kind for kind, _ in _EXPLAINED) as error:
+        words = next(words for kind, words in _EXPLAINED if isinstance(error, kind))
+        status = error.response.status_code if isinstance(error, HfHubHTTPError) else 0
         advice = "log in with `hf auth login` as someone who may" if status in (401, 403) else "try again later"
-        raise WeightsError(f"{hub_id}: the hub answered with status {status} ({_line(error)}); {advice}") from error
-    except (OSError, TransportError) as error:  # the connection broke on the way, or the disk is full
-        raise WeightsError(f"{hub_id}: cannot be fetched or sent ({_line(error)}); connect and try again") from error
-
-
-def _line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+        said = (str(error).strip().splitlines() or [type(error).__name__])[0]
+        told = {"page": hub_id.page, "hub": constants.ENDPOINT, "cache": constants.HF_HUB_CACHE}
+        raise WeightsError(f"{hub_id}: {words.format(**told, said=said, status=status, advice=advice)}") from error
 
 
 TAGS = ("articulated-objects", "object-tracking", "point-tracking", "rgb-d", "robotics")
@@ -179,17 +175,9 @@ def model_card(
     version: str,
     load_as: str,
 ) -> ModelCard:
-    """Make the card.
+    """A card of weights, with what the hub is told beside the licence.
 
-    Args:
-        data: what the hub is told beside the licence.
-        text: the card's text; None to say what the file holds.
-        config: of the network.
-        about: where the weights come from.
-        settings: of the tracker, as JSON text.
-        licence: of the weights; empty if unknown.
-        version: of the weights; empty if unknown.
-        load_as: what to pass to ``quest.load``.
+    Its text is made from the rest if None; ``load_as`` is what to pass to ``quest.load``.
     """
     header = ModelCardData(**{**data, **_licence(licence)}, ignore_metadata_errors=True)
     if text is None:

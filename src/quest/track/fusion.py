@@ -68,11 +68,8 @@ def fuse(
 ) -> Fused:
     """The most probable place, and how probable it is.
 
-    Args:
-        point_world: of each view, metres; NaN where it has none.
-        covariance: of them, square metres.
-        lost_p: probability that each view has lost the entity, by what it knows alone.
-        noise: parameters; the volume of a lost view's point is the cube of the range of depths of other surfaces.
+    A view's point is NaN where it has none; ``lost_p`` is by what a view knows alone. The volume of a lost view's point
+    is the cube of the range of depths of other surfaces.
     """
     known = np.flatnonzero(np.isfinite(point_world).all(axis=-1))
     right_p = np.zeros(len(point_world))

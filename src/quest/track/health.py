@@ -63,13 +63,9 @@ class Repeats:
     """Whether they do now."""
 
     def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: str) -> bool:
-        """Whether the next one is that before, and this is not what is usual.
+        """Whether the next one, with its digest, is that before, and this is not what is usual.
 
         Without noise, what stands still may be a scene that does.
-
-        Args:
-            data: the next one.
-            digest: of its bytes.
         """
         again, some = digest == self.digest, data[::8, ::8].copy()
         self.runs += self.still and not again
@@ -96,12 +92,7 @@ class Health:
     depths: Repeats = field(default_factory=lambda: Repeats(_STILLEST_DEPTH))
 
     def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: str) -> tuple[tuple[str, ...], bool]:
-        """What is wrong with the next picture, in words, and whether it shows nothing.
-
-        Args:
-            rgb: the picture.
-            digest: of its bytes.
-        """
+        """What is wrong with the next picture, in words, and whether it shows nothing."""
         height, width = rgb.shape[:2]
         cell_px = max(_CELL_PX, max(width, height) / _SIDE)
         cells = np.maximum(np.rint(np.array([width, height]) / cell_px), 2).astype(int)
@@ -119,11 +110,9 @@ class Health:
         return flags, False
 
     def of_depth(self, depth_m: Float32[np.ndarray, "H W"], *, elsewhere: bool) -> str | None:
-        """Why the next depth is not to be used, in words; None if it is.
+        """Why the next depth, metres, is not to be used, in words; None if it is.
 
-        Args:
-            depth_m: the next one, metres.
-            elsewhere: whether the colours say that the camera looks at something else at once: units are not told then.
+        Where the colours say that the camera looks ``elsewhere`` at once, nothing is said of units.
         """
         if elsewhere:
             self.depth_m, self.unit = None, 1.0

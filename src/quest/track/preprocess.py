@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from enum import Enum
 
 import cv2
 import numpy as np
@@ -27,14 +26,6 @@ _LEAST_DEPTHS = 16
 _LATEST_S = 1e12
 """Thirty thousand years."""
 _LEAST_BEYOND = 0.001
-
-
-class Arrival(Enum):
-    """What a frame is to the stream."""
-
-    NEW = "new"
-    LATE = "late"
-    DUPLICATE = "duplicate"
 
 
 @dataclass
@@ -78,14 +69,7 @@ class Prepared:
 
 
 class Preprocessor:
-    """Checks the frames of one stream and prepares them.
-
-    Args:
-        camera: intrinsics of the frames.
-
-    Attributes:
-        camera: the same.
-        state: what the next frame depends on.
+    """Checks the frames of one stream and prepares them; all that the next frame depends on is its ``state``.
 
     Raises:
         InputError: pictures with a side below 16 pixels.
@@ -147,8 +131,8 @@ class Preprocessor:
             )
         return seconds
 
-    def accept(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> Arrival:
-        """Whether a frame is the next one; what comes too late or twice changes nothing.
+    def accept(self, rgb: UInt8[np.ndarray, "H W 3"], stamp_s: float) -> bool:
+        """Whether a frame is the next one; what comes too late or twice changes nothing but the flags.
 
         A stamp that lies more than five seconds back means that the clock began anew: as much time passed as between
         the two frames before.
@@ -158,17 +142,17 @@ class Preprocessor:
         if before is not None and stamp_s < before:
             if before - stamp_s <= _CLOCK_RESTART_S:
                 state.flags = (f"late: {before - stamp_s:.3f} s older than the frame before; ignored",)
-                return Arrival.LATE
+                return False
             state.flags = (f"clock went back by {before - stamp_s:.1f} s",)
         digest = digest_of(rgb)
         if digest == state.digest and stamp_s == before:
             state.flags = ("duplicate: same stamp and colours as the frame before; ignored",)
-            return Arrival.DUPLICATE
+            return False
         if before is not None and stamp_s >= before:
             state.step_s = stamp_s - before
         state.now_s += state.step_s
         state.stamp_s, state.digest = stamp_s, digest
-        return Arrival.NEW
+        return True
 
     def prepare(
         self,
@@ -225,12 +209,7 @@ def grey_of(rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
 
 @torch.inference_mode()
 def to_picture(grey: UInt8[np.ndarray, "H W"], features: XFeat) -> Picture:
-    """What the filter reads of a frame.
-
-    Args:
-        grey: of :func:`grey_of`.
-        features: the network of the descriptors.
-    """
+    """What the filter reads of a frame: grey values, and the descriptors of a network."""
     device = next(features.parameters()).device
     descriptors, _ = features.features(torch.from_numpy(grey).to(device))
     return Picture(grey, descriptors.float().cpu().numpy())

@@ -66,18 +66,9 @@ class QueriesState:
 
 
 class StreamQueries:
-    """Asks, renames and retires the queries of one stream, and binds them to entities.
+    """Asks, renames and retires the queries of one stream, which are its ``state``, and binds them to entities.
 
-    Args:
-        config: settings of discovery.
-        camera: intrinsics of the frames.
-        queries: what to follow; None discovers entities in the first frame.
-
-    Attributes:
-        state: the queries.
-
-    Raises:
-        InputError: a point query lies outside the image.
+    Without queries everything in the first frame is discovered.
     """
 
     def __init__(self, config: TrackerConfig, camera: Camera, queries: Sequence[Query] | None) -> None:
@@ -174,13 +165,9 @@ class StreamQueries:
     def bind(
         self, frame: int, now_s: float, at_px: Float[np.ndarray, "K 2"], see: Callable[[], Found]
     ) -> Float[np.ndarray, "M 2"]:
-        """Queries that find their entity in this frame join those that are followed.
+        """Queries that find their entity in this frame join those that are followed, at ``at_px``.
 
-        Args:
-            frame: its index.
-            now_s: its time, seconds.
-            at_px: where the queries are that are followed, pixels of the source.
-            see: gives what the finder sees in it; asked only where a query looks for an entity.
+        ``see`` gives what the finder sees in it, and is asked only where a query looks for an entity.
 
         Returns:
             Pixels of the new ones.
@@ -201,11 +188,7 @@ class StreamQueries:
         return np.array(pixels, np.float64).reshape(-1, 2)
 
     def discover(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> list[int]:
-        """What is found joins those that are followed, but for what one of them follows already.
-
-        Args:
-            found: entities in this frame, best first.
-            at_px: where the queries are that are followed, pixels of the source.
+        """What is found, best first, joins those that are followed, at ``at_px``, but for what one follows already.
 
         Returns:
             Which of the found ones join.
@@ -228,14 +211,13 @@ class StreamQueries:
         self.state.numbered += 1
         return self.state.numbered - 1
 
-    def _bound(self, waiting: Waiting) -> Following:
-        """A query whose place is told, not found."""
-        query = waiting.query
-        return self._begin(waiting, query.name or f"point {waiting.number}", query.label, query.intent)
-
-    def _begin(self, waiting: Waiting, name: str, label: str | None, intent: str | None) -> Following:
+    def _bound(self, waiting: Waiting, label: str | None = None, intent: str | None = None) -> Following:
+        """A query with the label and intent of what it found; without them its place is told."""
+        query, number = waiting.query, waiting.number
         self.state.waiting = [w for w in self.state.waiting if w is not waiting]
-        return Following(waiting.number, name, label, waiting.query.intent or intent)
+        return Following(
+            number, query.name or f"{label or 'point'} {number}", query.label or label, query.intent or intent
+        )
 
     def _among(
         self, looking: Sequence[Waiting], at_px: Float[np.ndarray, "K 2"], found: Found
@@ -269,8 +251,7 @@ class StreamQueries:
             best = int(fits.argmax()) if len(fits) else -1
             if best >= 0 and fits[best] > config.prompt_threshold:
                 chosen.append(best)
-                label = query.label or likeliest[best]
-                begun.append(self._begin(waiting, query.name or f"{label} {waiting.number}", label, intent[best]))
+                begun.append(self._bound(waiting, query.label or likeliest[best], intent[best]))
         return begun, list(found.uv_px[chosen])
 
     def near(self, found: Found, at_px: Float[np.ndarray, "K 2"]) -> Bool[np.ndarray, "N K"]:

@@ -21,13 +21,9 @@ STANDARD_OUTPUT = Path("-")
 
 
 def state_line(state: StreamState, *, frame: int) -> str:
-    """One frame as one line of JSON, without the line's end; what is unknown (NaN) is null.
+    """A stream's answer to a frame as one line of JSON, without the line's end; what is unknown (NaN) is null.
 
     Numbers that the tracker computes have six significant digits. The fields are listed in ``docs/monitor.md``.
-
-    Args:
-        state: what the stream answered.
-        frame: index of the frame.
     """
     queries = [
         {

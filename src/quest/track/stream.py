@@ -15,6 +15,7 @@ from quest.errors import InputError
 from quest.filter import step as filtering
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
+from quest.filter.queries import Queries
 from quest.filter.step import Answer, FilterState
 from quest.filter.view import View, in_image, move
 from quest.model.finder import FinderNetwork
@@ -22,9 +23,8 @@ from quest.model.found import Found, find
 from quest.model.xfeat import XFeat
 from quest.monitor import Alarm, Budget, Calibration, Inputs, Monitor, MonitorState, probability
 from quest.track.finding import FORGOTTEN, Finding, Looker
-from quest.track.preprocess import Arrival, Prepared, Preprocessor, PreprocessorState, to_picture
+from quest.track.preprocess import Prepared, Preprocessor, PreprocessorState, to_picture
 from quest.track.queries import QueriesState, StreamQueries
-from quest.track.reasons import reason
 from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
 from quest.types import LABELS, Camera, Query, State
@@ -51,14 +51,8 @@ class Memory:
     """From the world of the filter, the first camera's axes, to that of the poses."""
     frame: int = 0
     """Index of the next frame."""
-    stamp_s: float = 0.0
-    """Time of the newest frame."""
-    has_depth: bool = False
-    """Whether the newest frame brought any depth."""
     inputs: Inputs | None = None
     """What the monitor judges by."""
-    flags: tuple[str, ...] = ()
-    """Degradations of the newest frame, in words."""
     answer: StreamState | None = None
     """What was answered in the newest frame."""
     finding: Finding | None = None
@@ -66,22 +60,7 @@ class Memory:
 
 
 class Stream:
-    """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`.
-
-    Args:
-        network: finds entities, in evaluation mode.
-        features: dense features, by which the filter finds again what it follows.
-        noise: parameters of the filter.
-        config: settings of discovery.
-        camera: intrinsics of the frames.
-        queries: what to follow; None discovers entities in the first frame.
-        calibrations: of the monitor, by what frames bring.
-        budget: how often alarms may be false; None for no alarms.
-        finding: how finding goes on, from the first frame on; None where it does not.
-
-    Raises:
-        InputError: a point query lies outside the image, or pictures have a side below 16 pixels.
-    """
+    """Tracks queries through frames that come one by one; made by :meth:`quest.track.Tracker.stream`."""
 
     def __init__(
         self,
@@ -209,8 +188,7 @@ class Stream:
         others = [i for i in range(count) if i != row]
         order = [*range(row), len(others), *range(row, len(others))]
         self._memory.filter = filtering.keep(filtering.ask(filtering.keep(state, others), at_px, self._noise), order)
-        self._watch_new()
-        self._clear(number)
+        self._watch_new(corrected=number)
 
     def confirm(self, query: int | str) -> None:
         """Say that the newest answer to a query is right; an open alarm ends, as in :meth:`place`.
@@ -229,18 +207,17 @@ class Stream:
             self.place(number, *answer.uv_px[row].tolist())
         else:
             memory.filter = filtering.confirm(memory.filter, row)
-            self._clear(number)
+            self._watch_new(corrected=number)
 
-    def _clear(self, number: int) -> None:
-        if self._monitor is not None:
-            self._monitor.clear(number)
-
-    def _watch_new(self) -> None:
-        """The monitor watches what is followed from now on."""
-        if self._monitor is not None:
-            for following in self._queries.state.following:
-                if following.number not in self._monitor.state.name:
-                    self._monitor.watch(following.number, following.name)
+    def _watch_new(self, *, corrected: int | None = None) -> None:
+        """The monitor watches what is followed from now on, and ends the alarm of what somebody has corrected."""
+        if self._monitor is None:
+            return
+        for following in self._queries.state.following:
+            if following.number not in self._monitor.state.name:
+                self._monitor.watch(following.number, following.name)
+        if corrected is not None:
+            self._monitor.clear(corrected)
 
     def on_alarm(self, callback: Callable[[Alarm], None]) -> None:
         """Call a function with every alarm at the end of the step that raises it; it may save the stream.
@@ -275,14 +252,11 @@ class Stream:
         """
         preprocessor, memory = self._preprocessor, self._memory
         stamp_s = preprocessor.check(memory.frame, rgb, depth_m, stamp_s, cam_from_world)
-        arrival = preprocessor.accept(rgb, stamp_s)
+        accepted = preprocessor.accept(rgb, stamp_s)
         memory.frame += 1
-        if arrival is not Arrival.NEW:
-            memory.flags = preprocessor.state.flags
+        if not accepted:
             return self._repeated()
         frame = preprocessor.prepare(rgb, depth_m, cam_from_world)
-        memory.flags, memory.stamp_s = preprocessor.state.flags, stamp_s
-        memory.has_depth = frame.depth_m is not None
         state = self._filter(frame)
         at_px = filtering.read_off(state, self._noise).uv_px
         new_px = self._queries.bind(memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb))
@@ -290,7 +264,7 @@ class Stream:
         if memory.finding is not None:
             memory.filter = self._find(memory.finding, memory.filter, rgb)
         self._watch_new()
-        memory.answer, raised = self._answer(memory.filter)
+        memory.answer, raised = self._answer(memory.filter, stamp_s, has_depth=frame.depth_m is not None)
         for alarm in raised:
             for callback in self._callbacks:
                 try:
@@ -314,7 +288,7 @@ class Stream:
             state = filtering.step(memory.filter, picture, frame.depth_m, now_s, given, self._noise)
         if frame.first_pose is not None:
             memory.world_from_filter = np.linalg.inv(frame.first_pose) @ state.view.cam_from_world
-            memory.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
+            self._preprocessor.state.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
         return state
 
     def _look(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Found:
@@ -348,12 +322,12 @@ class Stream:
         finding.candidates = told.only(left[np.argsort(-told.log_odds[left], kind="stable")][: config.most])
         return filtering.ask(state, now_px[begun], self._noise) if len(begun) else state
 
-    def _answer(self, state: FilterState) -> tuple[StreamState, tuple[Alarm, ...]]:
+    def _answer(self, state: FilterState, stamp_s: float, *, has_depth: bool) -> tuple[StreamState, tuple[Alarm, ...]]:
         """What is said of the newest frame, and the alarms that are raised in it."""
-        memory, following = self._memory, self._queries.state.following
+        memory, following, told = self._memory, self._queries.state.following, self._preprocessor.state
         answer, numbers = filtering.read_off(state, self._noise), [f.number for f in following]
-        lost_p, alarms, raised = self._watch(numbers, answer, state)
-        doubt, blind_s = probability(answer.lost_log_odds), self._preprocessor.state.now_s - state.stamp_s
+        lost_p, alarms, raised = self._watch(numbers, answer, state, stamp_s)
+        doubt, blind_s = probability(answer.lost_log_odds), told.now_s - state.stamp_s
         if blind_s > 0:  # while nothing is seen, everything may come to move
             stays = np.exp(-blind_s / self._noise.hidden_s)
             lost_p, doubt = (1 - (1 - p) * stays for p in (lost_p, doubt))
@@ -364,7 +338,8 @@ class Stream:
         visible = answer.visible & (blind_s <= 0) & ~np.array([alarm is not None for alarm in alarms], bool)
         joints = tuple(None if j is None else j.moved(memory.world_from_filter) for j in answer.joint)
         point = move(memory.world_from_filter, answer.point_world)
-        told = StreamState(
+        tells = told.posed or told.has_depth  # how the camera moves
+        answered = StreamState(
             names=tuple(f.name for f in following),
             labels=tuple(f.label for f in following),
             uv_px=answer.uv_px.astype(np.float32),
@@ -375,28 +350,21 @@ class Stream:
                 State.LOST if gone else State.TRACKING if seen else State.HELD
                 for gone, seen in zip(lost, visible, strict=True)
             ),
-            stamp_s=memory.stamp_s,
-            has_depth=memory.has_depth,
+            stamp_s=stamp_s,
+            has_depth=has_depth,
             query=tuple(numbers),
             joint=joints,
-            q=np.array([_coordinate(j, p) for j, p in zip(joints, point, strict=True)], np.float32),
+            q=np.array([coordinate(j, p) for j, p in zip(joints, point, strict=True)], np.float32),
             lost_log_odds=answer.lost_log_odds.astype(np.float32),
             lost_p=lost_p.astype(np.float32),
             alarm=alarms,
-            cam_from_world=self._camera_pose(state),
-            flags=memory.flags,
+            cam_from_world=state.view.cam_from_world @ np.linalg.inv(memory.world_from_filter) if tells else None,
+            flags=told.flags,
         )
-        return told, raised
-
-    def _camera_pose(self, state: FilterState) -> Float[np.ndarray, "4 4"] | None:
-        """``cam_from_world``; None where nothing tells how the camera moves."""
-        told = self._preprocessor.state
-        if not (told.posed or told.has_depth):
-            return None
-        return state.view.cam_from_world @ np.linalg.inv(self._memory.world_from_filter)
+        return answered, raised
 
     def _watch(
-        self, numbers: list[int], answer: Answer, state: FilterState
+        self, numbers: list[int], answer: Answer, state: FilterState, stamp_s: float
     ) -> tuple[np.ndarray, tuple[Alarm | None, ...], tuple[Alarm, ...]]:
         """Calibrated P(lost), open alarms, and those that are raised now."""
         memory, monitor = self._memory, self._monitor
@@ -405,7 +373,7 @@ class Stream:
             return nothing
         inputs: Inputs = "depth" if self._preprocessor.state.has_depth else "colours"
         if inputs not in self._calibrations:
-            memory.flags += (WITHHELD_FLAG,)
+            self._preprocessor.state.flags += (WITHHELD_FLAG,)
             return nothing
         if inputs != memory.inputs:
             monitor.switch(self._calibrations[inputs])
@@ -415,22 +383,35 @@ class Stream:
             answer.lost_log_odds,
             lambda row: reason(state.queries, row, answer.uv_px[row]),
             frame=memory.frame - 1,
-            stamp_s=memory.stamp_s,
+            stamp_s=stamp_s,
         )
         return verdict.lost_p, verdict.open, verdict.raised
 
     def _repeated(self) -> StreamState:
         """The answer before, of the queries that are still followed, flagged."""
-        memory, following = self._memory, self._queries.state.following
-        if memory.answer is None:
-            raise AssertionError("the first frame is always new")
-        following = [f for f in following if f.number in memory.answer.query]
-        rows = [memory.answer.query.index(f.number) for f in following]
-        return replace(memory.answer.only(rows), names=tuple(f.name for f in following), flags=memory.flags)
+        before, flags = self._memory.answer, self._preprocessor.state.flags
+        assert before is not None, "the first frame is always new"
+        following = [f for f in self._queries.state.following if f.number in before.query]
+        rows = [before.query.index(f.number) for f in following]
+        return replace(before.only(rows), names=tuple(f.name for f in following), flags=flags)
 
 
-def _coordinate(joint: Joint | None, point: Float[np.ndarray, "3"]) -> float:
+def coordinate(joint: Joint | None, point: Float[np.ndarray, "3"]) -> float:
     """Where on its joint a point is, radians or metres; NaN without a joint that moves."""
     if joint is None or joint.kind is JointKind.STATIC:
         return float("nan")
     return float(joint.locate(point[None])[0])
+
+
+def reason(queries: Queries, row: int, uv_px: Float[np.ndarray, "2"]) -> str:
+    """Why the query of a row, which is answered by a pixel, is probably lost: words for who holds the camera."""
+    seen, unseen_s = queries.seen_log_odds[row], queries.unseen_s[row]
+    if seen > 0:
+        why = "looks little like its anchor"
+    elif unseen_s > 0:
+        why = f"not seen for {unseen_s:.1f} s where it should be"
+    else:
+        why = "behind something or out of view"
+    if queries.rival_log_odds[row] < seen:
+        return why
+    return f"{why}; looks more like what is {np.linalg.norm(queries.rival_px[row] - uv_px):.0f} px away"

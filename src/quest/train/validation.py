@@ -59,34 +59,23 @@ def score_windows(
     batches: int,
     device: torch.device,
 ) -> WindowScores:
-    """Scores on the same windows at every call; the network is left in training mode.
-
-    Args:
-        network: what is judged.
-        answered: what it answers on a batch.
-        sampler: of windows.
-        batches: how many.
-        device: where the network is.
-    """
+    """Scores of what a network answers on the same windows at every call; it is left in training mode."""
     rng = np.random.default_rng(0)
     network.eval()
-    px, distance, right, moved = [], [], [], []
+    scores = []
     with torch.no_grad():
         for _ in range(batches):
             frames, truth = sampler.draw(rng, disturb=False)
-            frames, truth = frames.to(device), truth.to(device)
-            scores = _score(answered(frames, truth), sampler.shape.encoder.image_size)
-            for values, value in zip((px, distance, right, moved), scores, strict=True):
-                values.append(value)
+            scores.append(_score(answered(frames.to(device), truth.to(device)), sampler.shape.encoder.image_size))
     network.train()
-    all_px, all_distance, all_moved = torch.cat(px), torch.cat(distance), torch.cat(moved)
+    px, distance, right, moved = (torch.cat(values) for values in zip(*scores, strict=True))
     return WindowScores(
-        median_px=float(all_px.median()) if len(all_px) else math.inf,
-        mean_distance=float(all_distance.mean()),
-        moved_distance=mean_of(all_distance[all_moved]),
-        still_distance=mean_of(all_distance[~all_moved]),
-        right=float(torch.cat(right).mean()),
-        answers=sum(len(d) for d in distance),
+        median_px=float(px.median()) if len(px) else math.inf,
+        mean_distance=float(distance.mean()),
+        moved_distance=mean_of(distance[moved]),
+        still_distance=mean_of(distance[~moved]),
+        right=float(right.mean()),
+        answers=len(distance),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -15,7 +15,6 @@ from quest.geometry import transform
 from quest.model.encoder import EncoderConfig
 from quest.model.frames import FrameBatch, reference_of
 from quest.train.feature_cache import DEPTH_UNIT_M, CachedView
-from quest.train.plan import WindowPlan
 from quest.train.settings import WindowConfig
 
 
@@ -37,6 +36,32 @@ class WindowShape(Protocol):
     def cell_px(self) -> int:
         """Side of the cells over which the reference frame takes its median, pixels of the input."""
         ...
+
+
+@dataclass(frozen=True)
+class WindowPlan:
+    """Which windows a batch is made of, all that is random about them drawn and nothing large read.
+
+    It is drawn for the whole batch from one generator, and can then be divided among processes and micro-batches, which
+    together have exactly the windows, the padding and the disturbances that one process would have had.
+    """
+
+    picks: tuple[tuple[CachedView, list[int]], ...]
+    """A view and frames of it per window: the anchor first, then the window, oldest first."""
+    following: tuple[int, ...]
+    """The frame after the window at the step of its newest frames; -1 where the view has none."""
+    entities: int
+    """Entities of the fullest view of the whole batch, to which all windows are padded."""
+    no_depth: Bool[np.ndarray, " B"]
+    """Windows that lose all depth."""
+
+    def __len__(self) -> int:
+        return len(self.picks)
+
+    def part(self, windows: slice) -> WindowPlan:
+        """Some of the windows, padded and disturbed as in the whole."""
+        own = {name: getattr(self, name)[windows] for name in ("picks", "following", "no_depth")}
+        return replace(self, **own)
 
 
 @dataclass(frozen=True)
