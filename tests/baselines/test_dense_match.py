@@ -40,6 +40,9 @@ def clip() -> Clip:
 def test_a_moved_picture_is_followed_from_any_frame(tracker: DenseMatch, clip: Clip) -> None:
     queries = [Query.point(0, 100.5, 90.25), Query.point(2, 150.0, 70.0)]
     tracks = tracker.track(clip, queries)
+    assert tracker.track(clip, []).uv_px.shape == (4, 0, 2)
+    with pytest.raises(ConfigError, match="xfeat"):
+        tracker.track(clip, [Query.semantic("handle")])
     for k, query in enumerate(queries):
         asked, shift = slice(query.frame, None), SHIFT_PX[query.frame :] - SHIFT_PX[query.frame]
         off_px = np.linalg.norm(tracks.uv_px[asked, k] - (query.uv_px + shift), axis=-1)
@@ -73,12 +76,6 @@ def test_a_match_lies_between_cells_but_not_beyond_the_border() -> None:
     assert similarity.tolist() == [1, 1]
 
 
-@pytest.mark.parametrize("queries", [None, [Query.semantic("handle")]])
-def test_only_points_are_followed(tracker: DenseMatch, clip: Clip, queries: list[Query] | None) -> None:
-    with pytest.raises(ConfigError, match="xfeat"):
-        tracker.track(clip, queries)
-
-
 def test_tokens_find_a_patch_that_moved() -> None:
     """By whole tokens, of ten pixels each, since the weights are random."""
     encoder = make_finder().encoder
@@ -96,7 +93,3 @@ def test_tokens_find_a_patch_that_moved() -> None:
     features = token_features(encoder, rgb[0])
     assert features.shape == (24, 4 * 32, 4 * 40)
     np.testing.assert_allclose(features.norm(dim=0), 1, atol=1e-5)
-
-
-def test_no_queries_have_no_answers(tracker: DenseMatch, clip: Clip) -> None:
-    assert tracker.track(clip, []).uv_px.shape == (4, 0, 2)

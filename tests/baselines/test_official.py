@@ -16,7 +16,7 @@ from quest.baselines import TRACKERS, line_up
 from quest.baselines.cotracker import CoTracker
 from quest.baselines.official import Official, import_code
 from quest.baselines.raft import filled
-from quest.cli.evaluate import _OF_REAL, rival_hashes
+from quest.data.cut import cut_clip
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.types import Camera, Clip, Query, State
 from tests.baselines.stubs import FILES, HIDDEN, MOVE_PX, SIZE, write_rivals
@@ -85,13 +85,7 @@ def test_points_come_and_go_in_source_pixels(rivals: Path, clip: Clip, name: str
 def test_clips_of_any_length(rivals: Path, clip: Clip) -> None:
     (tracker,) = line_up(["cotracker3-online-official"], weights="none", rivals=rivals)
     for frames in (1, 8, 9, 16, 17):
-        short = dataclasses.replace(
-            clip,
-            rgb=clip.rgb[:frames],
-            depth_m=None,
-            stamp_s=clip.stamp_s[:frames],
-            cam_from_world=clip.cam_from_world[:frames],
-        )
+        short = cut_clip(dataclasses.replace(clip, depth_m=None), slice(frames))
         tracks = tracker.track(short, [Query.point(0, 10.0, 60.0)])
         np.testing.assert_allclose(tracks.uv_px[-1, 0], np.add((10, 60), np.multiply(frames - 1, MOVE_PX)), atol=1e-4)
         assert any("without depth" in flag for flag in tracks.frame_flags)
@@ -102,16 +96,9 @@ def test_clips_of_any_length(rivals: Path, clip: Clip) -> None:
 @pytest.mark.usefixtures("installed")
 def test_settings_of_the_published_checkpoints(rivals: Path) -> None:
     made = {t.name: t.network.parts for t in line_up(NAMES, weights="none", rivals=rivals) if isinstance(t, Official)}
-    assert made["tapir-official"] == {"pyramid_level": 0, "extra_convs": False, "use_casual_conv": False}
-    assert made["bootstapir-official"] == {"pyramid_level": 1, "extra_convs": True, "use_casual_conv": False}
-    assert made["bootstapir-online-official"] == {"pyramid_level": 1, "extra_convs": True, "use_casual_conv": True}
-
-
-@pytest.mark.usefixtures("installed")
-def test_the_command_knows_which_weights_answered(rivals: Path) -> None:
-    trackers = line_up(["lk", "raft-official", "tapir-official"], weights="none", rivals=rivals)
-    assert rival_hashes(trackers) == [t.rival_hash for t in trackers if isinstance(t, Official)]
-    assert not any(entry.official for name, entry in TRACKERS.items() if name in _OF_REAL)
+    for name, boots, causal in (("tapir", 0, False), ("bootstapir", 1, False), ("bootstapir-online", 1, True)):
+        own = {"pyramid_level": boots, "extra_convs": bool(boots), "use_casual_conv": causal}
+        assert made[f"{name}-official"] == own
 
 
 def test_official_code_hides_nothing(rivals: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -141,16 +128,13 @@ def test_raft_3d_sees_the_nearest_depth_and_needs_some(rivals: Path, clip: Clip)
         tracker.track(dataclasses.replace(clip, depth_m=None), QUERIES)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_what_is_missing_is_said(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ConfigError, match="--rivals"):
-        line_up([name], weights="none")
+def test_what_is_missing_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torchvision.models", None)
-    with pytest.raises(ConfigError, match="torchvision" if name == "raft-3d-official" else "clone"):
-        line_up([name], weights="none", rivals=tmp_path)
-
-
-def test_code_that_lacks_a_package(rivals: Path, tmp_path: Path) -> None:
+    for name in NAMES:
+        with pytest.raises(ConfigError, match="--rivals"):
+            line_up([name], weights="none")
+        with pytest.raises(ConfigError, match="torchvision" if name == "raft-3d-official" else "clone"):
+            line_up([name], weights="none", rivals=tmp_path)
     file = tmp_path / "co-tracker/cotracker/predictor.py"
     file.parent.mkdir(parents=True)
     file.write_text("import no_such_package\n" + FILES["co-tracker/cotracker/predictor.py"])

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import quest
-from quest.baselines import TRACKERS, Shared, line_up
+from quest.baselines import TRACKERS, line_up
 from quest.baselines.pixels_only import PixelsOnly
 from quest.baselines.point_queries import lift_pixels
 from quest.baselines.redetect import Redetect
@@ -25,7 +25,7 @@ CPU = torch.device("cpu")
 
 @pytest.fixture(scope="module")
 def take() -> Take:
-    return make_take(frames=10, views=1, entities=2, size=(64, 48))
+    return make_take(frames=5, views=1, entities=2, size=(64, 48))
 
 
 def make_tracker() -> Tracker:
@@ -40,7 +40,7 @@ def test_every_name_is_a_tracker_of_that_name(monkeypatch: pytest.MonkeyPatch, t
     assert [tracker.name for tracker in trackers] == list(dict.fromkeys(names))
     queries = [Query.point(0, 30.0, 20.0)]
     for tracker in trackers:
-        assert tracker.track(take.views[0].clip, queries).uv_px.shape == (10, 1, 2)
+        assert tracker.track(take.views[0].clip, queries).uv_px.shape == (5, 1, 2)
         if has_protocol(tracker, "semantic"):
             assert tracker.track(take.views[0].clip).uv_px.shape[1] > 0
     with pytest.raises(ConfigError, match="expected one of"):
@@ -62,21 +62,17 @@ def test_baselines_without_weights_load_none(monkeypatch: pytest.MonkeyPatch) ->
     assert [t.name for t in line_up(names, weights="none")] == names
 
 
-def test_what_is_official_is_called_so() -> None:
+def test_names_say_what_they_are() -> None:
     assert all(entry.official == name.endswith("-official") for name, entry in TRACKERS.items())
     assert not any(entry.official and (entry.of_weights or entry.plain) for entry in TRACKERS.values())
-
-
-def test_variants_take_their_pace_from_their_name() -> None:
-    shared = Shared(make_tracker())
-    every = [TRACKERS[name].build(name, shared) for name in ("redetect", "redetect-1")]
+    every = [TRACKERS[name].build(name, make_tracker()) for name in ("redetect", "redetect-1")]
     assert [t.every for t in every if isinstance(t, Redetect)] == [4, 1]
 
 
 def test_pixels_only_sees_no_depth_and_lifts_afterwards(take: Take) -> None:
     clip = take.views[0].clip
     assert clip.depth_m is not None
-    tracker = PixelsOnly.without_depth(make_tracker())
+    tracker = PixelsOnly.without_depth("quest-pixels", make_tracker())
     queries = [Query.point(0, 30.0, 20.0), Query.point(3, 10.0, 30.0)]
     tracks = tracker.track(clip, queries)
     far = replace(clip, depth_m=clip.depth_m + np.float32(1.0))

@@ -23,7 +23,7 @@ POINTS = [Query.point(0, 20, 30, name="a"), Query.point(0, 40.5, 22.25, name="b"
 
 @pytest.fixture(scope="module")
 def clip() -> Clip:
-    return make_clip(frames=8)
+    return make_clip(frames=6)
 
 
 class Watched:
@@ -95,7 +95,7 @@ def test_what_is_kept(clip: Clip, tmp_path: Path):
     edit = Edit("place", query=0, frame=2, x=30, y=30)
     Watched(clip, {3: [edit, Edit("retire", query=7)]}, record=tmp_path)
     lines = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
-    assert [line["frame"] for line in lines] == list(range(8))
+    assert [line["frame"] for line in lines] == list(range(6))
     kept = [json.loads(line) for line in (tmp_path / "edits.jsonl").read_text().splitlines()]
     assert kept == [{"next_frame": 3, "edit": asdict(edit)}]
 

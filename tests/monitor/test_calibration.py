@@ -11,14 +11,7 @@ import numpy as np
 import pytest
 
 from quest.errors import WeightsError
-from quest.monitor import (
-    Budget,
-    Calibration,
-    calibration_file,
-    probability,
-    read_calibrations,
-    write_calibrations,
-)
+from quest.monitor import Budget, Calibration, calibration, probability, read_calibrations, write_calibrations
 from quest.monitor.calibration import LOGIT_LIMIT
 from quest.monitor.statistic import Cusum
 from tests.monitor.calibrations import share
@@ -83,45 +76,30 @@ def test_log_odds_are_scaled_shifted_and_bounded():
 
 
 def test_round_trip():
-    calibration = made()
-    text = calibration.to_json()
+    text = made().to_json()
     again = Calibration.from_json(text)
     assert "\n" not in text
     assert again.to_json() == text
-    assert replace(again, maxima=MAXIMA) == replace(calibration, maxima=MAXIMA)
-    assert (again.maxima >= calibration.maxima).all()  # rounded up: a threshold never becomes more eager
-    np.testing.assert_allclose(again.maxima, calibration.maxima, atol=2e-4)
+    assert replace(again, maxima=MAXIMA) == replace(made(), maxima=MAXIMA)
+    assert (again.maxima >= MAXIMA).all()  # rounded up: a threshold never becomes more eager
+    np.testing.assert_allclose(again.maxima, MAXIMA, atol=2e-4)
 
 
 def damaged(**changes: object) -> str:
     return json.dumps({**json.loads(made().to_json()), **changes})
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{",
-        "[]",
-        "{}",
-        damaged(format=0),
-        damaged(maxima=[]),
-        damaged(maxima=[2.0, 1.0]),
-        damaged(maxima="none"),
-        damaged(block_frames=0),
-        damaged(statistic={"drift": 0.0, "keep": 2.0}),
-        damaged(statistic={"other": 0.0}),
-        damaged(slope=0.0),
-        damaged(slope=None),
-        damaged(shift="inf"),
-        damaged(unit="house"),
-    ],
-)
-def test_a_text_that_is_no_calibration(text: str):
-    with pytest.raises(WeightsError, match=r"calibrate"):
-        Calibration.from_json(text)
+DAMAGED = (
+    "{", "[]", "{}", damaged(format=0), damaged(maxima=[]), damaged(maxima=[2.0, 1.0]), damaged(maxima="none"),
+    damaged(block_frames=0), damaged(statistic={"drift": 0.0, "keep": 2.0}), damaged(statistic={"other": 0.0}),
+    damaged(slope=0.0), damaged(slope=None), damaged(shift="inf"), damaged(unit="house"),
+)  # fmt: skip
 
 
-def test_maxima_must_be_sorted():
+def test_a_text_that_is_no_calibration():
+    for text in DAMAGED:
+        with pytest.raises(WeightsError, match=r"calibrate"):
+            Calibration.from_json(text)
     with pytest.raises(WeightsError, match="ascending"):
         replace(made(), maxima=MAXIMA[::-1])
 
@@ -139,21 +117,16 @@ def test_the_file_keeps_both(tmp_path: Path):
 
 
 def test_the_file_that_ships(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(calibration_file, "resources", SimpleNamespace(files=lambda package: tmp_path))
+    monkeypatch.setattr(calibration, "resources", SimpleNamespace(files=lambda package: tmp_path))
     assert read_calibrations() == {}
     write_calibrations(tmp_path / "assets" / "monitor.json", {"depth": made()})
     assert list(read_calibrations()) == ["depth"]
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", "{}", '{"sound": {}}', '{"depth": {}}', '{"depth": 3}', "\ud800"])
-def test_a_file_that_is_damaged(text: str, tmp_path: Path):
+def test_a_file_that_is_damaged_or_not_there(tmp_path: Path):
     path = tmp_path / "monitor.json"
-    path.write_bytes(text.encode("utf-8", "surrogatepass"))
-    with pytest.raises(WeightsError, match=r"monitor\.json.*quest calibrate") as error:
-        read_calibrations(path)
-    assert "\n" not in str(error.value)
-
-
-def test_a_file_that_is_not_there(tmp_path: Path):
-    with pytest.raises(WeightsError, match=r"none\.json.*quest calibrate"):
-        read_calibrations(tmp_path / "none.json")
+    for text in ("", "{", "[]", "{}", '{"sound": {}}', '{"depth": {}}', '{"depth": 3}', "\ud800", None):
+        path.unlink() if text is None else path.write_bytes(text.encode("utf-8", "surrogatepass"))
+        with pytest.raises(WeightsError, match=r"monitor\.json.*quest calibrate") as error:
+            read_calibrations(path)
+        assert "\n" not in str(error.value)

@@ -45,10 +45,6 @@ def test_every_entity_that_asks_gets_a_slot_of_its_own():
         rows = wanted[b].nonzero().flatten()
         assert slot[b, rows].tolist() == linear_sum_assignment(cost[b, rows].numpy())[1].tolist()
         assert len(set(slot[b, rows].tolist())) == len(rows)
-
-
-def test_more_entities_than_slots():
     slot, matched = assign_slots(torch.rand(1, 4, 2), torch.ones(1, 4, dtype=torch.bool))
-    assert matched.sum() == 2
-    assert sorted(slot[matched].tolist()) == [0, 1]
+    assert sorted(slot[matched].tolist()) == [0, 1], "more entities than slots"
     assert (slot[~matched] == 0).all()

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from quest.errors import ConfigError, WeightsError
+from quest.model.encoder import EncoderConfig
 from quest.model.frames import FrameBatch
 from quest.model.weights import load_network
 from quest.paper.network import PaperConfig, PaperNetwork, SlotAnswers, is_paper, read_paper
@@ -48,15 +51,13 @@ def test_the_published_shape():
     assert network(replace(frames, features=features[None])).uv.shape == (1, 2, 8, 2)
 
 
-@pytest.mark.parametrize("frames_in_window", [1, 2, 4])
-def test_shapes(frames_in_window: int):
-    got = make_paper()(make_frames(frames=frames_in_window))
-    shape = (2, frames_in_window, PAPER.slots)
-    assert got.uv.shape == (*shape, 2)
-    assert got.point.shape == (*shape, 3)
-    assert got.logit.shape == shape
-    assert got.label_logits.shape == (*shape, len(LABELS))
-    assert got.uv.isfinite().all()
+def test_shapes():
+    for frames in (1, 4):
+        got = make_paper()(make_frames(frames=frames))
+        shape = (2, frames, PAPER.slots)
+        assert (got.uv.shape, got.point.shape) == ((*shape, 2), (*shape, 3))
+        assert (got.logit.shape, got.label_logits.shape) == (shape, (*shape, len(LABELS)))
+        assert got.uv.isfinite().all()
 
 
 def test_batch_elements_are_independent():
@@ -118,8 +119,6 @@ def test_places_off_the_map_are_where_a_query_looked():
              for n, p in enumerate(got.where[0, 1, k])), torch.zeros(2),
         )  # fmt: skip
         torch.testing.assert_close(got.uv[0, 1, k], expected, atol=1e-4, rtol=0)
-    with pytest.raises(ConfigError, match="place_from"):
-        make_paper(place_from="moon")
 
 
 def test_without_any_depth_pixels_stay_finite():
@@ -161,3 +160,29 @@ def test_a_file_that_shares_its_encoder(tmp_path: Path):
     whole.unlink()
     with pytest.raises(WeightsError, match="not beside it"):
         read_paper(shares)
+
+
+def test_configurations_come_back_and_older_ones_have_no_flow_head():
+    for config in (PaperConfig(), PAPER):
+        assert PaperConfig.from_json(config.to_json()) == config
+    values = json.loads(PAPER.to_json())
+    assert values.pop("flow") is False
+    assert PaperConfig.from_json(json.dumps(values)) == PAPER
+
+
+FOREIGN = (
+    "", "{", "[]", "null", "3", "{}", '{"encoder": {}, "colour": 1}', '{"encoder": {"colour": 1}}', '{"encoder": 3}',
+)  # fmt: skip
+CONTRADICTIONS: tuple[dict[str, Any], ...] = (
+    {"heads": 5}, {"cell_px": 0}, {"cell_px": 10}, {"window": 0}, {"slots": 0}, {"decoder_layers": 0},
+    {"encoder": EncoderConfig(image_size=230)}, {"encoder": EncoderConfig(heads=5)}, {"place_from": "moon"},
+)  # fmt: skip
+
+
+def test_configurations_that_cannot_be():
+    for text in FOREIGN:
+        with pytest.raises(ConfigError):
+            PaperConfig.from_json(text)
+    for changes in CONTRADICTIONS:
+        with pytest.raises(ConfigError, match="network"):
+            replace(PaperConfig(), **changes)

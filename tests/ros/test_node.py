@@ -51,9 +51,8 @@ def test_topics_services_and_quality_of_service(network: Network):
     assert profiles.keys() == {COLOUR, DEPTH, COLOUR_INFO, "/tf", "/tf_static"}
     assert {profiles[topic] for topic in (COLOUR, DEPTH, COLOUR_INFO)} == {"sensor data"}
     assert profiles["/tf_static"].durability == "transient local"
-    assert network.services.keys() == {
-        f"/quest/{name}" for name in ("add", "answer_alarm", "rename", "reset", "retire")
-    }
+    services = ("add", "answer_alarm", "rename", "reset", "retire")
+    assert network.services.keys() == {f"/quest/{name}" for name in services}
     assert all(descriptor.read_only for descriptor in node.declared.values())
     # What waits for the tracker must not keep pictures waiting.
     groups = {id(group) for _, _, group in network.services.values()} | {id(timer.group) for timer in network.timers}
@@ -69,11 +68,8 @@ def test_messages_become_tracks_markers_and_diagnostics(network: Network, messag
     assert [(track.name, track.x_px, track.y_px) for track in tracks.tracks] == [("mine", 20.0, 30.0)]
     assert tracks.header.frame_id == COLOUR_FRAME
     assert len(network.last("/quest/markers").markers) == 2
-    assert [status.name for status in network.last("/diagnostics").status] == [
-        "quest: input",
-        "quest: tracker",
-        "quest: mine",
-    ]
+    told = [status.name for status in network.last("/diagnostics").status]
+    assert told == ["quest: input", "quest: tracker", "quest: mine"]
     assert any(level == "info" and "stream 0 begins" in text for level, text in network.logged)
     published = len(network.published)
     node.track()
@@ -123,18 +119,12 @@ def test_main_tracks_in_a_thread_until_shut_down(network: Network, messages: Any
     assert not network.alive
 
 
-def test_main_says_what_is_wrong_with_a_parameter(network: Network):
-    network.parameters["alpha"] = 2.0
-    assert importlib.import_module("quest_ros.node").main([]) == 1
-    assert [level for level, _ in network.logged] == ["fatal"]
-    assert "alpha" in network.logged[0][1]
-    assert not network.alive
-
-
-def test_weights_that_are_not_there_end_the_node(network: Network, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    monkeypatch.undo()
+@pytest.mark.parametrize(("name", "value"), [("alpha", 2.0), ("weights", "none.safetensors")])
+def test_main_says_what_is_wrong_with_a_parameter(tmp_path: Path, name: str, value: Any):
     with pytest.MonkeyPatch.context() as patch:
         network = install(patch, types_of("humble"))
-        network.parameters["weights"] = str(tmp_path / "none.safetensors")
+        network.parameters[name] = str(tmp_path / value) if name == "weights" else value
         assert importlib.import_module("quest_ros.node").main([]) == 1
-        assert "none.safetensors" in network.logged[0][1]
+    assert [level for level, _ in network.logged] == ["fatal"]
+    assert str(value if name == "weights" else name) in network.logged[0][1]
+    assert not network.alive

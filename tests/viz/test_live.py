@@ -4,31 +4,26 @@ import io
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from rich.console import Console
 
-from quest.filter.joints import Joint, JointKind
 from quest.monitor import Budget
 from quest.types import Query
-from quest.viz.live import LiveView, joint_words, query_words
+from quest.viz.live import LiveView, query_words
 from tests.track.test_events import ALARM, make_state
 from tests.track.test_state_lines import DOOR, HINGE
 
-RAIL = Joint(JointKind.PRISMATIC, np.array([1.0, 0, 0]), np.zeros(3), np.zeros(3), -0.001, 0.31, np.eye(4))
 
-EACH_90 = Budget(0.05, 90)
-
-
-def make_view(*, terminal: bool, width: int = 120, budget: Budget | None = EACH_90) -> tuple[LiveView, io.StringIO]:
+def make_view(
+    *,
+    terminal: bool,
+    width: int = 120,
+    budget: Budget | None = Budget(0.05, 90),  # noqa: B008
+) -> tuple[LiveView, io.StringIO]:
     file = io.StringIO()
     console = Console(
-        file=file,
-        width=width,
-        force_terminal=terminal,
-        force_interactive=terminal,
-        color_system=None,
+        file=file, width=width, force_terminal=terminal, force_interactive=terminal, color_system=None,
         legacy_windows=False,
-    )
+    )  # fmt: skip
     return LiveView(console, name="clip [red]", frames=9, budget=budget), file
 
 
@@ -38,60 +33,34 @@ def text_of(view: LiveView, width: int) -> str:
     return file.getvalue()
 
 
-@pytest.mark.parametrize(
-    ("joint", "q", "words"),
-    [
-        (None, np.nan, "?"),
-        (HINGE, np.pi / 2, "revolute 90 deg (0 to 57)"),
-        (HINGE, np.nan, "revolute ? deg (0 to 57)"),
-        (RAIL, 0.118, "prismatic 0.12 m (0.00 to 0.31)"),
-        (replace(RAIL, kind=JointKind.STATIC, covariance=np.eye(3)), np.nan, "static"),
-    ],
-)
-def test_joint_words(joint: Joint | None, q: float, words: str):
-    assert joint_words(joint, q) == words
-
-
 def test_query_words():
     assert query_words(Query.semantic("handle")) == "handle"
     assert query_words(Query.slot(name="any")) == "any"
     assert query_words(Query.point(20, 3, 4)) == "point (from frame 20 on)"
 
 
-def test_picture():
-    view, _ = make_view(terminal=True)
+def test_a_terminal_gets_one_table_that_stays():
+    view, file = make_view(terminal=True)
     with view:
         view.show(0, make_state())
         state = replace(
-            DOOR,
-            joint=(HINGE, None),
-            q=np.array([np.pi / 2, np.nan], np.float32),
-            alarm=(ALARM, None),
-            flags=("no depth",),
-            lost_p=np.array([0.8, np.nan], np.float32),
-        )
+            DOOR, joint=(HINGE, None), q=np.array([np.pi / 2, np.nan], np.float32), alarm=(ALARM, None),
+            flags=("no depth",), lost_p=np.array([0.8, np.nan], np.float32),
+        )  # fmt: skip
         view.show(5, state, waiting=[Query.semantic("knob")], behind_s=1.25)
+    assert "frame 5 (0 to 8)" in file.getvalue()
     text = text_of(view, 120)
     for part in (
-        *(
-            "clip [red]",
-            "frame 5 (0 to 8)",
-            "alpha 0.05 in 90 frames",
-            "1.2 s behind",
-            "degraded: no depth",
-            "not followed: knob",
-        ),
+        *("clip [red]", "frame 5 (0 to 8)", "alpha 0.05 in 90 frames", "1.2 s behind", "degraded: no depth"),
         *("left", "handle", "tracking", "1.0 1.0", "0.00 0.50 0.00", "revolute 90 deg (0 to 57)", "0.80", "3 frames"),
         *("alarm: left, open for 3 frames: looks unlike its anchor", "now following left, right"),
+        "not followed: knob",
     ):
         assert part in text
     assert max(len(line) for line in text_of(view, 80).splitlines()) <= 80
-
-
-def test_narrow_terminals_leave_out_the_label():
-    view, _ = make_view(terminal=True, width=80)
-    view.show(0, make_state())
-    assert "handle" not in text_of(view, 80)
+    narrow, _ = make_view(terminal=True, width=80)
+    narrow.show(0, make_state())
+    assert "handle" not in text_of(narrow, 80)
 
 
 def test_without_alarms():
@@ -99,14 +68,6 @@ def test_without_alarms():
     view.show(0, make_state(lost_p=np.full(2, np.nan, np.float32)))
     assert "without calibration" in text_of(view, 120)
     assert "no alarms" in view.summary().plain
-
-
-def test_a_terminal_gets_one_table_that_stays():
-    view, file = make_view(terminal=True)
-    with view:
-        for t in range(9):
-            view.show(t, make_state())
-    assert "frame 8 (0 to 8)" in file.getvalue()
 
 
 def test_elsewhere_one_line_per_event():

@@ -15,18 +15,11 @@ def tracks_of(points: dict[str, np.ndarray], joints: Joints | None = None) -> Tr
     world = np.stack(list(points.values()), axis=1).astype(np.float32)
     shape = world.shape[:2]
     return Tracks(
-        names=tuple(points),
-        labels=("handle",) * len(points),
-        uv_px=100 + 100 * world[..., :2],
-        point_world=world,
-        confidence=np.ones(shape, np.float32),
-        visible=np.ones(shape, bool),
-        state=np.full(shape, State.TRACKING.value, dtype="<U8"),
-        stamp_s=np.arange(len(world)) / FPS,
-        lost_p=np.zeros(shape, np.float32),
-        alarm=np.zeros(shape, bool),
-        joints=joints,
-    )
+        names=tuple(points), labels=("handle",) * len(points), uv_px=100 + 100 * world[..., :2], point_world=world,
+        confidence=np.ones(shape, np.float32), visible=np.ones(shape, bool),
+        state=np.full(shape, State.TRACKING.value, dtype="<U8"), stamp_s=np.arange(len(world)) / FPS,
+        lost_p=np.zeros(shape, np.float32), alarm=np.zeros(shape, bool), joints=joints,
+    )  # fmt: skip
 
 
 def joints_of(*kinds_and_q: tuple[str, np.ndarray]) -> Joints:

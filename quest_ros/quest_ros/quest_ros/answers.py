@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,8 +21,7 @@ _LEAST_ARROW = 5
 """Length of the arrow of a joint's axis, in diameters of the marker, at least."""
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """When and where answers are."""
 
     stamp_ns: int
@@ -33,19 +31,23 @@ class Place:
     frame_from_world: Float[np.ndarray, "4 4"] | None
     """From the world of the tracker to it; None where they are the same."""
 
+    def point(self, point: np.ndarray) -> Float[np.ndarray, "3"]:
+        """A point of the world in this frame."""
+        point = point.astype(np.float64)
+        return point if self.frame_from_world is None else move(self.frame_from_world, point)
 
-@dataclass(frozen=True)
-class Status:
-    """One line of the diagnostics."""
+    def joint(self, joint: Joint | None) -> Joint | None:
+        """A joint of the world in this frame."""
+        return joint if joint is None or self.frame_from_world is None else joint.moved(self.frame_from_world)
+
+
+class Status(NamedTuple):
+    """One line of the diagnostics: its level is ``OK``, ``WARN`` or ``ERROR``; values are more to know, by name."""
 
     name: str
-    """What it is about."""
     level: str
-    """``OK``, ``WARN`` or ``ERROR``."""
     message: str
-    """In words."""
     values: tuple[tuple[str, str], ...] = ()
-    """More to know, by name."""
 
 
 def time_of(types: Types, stamp_ns: int) -> Any:
@@ -59,16 +61,7 @@ def header_of(types: Types, stamp_ns: int, frame_id: str) -> Any:
 
 
 def tracks_of(types: Types, state: StreamState, place: Place, *, stream: int, frame: int, dropped: int) -> Any:
-    """An answer as quest_msgs/Tracks.
-
-    Args:
-        types: gives the classes of messages.
-        state: the answer.
-        place: its time and frame.
-        stream: number of the stream.
-        frame: index of the picture in it.
-        dropped: pictures that were left out so far.
-    """
+    """An answer as quest_msgs/Tracks, with the number of the stream, the picture's index in it, and those left out."""
     return types("quest_msgs/msg/Tracks")(
         header=header_of(types, place.stamp_ns, place.frame_id),
         stream=stream,
@@ -90,7 +83,7 @@ def _track(types: Types, state: StreamState, k: int, place: Place) -> Any:
         visible=bool(state.visible[k]),
         x_px=float(state.uv_px[k, 0]) - 0.5,
         y_px=float(state.uv_px[k, 1]) - 0.5,
-        point=_xyz(types, "Point", _moved(place, state.point_world[k].astype(np.float64))),
+        point=_xyz(types, "Point", place.point(state.point_world[k])),
         p_lost=float(state.lost_p[k]),
         confidence=float(state.confidence[k]),
         joint=_joint(types, state.joint[k], float(state.q[k]), place),
@@ -102,9 +95,7 @@ def _track(types: Types, state: StreamState, k: int, place: Place) -> Any:
 
 
 def _joint(types: Types, joint: Joint | None, q: float, place: Place) -> Any:
-    Message, nothing = types("quest_msgs/msg/Joint"), np.full(3, np.nan)
-    if joint is not None and place.frame_from_world is not None:
-        joint = joint.moved(place.frame_from_world)
+    Message, nothing, joint = types("quest_msgs/msg/Joint"), np.full(3, np.nan), place.joint(joint)
     moves = joint is not None and joint.kind is not JointKind.STATIC
     return Message(
         kind=Message.UNKNOWN if joint is None else getattr(Message, joint.kind.name),
@@ -120,12 +111,8 @@ def _joint(types: Types, joint: Joint | None, q: float, place: Place) -> Any:
 def markers_of(types: Types, state: StreamState, place: Place, size_m: float, gone: Iterable[tuple[str, int]]) -> Any:
     """An answer as visualization_msgs/MarkerArray: a ball, a name and the joint's axis for each point that is known.
 
-    Args:
-        types: gives the classes of messages.
-        state: the answer.
-        place: its time and frame.
-        size_m: diameter of a ball.
-        gone: namespaces and numbers of the markers that are shown so far; those that are not shown again are deleted.
+    ``size_m`` is the diameter of a ball, ``gone`` are namespaces and numbers of the markers that are shown so far:
+    those that are not shown again are deleted.
     """
     Marker, markers = types("visualization_msgs/msg/Marker"), []
 
@@ -145,7 +132,7 @@ def markers_of(types: Types, state: StreamState, place: Place, size_m: float, go
 
     above = np.array([0.0, 0.0, 1.5] if place.frame_from_world is None else [0.0, -1.5, 0.0]) * size_m
     for k, number in enumerate(state.query):
-        point = _moved(place, state.point_world[k].astype(np.float64))
+        point = place.point(state.point_world[k])
         if not np.isfinite(point).all():
             continue
         colour, number = _COLOURS[state.state[k]], int(number)
@@ -153,7 +140,7 @@ def markers_of(types: Types, state: StreamState, place: Place, size_m: float, go
         text = f"{state.names[k]}: {_words(state, k)}"
         pose = _pose(types, point + above)
         add("names", number, Marker.TEXT_VIEW_FACING, (0.0, 0.0, size_m), colour, pose=pose, text=text)
-        if (line := _axis(state.joint[k], place, size_m)) is not None:
+        if (line := _axis(place.joint(state.joint[k]), size_m)) is not None:
             ends, width = [_xyz(types, "Point", end) for end in line], size_m / 4
             pose = _pose(types, np.zeros(3))
             add("joints", number, Marker.ARROW, (width, 2 * width, 0.0), colour, points=ends, pose=pose)
@@ -163,12 +150,10 @@ def markers_of(types: Types, state: StreamState, place: Place, size_m: float, go
     return types("visualization_msgs/msg/MarkerArray")(markers=markers)
 
 
-def _axis(joint: Joint | None, place: Place, size_m: float) -> np.ndarray | None:
+def _axis(joint: Joint | None, size_m: float) -> np.ndarray | None:
     """Ends of the arrow of a joint: along what was seen of the path if it slides, along the axis if it turns."""
     if joint is None or joint.kind is JointKind.STATIC:
         return None
-    if place.frame_from_world is not None:
-        joint = joint.moved(place.frame_from_world)
     if joint.kind is JointKind.PRISMATIC:
         low, high = joint.lower, max(joint.upper, joint.lower + _LEAST_ARROW * size_m)
     else:
@@ -178,15 +163,7 @@ def _axis(joint: Joint | None, place: Place, size_m: float) -> np.ndarray | None
 
 
 def diagnostics_of(types: Types, statuses: Sequence[Status], *, stamp_ns: int, node: str, hardware: str) -> Any:
-    """Statuses as diagnostic_msgs/DiagnosticArray.
-
-    Args:
-        types: gives the classes of messages.
-        statuses: what to say.
-        stamp_ns: time.
-        node: name of the node, which begins all names.
-        hardware: what it is about: the frame of the camera.
-    """
+    """Statuses as diagnostic_msgs/DiagnosticArray; the node begins all names, the hardware is the camera's frame."""
     Message, KeyValue = types("diagnostic_msgs/msg/DiagnosticStatus"), types("diagnostic_msgs/msg/KeyValue")
     return types("diagnostic_msgs/msg/DiagnosticArray")(
         header=header_of(types, stamp_ns, ""),
@@ -220,10 +197,6 @@ def _words(state: StreamState, k: int) -> str:
     """State of a query, with P(lost) where it is known."""
     lost = f", P(lost) {state.lost_p[k]:.2f}" if np.isfinite(state.lost_p[k]) else ""
     return f"{state.state[k].value}{lost}"
-
-
-def _moved(place: Place, point: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
-    return point if place.frame_from_world is None else move(place.frame_from_world, point)
 
 
 def _xyz(types: Types, name: str, values: Sequence[float] | np.ndarray) -> Any:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 PATIENCE_NS = 500_000_000
 """How much newer pictures have to be before one is tracked without the depth or the pose that it waits for."""
@@ -13,14 +12,11 @@ JUMP_NS = 1_000_000_000
 """Colours that are older than those before by more begin a new stream; by less, they are late and left out."""
 
 
-@dataclass(frozen=True)
-class Sent:
-    """A message and its time."""
+class Sent(NamedTuple):
+    """A message and its time: that of its header, or of its arrival where nobody set that."""
 
     stamp_ns: int
-    """That of its header, or of its arrival where nobody set that."""
     message: Any
-    """The message."""
 
 
 class Inbox:
@@ -81,9 +77,7 @@ class Inbox:
         if not ready:
             return None
         self.dropped += ready[-1]
-        for _ in range(ready[-1]):
-            self._colours.popleft()
-        sent = self._colours.popleft()
+        sent = [self._colours.popleft() for _ in range(ready[-1] + 1)][-1]
         near = min(self._depths, key=lambda depth: abs(depth.stamp_ns - sent.stamp_ns), default=None)
         if near is not None and not self._near(sent, near):
             near = None

@@ -7,11 +7,11 @@ message is told in the diagnostics, and never raised.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
 from threading import Lock
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,24 +31,40 @@ SILENT_S = 2.0
 """After how long without pictures the diagnostics say so."""
 
 
-@dataclass(frozen=True)
-class Notice:
-    """A line for the log."""
+class Notice(NamedTuple):
+    """A line for the log; its level is ``INFO``, ``WARN`` or ``ERROR``."""
 
     level: str
-    """``INFO``, ``WARN`` or ``ERROR``."""
     text: str
-    """In words."""
 
 
-@dataclass(frozen=True)
-class Answer:
+class Answer(NamedTuple):
     """What is to be published about a picture."""
 
     tracks: Any
     """quest_msgs/Tracks."""
     markers: Any
     """visualization_msgs/MarkerArray."""
+
+
+def _service(ask: Callable[[Tracking, Stream, Any, Any], str]) -> Callable[[Tracking, Any, Any], Any]:
+    """A service that changes the stream: what is said, or the error, becomes words in the response."""
+
+    @wraps(ask)
+    def answer(self: Tracking, request: Any, response: Any) -> Any:
+        if hasattr(response, "query"):
+            response.query = -1
+        with self._tracking:
+            try:
+                if self._stream is None:
+                    raise InputError("no picture has been tracked yet; ask again when there is one")
+                response.message = ask(self, self._stream, request, response)
+                response.success = True
+            except QuestError as error:
+                response.success, response.message = False, str(error)
+        return response
+
+    return answer
 
 
 class Tracking:
@@ -63,13 +79,7 @@ class Tracking:
     """
 
     def __init__(
-        self,
-        tracker: Tracker,
-        settings: Settings,
-        types: Types,
-        *,
-        name: str = "quest",
-        topic: str = "image",
+        self, tracker: Tracker, settings: Settings, types: Types, *, name: str = "quest", topic: str = "image"
     ) -> None:
         if settings.threshold:
             tracker.config = replace(tracker.config, threshold=settings.threshold)
@@ -98,12 +108,7 @@ class Tracking:
         self._told: list[tuple[str, str]] = []
 
     def take_colours(self, message: Any, now_ns: int) -> None:
-        """Take an Image or CompressedImage of colours.
-
-        Args:
-            message: the picture.
-            now_ns: time by the node's clock, nanoseconds.
-        """
+        """Take an Image or CompressedImage of colours; ``now_ns`` is the time by the node's clock."""
         with self._coming:
             self._came_ns, self._frame_id = now_ns, frame_name(message.header.frame_id)
             back_ns = self._inbox.colours(Sent(header_ns(message) or now_ns, message))
@@ -114,7 +119,7 @@ class Tracking:
                     self._transforms.add(static, static=True)
 
     def take_depth(self, message: Any, now_ns: int) -> None:
-        """Take an Image or CompressedImage of depth; arguments are as in :meth:`take_colours`."""
+        """Take an Image or CompressedImage of depth."""
         with self._coming:
             self._inbox.depth(Sent(header_ns(message) or now_ns, message))
 
@@ -124,13 +129,7 @@ class Tracking:
             self._info = message
 
     def take_transforms(self, message: Any, now_ns: int, *, static: bool) -> None:
-        """Take a TFMessage.
-
-        Args:
-            message: the transforms.
-            now_ns: as in :meth:`take_colours`.
-            static: whether they hold throughout.
-        """
+        """Take a TFMessage; static transforms hold throughout."""
         with self._coming:
             self._transforms.add(message, static=static, log_ns=now_ns)
             if static:
@@ -196,12 +195,24 @@ class Tracking:
         return Answer(tracks_of(self._types, state, place, **counts), markers)
 
     def _rig_for(self, rgb: np.ndarray, info: Any, doubts: list[str]) -> Rig:
-        """The camera of a picture; the stream ends if the pictures have another size, and camera_info says so too."""
+        """The camera of a picture; the stream ends if the pictures have another size, and camera_info says so too.
+
+        Raises:
+            InputError: no camera is known: camera_info has not come, or is not of such pictures.
+        """
         size, running = rgb.shape[:2], self._rig
         if running is not None and (running.camera.height, running.camera.width) != size:
             running = None
         try:
-            rig = self._rig_of(info, size)
+            if info is None:
+                raise InputError("no camera_info has come: check its topic, and that it is of the colours")
+            camera, lens = camera_of(info, self._topic, size, self._topic)
+            if (camera.height, camera.width) != size:
+                raise InputError(
+                    f"pictures of {self._topic} are {size[1]} x {size[0]}, but camera_info is for {camera.width} x "
+                    f"{camera.height}; expected the camera_info of the colours"
+                )
+            rig = Rig(camera, lens)
         except InputError as error:
             if running is None:
                 raise
@@ -214,22 +225,6 @@ class Tracking:
         if not np.allclose(running.camera.matrix, rig.camera.matrix) or running.distortion != rig.distortion:
             doubts.append("camera_info changes on the way: the first of the stream is used")
         return running
-
-    def _rig_of(self, info: Any, size: tuple[int, ...]) -> Rig:
-        """The camera of pictures of a height and width by camera_info.
-
-        Raises:
-            InputError: there is none, or it is not of such pictures.
-        """
-        if info is None:
-            raise InputError("no camera_info has come: check its topic, and that it is of the colours")
-        camera, lens = camera_of(info, self._topic, size, self._topic)
-        if (camera.height, camera.width) != size:
-            raise InputError(
-                f"pictures of {self._topic} are {size[1]} x {size[0]}, but camera_info is for {camera.width} x "
-                f"{camera.height}; expected the camera_info of the colours"
-            )
-        return Rig(camera, lens)
 
     def _depth_of(self, rig: Rig, colours: Sent, depth: Sent | None, doubts: list[str]) -> np.ndarray | None:
         settings = self._settings
@@ -279,13 +274,9 @@ class Tracking:
         """A new stream, with the queries of the settings."""
         settings, asked = self._settings, self._settings.queries()
         online = settings.online_s or False
-        stream = self._tracker.stream(
-            rig.camera,
-            None if online or (settings.discover and not asked) else (),
-            online=online,
-            alpha=settings.alpha,
-            alpha_frames=settings.alpha_frames or None,
-        )
+        found = None if online or (settings.discover and not asked) else ()
+        budget = {"alpha": settings.alpha, "alpha_frames": settings.alpha_frames or None}
+        stream = self._tracker.stream(rig.camera, found, online=online, **budget)
         for query in asked:
             try:
                 stream.add(query)
@@ -303,12 +294,11 @@ class Tracking:
 
     def _tell(self, state: StreamState) -> None:
         """Say which alarms are new."""
-        before = self._state
+        before, self._state = self._state, state
         known = {} if before is None else dict(zip(before.query, before.alarm, strict=True))
         for name, number, alarm in zip(state.names, state.query, state.alarm, strict=True):
             if alarm is not None and known.get(number) is None:
                 self._say("WARN", f"alarm of {name}: {alarm.reason}")
-        self._state = state
 
     def _refuse(self, problem: str, details: str = "") -> None:
         self._refused += 1
@@ -317,8 +307,9 @@ class Tracking:
         self._problem = problem
 
     def _doubt(self, doubts: tuple[str, ...]) -> None:
+        known = {before.partition(":")[0] for before in self._doubts}
         for doubt in doubts:
-            if doubt.partition(":")[0] not in {before.partition(":")[0] for before in self._doubts}:
+            if doubt.partition(":")[0] not in known:
                 self._say("WARN", doubt)
         self._doubts = doubts
 
@@ -332,12 +323,7 @@ class Tracking:
             return notices
 
     def diagnostics(self, now_ns: int, *, news: bool = False) -> Any | None:
-        """The diagnostics as diagnostic_msgs/DiagnosticArray.
-
-        Args:
-            now_ns: time by the node's clock, nanoseconds.
-            news: give them only if the level of anything is another than when they were given last, else None.
-        """
+        """The diagnostics as diagnostic_msgs/DiagnosticArray; with ``news`` None while no level changes."""
         with self._tracking:
             statuses = [self._input(now_ns), *self._health()]
             told = [(status.name, status.level) for status in statuses]
@@ -360,14 +346,9 @@ class Tracking:
         elif self._doubts:
             level, message = "WARN", "; ".join(self._doubts)
         counts = {
-            "pictures": inbox.came,
-            "tracked": self._tracked,
-            "dropped while busy": inbox.dropped,
-            "late": inbox.late,
-            "without depth in time": inbox.unmatched,
-            "refused": self._refused,
-            "streams": self._streams,
-        }
+            "pictures": inbox.came, "tracked": self._tracked, "dropped while busy": inbox.dropped, "late": inbox.late,
+            "without depth in time": inbox.unmatched, "refused": self._refused, "streams": self._streams,
+        }  # fmt: skip
         return Status("input", level, message, tuple((key, str(value)) for key, value in counts.items()))
 
     def _health(self) -> list[Status]:
@@ -384,67 +365,42 @@ class Tracking:
         tracker = Status("tracker", "WARN" if troubles else "OK", message, (("monitor", watched),))
         return [tracker, *statuses_of(state)]
 
-    def add(self, request: Any, response: Any) -> Any:
+    @_service
+    def add(self, stream: Stream, request: Any, response: Any) -> str:
         """Answer quest_msgs/AddQuery."""
-        response.query = -1
-        with self._asked(response) as stream:
-            response.query = stream().add(_query(request, stream().frame))
-            response.message = f"query {response.query} is followed from the next picture on"
-        return response
+        response.query = stream.add(_query(request, stream.frame))
+        return f"query {response.query} is followed from the next picture on"
 
-    def retire(self, request: Any, response: Any) -> Any:
+    @_service
+    def retire(self, stream: Stream, request: Any, response: Any) -> str:
         """Answer quest_msgs/RetireQuery."""
-        with self._asked(response) as stream:
-            stream().retire(_which(request))
-            response.message = "retired"
-        return response
+        stream.retire(_which(request))
+        return "retired"
 
-    def rename(self, request: Any, response: Any) -> Any:
+    @_service
+    def rename(self, stream: Stream, request: Any, response: Any) -> str:
         """Answer quest_msgs/RenameQuery."""
-        with self._asked(response) as stream:
-            if not request.new_name:
-                raise InputError("new_name: expected a name, got none")
-            stream().rename(_which(request), request.new_name)
-            response.message = "renamed"
-        return response
+        if not request.new_name:
+            raise InputError("new_name: expected a name, got none")
+        stream.rename(_which(request), request.new_name)
+        return "renamed"
 
-    def answer_alarm(self, request: Any, response: Any) -> Any:
+    @_service
+    def answer_alarm(self, stream: Stream, request: Any, response: Any) -> str:
         """Answer quest_msgs/AnswerAlarm."""
-        with self._asked(response) as stream:
-            if request.answer == request.RIGHT:
-                stream().confirm(_which(request))
-            elif request.answer == request.PLACE:
-                stream().place(_which(request), request.x_px + 0.5, request.y_px + 0.5)
-            else:
-                raise InputError(f"answer: expected RIGHT (1) or PLACE (2), got {request.answer}")
-            response.message = "taken"
-        return response
+        if request.answer == request.RIGHT:
+            stream.confirm(_which(request))
+        elif request.answer == request.PLACE:
+            stream.place(_which(request), request.x_px + 0.5, request.y_px + 0.5)
+        else:
+            raise InputError(f"answer: expected RIGHT (1) or PLACE (2), got {request.answer}")
+        return "taken"
 
-    def reset(self, request: Any, response: Any) -> Any:
+    @_service
+    def reset(self, stream: Stream, request: Any, response: Any) -> str:
         """Answer std_srvs/Trigger: the next picture begins a new stream."""
-        with self._asked(response) as stream:
-            stream()
-            self._end("on request")
-            response.message = "the next picture begins a new stream"
-        return response
-
-    @contextmanager
-    def _asked(self, response: Any) -> Iterator[Callable[[], Stream]]:
-        """What answers a request: errors become words in the response.
-
-        Gives a function that gives the stream, and raises InputError if there is none yet.
-        """
-        with self._tracking:
-            response.success = True
-            try:
-                yield self._running
-            except QuestError as error:
-                response.success, response.message = False, str(error)
-
-    def _running(self) -> Stream:
-        if self._stream is None:
-            raise InputError("no picture has been tracked yet; ask again when there is one")
-        return self._stream
+        self._end("on request")
+        return "the next picture begins a new stream"
 
 
 def _query(request: Any, frame: int) -> Query:

@@ -11,13 +11,10 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 from quest.errors import ConfigError, WeightsError
 from quest.types import Clip, Query, Tracks
-
-if TYPE_CHECKING:
-    from quest.track import Tracker
 
 Inputs = Literal["depth and poses", "depth", "colours"]
 """What of a real recording a tracker is shown."""
@@ -40,14 +37,6 @@ class ClipTracker(Protocol):
 
 
 @dataclass(frozen=True)
-class Shared:
-    """What trackers that are made of the same weights share."""
-
-    tracker: Tracker
-    """The tracker whose networks and settings they use."""
-
-
-@dataclass(frozen=True)
 class Entry:
     """How a tracker is made, and what is said of it."""
 
@@ -55,7 +44,7 @@ class Entry:
     """What it does, in a few words."""
     maker: str
     """``module:function`` in this package. It is called with the settings; before them with the name and, for trackers
-    of weights, a :class:`Shared`, for official ones, the folder of code and weights."""
+    of weights, QueST's own, for official ones, the folder of code and weights. Empty for QueST itself."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the maker."""
     of_weights: bool = False
@@ -70,7 +59,7 @@ class Entry:
         """Whether it needs nothing."""
         return not (self.of_weights or self.official)
 
-    def build(self, name: str, shared: Shared | None = None, *, rivals: Path | None = None) -> ClipTracker:
+    def build(self, name: str, tracker: ClipTracker | None = None, *, rivals: Path | None = None) -> ClipTracker:
         """The tracker.
 
         Raises:
@@ -82,13 +71,16 @@ class Entry:
                 f"tracker {name!r}: it runs its authors' code and weights; put both into a folder as docs/metrics.md "
                 "says, and name that with --rivals"
             )
+        if not self.maker:
+            assert tracker is not None
+            return tracker
         module, _, function = self.maker.partition(":")
         make = attrgetter(function)(import_module(f"quest.baselines.{module}"))
-        return make(*(() if self.plain else (name, rivals if self.official else shared)), **self.settings)
+        return make(*(() if self.plain else (name, rivals if self.official else tracker)), **self.settings)
 
 
 def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHING, **settings: Any) -> Entry:
-    return Entry(about, f"of_weights:{maker}", settings, of_weights=True, inputs=inputs)
+    return Entry(about, maker, settings, of_weights=True, inputs=inputs)
 
 
 def _official(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",), **settings: Any) -> Entry:
@@ -96,18 +88,20 @@ def _official(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours"
 
 
 TRACKERS: dict[str, Entry] = {
-    "quest": _of_weights("this tracker", "whole"),
-    "quest-pixels": _of_weights("quest without depth", "pixels_only", inputs=("colours",)),
-    "redetect": _of_weights("its finder without queries, every 4th frame", "redetect", every=4),
-    "redetect-1": _of_weights("the same in every frame", "redetect", every=1),
+    "quest": _of_weights("this tracker", ""),
+    "quest-pixels": _of_weights("quest without depth", "pixels_only:PixelsOnly.without_depth", inputs=("colours",)),
+    "redetect": _of_weights("its finder without queries, every 4th frame", "redetect:Redetect", every=4),
+    "redetect-1": _of_weights("the same in every frame", "redetect:Redetect", every=1),
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
-    "lk": Entry("Lucas-Kanade, one point", "lucas_kanade:LucasKanade"),
-    "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "lucas_kanade:LucasKanadeGrid"),
-    "lk-reinit": Entry("the same, begun anew by its first patch after occlusions", "lucas_kanade:LucasKanadeAgain"),
-    "dis": Entry("dense optical flow, chained", "dense_flow:DenseFlow"),
+    "lk": Entry("Lucas-Kanade, one point", "chained:LucasKanade"),
+    "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "chained:LucasKanadeGrid"),
+    "lk-reinit": Entry("the same, begun anew by its first patch after occlusions", "chained:LucasKanadeAgain"),
+    "dis": Entry("dense optical flow, chained", "chained:DenseFlow"),
     "xfeat": Entry("every frame matched to the query's by dense features", "dense_match:DenseMatch.by_xfeat"),
-    "dino": _of_weights("the same by tokens of the vision transformer", "tokens", inputs=("colours",)),
-    "world-pnp": Entry("still in the world, camera by LK and PnP", "still_world:StillWorld", inputs=("depth",)),
+    "dino": _of_weights(
+        "the same by tokens of the vision transformer", "dense_match:DenseMatch.by_tokens", inputs=("colours",)
+    ),
+    "world-pnp": Entry("still in the world, camera by LK and PnP", "hold_still:StillWorld", inputs=("depth",)),
     "world-given": Entry(
         "still in the world, given poses", "hold_still:HoldStill", {"name": "world-given"}, inputs=("depth and poses",)
     ),
@@ -144,8 +138,8 @@ def line_up(names: Sequence[str], *, weights: str, rivals: Path | None = None) -
         import quest
         from quest.track import Tracker
 
-        shared = Shared(quest.load(weights))
+        shared = quest.load(weights)
         other = [name for name in names if TRACKERS[name].of_weights and name != "quest"]
-        if other and not isinstance(shared.tracker, Tracker):
+        if other and not isinstance(shared, Tracker):
             raise WeightsError(f"tracker {other[0]!r}: these weights are of the published network; use a finder's")
     return tuple(TRACKERS[name].build(name, shared, rivals=rivals) for name in dict.fromkeys(names))

@@ -10,42 +10,36 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 
-from quest.baselines.official import OfficialClip, import_code
+from quest.baselines.official import Official, import_code
+from quest.baselines.point_queries import Followed, PointTracker
+from quest.types import Clip
 
-_HALF_PX = np.array((0.0, 0.5, 0.5), np.float32)
 
+class CoTracker(Official, PointTracker):
+    """All points together, and the grid of 6 x 6 that supports them; confidence is 1 where a point is visible.
 
-class CoTracker(OfficialClip):
-    """All points together, and the grid of 6 x 6 that supports them.
-
-    Args:
-        name: what tables call it.
-        rivals: the folder of code and weights.
-        online: whether windows of 16 frames are seen, 8 further each time, so that an answer looks at most 15 frames
-            ahead; else the whole clip is seen at once.
-        device: as of :func:`quest.load`.
+    Online it sees windows of 16 frames, 8 further each time, so that an answer looks at most 15 frames ahead; else the
+    whole clip at once.
     """
 
-    def __init__(self, name: str, rivals: Path, *, online: bool, device: str = "auto") -> None:
+    def __init__(self, name: str, rivals: Path, *, online: bool) -> None:
         code = import_code(rivals / "co-tracker", "cotracker.predictor")
         self.predictor = (code.CoTrackerOnlinePredictor if online else code.CoTrackerPredictor)(checkpoint=None)
-        super().__init__(name, rivals, self.predictor.model, device=device)
+        super().__init__(name, rivals, self.predictor.model)
         self.online = online
 
     @torch.no_grad()
-    def follow(
-        self, rgb: UInt8[np.ndarray, "T H W 3"], queries: Float32[np.ndarray, "K 3"]
-    ) -> tuple[Float32[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"], Float32[np.ndarray, "T K"]]:
-        """Confidence is 1 where the point is visible."""
-        asked = torch.from_numpy(queries - _HALF_PX)[None].to(self.device)
-        tracks, visible = (self._windows if self.online else self._whole)(rgb, asked)
-        seen = visible[0, : len(rgb)].cpu().numpy().astype(bool)
-        return tracks[0, : len(rgb)].float().cpu().numpy() + _HALF_PX[1:], seen, seen.astype(np.float32)
-
-    def _whole(self, rgb: UInt8[np.ndarray, "T H W 3"], asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        return self.predictor(self._video(rgb), queries=asked)
+    def follow(self, clip: Clip, first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]) -> Followed:
+        """In windows, or the whole clip at once."""
+        asked = torch.from_numpy(np.column_stack((first, uv_first - 0.5)).astype(np.float32))[None].to(self.device)
+        if self.online:
+            tracks, visible = self._windows(clip.rgb, asked)
+        else:
+            tracks, visible = self.predictor(self._video(clip.rgb), queries=asked)
+        seen = visible[0, : len(clip)].cpu().numpy().astype(bool)
+        return tracks[0, : len(clip)].float().cpu().numpy() + np.float32(0.5), seen, seen.astype(np.float32)
 
     def _windows(self, rgb: UInt8[np.ndarray, "T H W 3"], asked: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         step = self.predictor.step

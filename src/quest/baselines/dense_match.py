@@ -5,19 +5,20 @@ Reference of the matching of tokens: Amir et al., Deep ViT features as dense vis
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float, Float32, Int, UInt8
 from torch import Tensor
 
-from quest.baselines.point_queries import check_point_queries, tracks_of
+from quest.baselines.point_queries import Followed, PointTracker
 from quest.model.encoder import Encoder
 from quest.model.xfeat import XFeat, sample
-from quest.types import Clip, Query, Tracks
+from quest.track import Tracker
+from quest.types import Clip
 
 LEAST_SIMILARITY = 0.6
 """Cosine above which the best match is said to be the point; set beforehand, not tuned on any recording."""
@@ -26,9 +27,10 @@ TOKEN_BLOCK = 8
 LONGEST_PX = 640
 """Longer side of the picture that the vision transformer sees."""
 _FINER = 4
+Colours = UInt8[np.ndarray, "H W 3"]
 
 
-class DenseMatch:
+class DenseMatch(PointTracker):
     """Answers with the most similar place of the whole picture, be it similar or not; visible is what is similar.
 
     Args:
@@ -37,54 +39,39 @@ class DenseMatch:
         weights_hash: SHA-256 of the weights, where they are the user's choice.
     """
 
-    protocols = ("point",)
-
     def __init__(
-        self,
-        name: str,
-        features: Callable[[UInt8[np.ndarray, "H W 3"]], Float[Tensor, "D h w"]],
-        *,
-        weights_hash: str | None = None,
+        self, name: str, features: Callable[[Colours], Float[Tensor, "D h w"]], *, weights_hash: str | None = None
     ) -> None:
-        self.name = name
-        self.features = features
-        self.weights_hash = weights_hash
+        self.name, self.features, self.weights_hash = name, features, weights_hash
 
     @classmethod
     def by_xfeat(cls) -> DenseMatch:
         """By the packaged network of XFeat."""
         return cls("xfeat", partial(xfeat_features, XFeat.from_package()))
 
+    @classmethod
+    def by_tokens(cls, name: str, tracker: Tracker) -> DenseMatch:
+        """By tokens of the vision transformer in a tracker's network."""
+        return cls(name, partial(token_features, tracker.network.encoder), weights_hash=tracker.weights_hash)
+
     @torch.no_grad()
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        """Match each point query in every frame after its own.
-
-        Args:
-            clip: frames; depth is needed for world points.
-            queries: point queries.
-
-        Returns:
-            One track per query; NaN before its frame. World points are held where depth is missing or the point is
-            not visible; ``frame_flags`` tell of missing depth. Confidence is the similarity, from 0 to 1.
+    def follow(self, clip: Clip, first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]) -> Followed:
+        """Match each point in every frame after its own; confidence is the similarity.
 
         Raises:
-            ConfigError: a query that is not a point.
-            InputError: a query outside the clip, or pictures with a side below 16 pixels (XFeat).
+            InputError: pictures with a side below 16 pixels (XFeat).
         """
-        first, uv_first = check_point_queries(clip, queries, tracker=self.name)
-        assert queries is not None
-        t, k = len(clip), len(queries)
+        t, k = len(clip), len(first)
         size = (clip.camera.width, clip.camera.height)
         uv_px, confidence = np.full((t, k, 2), np.nan, np.float32), np.zeros((t, k), np.float32)
         wanted = None
-        for i in range(int(first.min(initial=t)), t):
-            features = self.features(clip.rgb[i])
+        for i, rgb in enumerate(clip.rgb):
+            features = self.features(rgb)
             wanted = features.new_zeros(k, len(features)) if wanted is None else wanted
             known, born = np.flatnonzero(first < i), np.flatnonzero(first == i)
             uv_px[i, known], confidence[i, known] = best_match(features, wanted[known], size)
-            uv_px[i, born], confidence[i, born] = uv_first[born], 1.0
             wanted[born] = sample(features, torch.from_numpy(uv_first[born]).to(features.device), size)
-        return tracks_of(clip, queries, uv_px, confidence > LEAST_SIMILARITY, confidence)
+        return uv_px, confidence > LEAST_SIMILARITY, confidence
 
 
 def xfeat_features(network: XFeat, rgb: UInt8[np.ndarray, "H W 3"]) -> Float[Tensor, "D h w"]:

@@ -8,24 +8,18 @@ the name that ``git clone`` gives it, and the weights of a tracker the tracker's
 from __future__ import annotations
 
 import sys
-from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float32, UInt8
 from torch import nn
 
-from quest.baselines.point_queries import check_point_queries, tracks_of
 from quest.data.provenance import file_hash
 from quest.errors import ConfigError, WeightsError
 from quest.model.tensor_file import read_tensors
 from quest.track.tracker import pick_device
-from quest.types import Clip, Query, Tracks
 
 _SAID = 5
 """Names of tensors that an error lists."""
@@ -91,62 +85,14 @@ class Official:
         name: what tables call the tracker.
         rivals: the folder of code and weights.
         network: of the official code.
-        device: as of :func:`quest.load`.
 
     Raises:
-        ConfigError: no such device, or the code is not there or cannot be imported.
+        ConfigError: the code is not there or cannot be imported.
         WeightsError: the checkpoint is not there, is torn, or is of another network.
     """
 
-    protocols = ("point",)
-
-    def __init__(self, name: str, rivals: Path, network: nn.Module, *, device: str) -> None:
+    def __init__(self, name: str, rivals: Path, network: nn.Module) -> None:
         self.name = name
-        self.device = pick_device(device)
+        self.device = pick_device("auto")
         self.rival_hash = load_weights(network, rivals / f"{name}.safetensors")
         self.network: Any = network.to(self.device).eval().requires_grad_(requires_grad=False)
-
-
-class OfficialClip(Official, ABC):
-    """One that is given a clip and points in it."""
-
-    @abstractmethod
-    def follow(
-        self, rgb: UInt8[np.ndarray, "T H W 3"], queries: Float32[np.ndarray, "K 3"]
-    ) -> tuple[Float32[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"], Float32[np.ndarray, "T K"]]:
-        """Pixels, whether they are visible, and how confident that is, from 0 to 1.
-
-        What is said of frames in front of a query's own does not count.
-
-        Args:
-            rgb: frames, in the first of which a query begins.
-            queries: (t, x, y) in frames and pixels, centres at half-integers.
-        """
-
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        """Follow each point query forward from its frame.
-
-        Args:
-            clip: frames; depth is needed for world points.
-            queries: point queries.
-
-        Returns:
-            One track per query; NaN in front of its frame. World points are held where depth is missing or the point is
-            not visible; ``frame_flags`` tell of missing depth. Pixels are the rival's own in every frame.
-
-        Raises:
-            ConfigError: a query that is not a point.
-            InputError: a query outside the clip.
-        """
-        first, uv_first = check_point_queries(clip, queries, tracker=self.name)
-        assert queries is not None
-        t, k = len(clip), len(queries)
-        uv_px, confidence = np.full((t, k, 2), np.nan, np.float32), np.zeros((t, k), np.float32)
-        visible, start = np.zeros((t, k), dtype=bool), int(first.min(initial=t))
-        if k:
-            asked = np.column_stack((first - start, uv_first)).astype(np.float32)
-            uv_px[start:], visible[start:], confidence[start:] = self.follow(clip.rgb[start:], asked)
-        early, each = np.arange(t)[:, None] < first, np.arange(k)
-        uv_px[early], visible[early], confidence[early] = np.nan, False, 0
-        uv_px[first, each], visible[first, each], confidence[first, each] = uv_first, True, 1
-        return tracks_of(clip, queries, uv_px, visible, confidence)

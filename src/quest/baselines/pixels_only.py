@@ -18,7 +18,7 @@ class PixelsOnly(Tracker):
     name = "quest-pixels"
 
     @classmethod
-    def without_depth(cls, tracker: Tracker, *, name: str = "quest-pixels") -> PixelsOnly:
+    def without_depth(cls, name: str, tracker: Tracker) -> PixelsOnly:
         """A tracker's networks and settings without depth."""
         other = cls(
             tracker.network,

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32, Int
 
+from quest.data.cut import cut_clip
 from quest.errors import ConfigError, InputError
 from quest.geometry import invert, lift, project, transform
 from quest.types import Clip, Query, State, Tracks
@@ -52,17 +54,10 @@ def query_names(queries: Sequence[Query]) -> tuple[str, ...]:
 
 
 def lift_pixels(clip: Clip, uv_px: Float32[np.ndarray, "T K 2"], *, window_px: int = 3) -> Float32[np.ndarray, "T K 3"]:
-    """World points of pixels, by the median of the valid depths in a small window.
+    """World points of pixels, metres, by the median of the valid depths in a small window.
 
-    The median keeps one stray pixel at a depth edge from throwing the point onto the background.
-
-    Args:
-        clip: frames with depth.
-        uv_px: pixel per frame and query; NaN where there is none.
-        window_px: odd side of the window, pixels.
-
-    Returns:
-        Metres; NaN where the pixel is missing or outside the image, or has no depth around it.
+    The median keeps one stray pixel at a depth edge from throwing the point onto the background. NaN where the pixel is
+    NaN or outside the image, or has no depth around it.
     """
     if clip.depth_m is None:
         return np.full((*uv_px.shape[:2], 3), np.nan, dtype=np.float32)
@@ -131,34 +126,57 @@ def hold_last(point: Float[np.ndarray, "T K C"], *, first: Int[np.ndarray, " K"]
     return np.where((last >= 0)[..., None], held, np.nan).astype(point.dtype)
 
 
-def tracks_of(
-    clip: Clip,
-    queries: Sequence[Query],
-    uv_px: Float32[np.ndarray, "T K 2"],
-    visible: Bool[np.ndarray, "T K"],
-    confidence: Float32[np.ndarray, "T K"],
-) -> Tracks:
-    """Answers of pixels: lifted where they are visible, held in the world elsewhere.
+Followed = tuple[Float32[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"], Float32[np.ndarray, "T K"]]
+"""Pixels, whether they are visible, and how confident that is, from 0 to 1."""
 
-    What is not visible is held because its pixel shows something else. Missing depth is told in ``frame_flags``.
 
-    Args:
-        clip: frames.
-        queries: point queries of it.
-        uv_px: pixel per frame and query; NaN in front of the query's frame.
-        visible: whether the point is seen there.
-        confidence: from 0 to 1.
+class PointTracker(ABC):
+    """Follows points forward from their frames through pictures.
+
+    Pixels are lifted by the median of the valid depths in 3 x 3 pixels.
     """
-    point_world = lift_pixels(clip, uv_px)
-    first = np.array([q.frame for q in queries], dtype=np.int64)
-    return Tracks(
-        names=query_names(queries),
-        labels=tuple(q.label for q in queries),
-        uv_px=uv_px,
-        point_world=hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first),
-        confidence=confidence,
-        visible=visible,
-        state=np.where(visible, State.TRACKING.value, State.LOST.value),
-        stamp_s=clip.stamp_s,
-        frame_flags=depth_flags(clip, queries, point_world),
-    )
+
+    name: str
+    protocols = ("point",)
+
+    @abstractmethod
+    def follow(self, clip: Clip, first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]) -> Followed:
+        """Where points go from their pixels (centres at half-integers) in their first frames, one of which is frame 0.
+
+        What is said of a query's own frame and of earlier ones does not count.
+        """
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """Follow each point query forward from its frame.
+
+        Returns:
+            One track per query; NaN before its frame. World points are held where depth is missing or the point is
+            not visible, because its pixel shows something else; ``frame_flags`` tell of missing depth.
+
+        Raises:
+            ConfigError: a query that is not a point.
+            InputError: a query outside the clip.
+        """
+        first, uv_first = check_point_queries(clip, queries, tracker=self.name)
+        assert queries is not None
+        t, k = len(clip), len(queries)
+        uv_px, confidence = np.full((t, k, 2), np.nan, np.float32), np.zeros((t, k), np.float32)
+        visible, start = np.zeros((t, k), dtype=bool), int(first.min(initial=t))
+        if k:
+            followed = self.follow(cut_clip(clip, slice(start, None)), first - start, uv_first)
+            uv_px[start:], visible[start:], confidence[start:] = followed
+        early, each = np.arange(t)[:, None] < first, np.arange(k)
+        uv_px[early], visible[early], confidence[early] = np.nan, False, 0
+        uv_px[first, each], visible[first, each], confidence[first, each] = uv_first, True, 1
+        point_world = lift_pixels(clip, uv_px)
+        return Tracks(
+            names=query_names(queries),
+            labels=tuple(q.label for q in queries),
+            uv_px=uv_px,
+            point_world=hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first),
+            confidence=confidence,
+            visible=visible,
+            state=np.where(visible, State.TRACKING.value, State.LOST.value),
+            stamp_s=clip.stamp_s,
+            frame_flags=depth_flags(clip, queries, point_world),
+        )

@@ -10,21 +10,19 @@ import sys
 from argparse import Namespace
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
-from quest.baselines.chained import Chained
-from quest.baselines.dense_flow import moved
+from quest.baselines.chained import Chained, Points, Stepped, moved
 from quest.baselines.official import Official, import_code
 from quest.errors import ConfigError, InputError
 from quest.types import Camera, Clip
@@ -33,44 +31,36 @@ STEPS, STEPS_3D = 20, 16
 """Iterations per pair of frames, as in their demo and evaluation."""
 DEPTH_SCALE = 0.2
 """What RAFT-3D is given is metres times this, as in its own evaluation."""
+Colours = UInt8[np.ndarray, "H W 3"]
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-class Raft(Official, Chained[UInt8[np.ndarray, "H W 3"]]):
+class Raft(Official, Chained[Colours]):
     """Optical flow; it never says that it lost anything that is in the image."""
 
-    def __init__(self, name: str, rivals: Path, *, device: str = "auto") -> None:
+    def __init__(self, name: str, rivals: Path) -> None:
         code = import_code(rivals / "RAFT" / "core", "raft")
         network = code.RAFT(Namespace(small=False, mixed_precision=False, alternate_corr=False))
-        super().__init__(name, rivals, network, device=device)
+        super().__init__(name, rivals, network)
 
-    def picture(self, clip: Clip, t: int) -> UInt8[np.ndarray, "H W 3"]:
+    def picture(self, clip: Clip, t: int) -> Colours:
         """Colours."""
         return clip.rgb[t]
 
     @torch.no_grad()
-    def step(
-        self,
-        previous: UInt8[np.ndarray, "H W 3"],
-        picture: UInt8[np.ndarray, "H W 3"],
-        uv_px: Float32[np.ndarray, "M 2"],
-    ) -> tuple[Float32[np.ndarray, "M 2"], Bool[np.ndarray, " M"]]:
+    def step(self, previous: Colours, picture: Colours, uv_px: Points) -> Stepped:
         """The flow at the point."""
         pair = [to_maps(colours, self.device) for colours in (previous, picture)]
         _, flow_px = self.network(*pair, iters=STEPS, test_mode=True)
-        return moved(to_field(flow_px.permute(0, 2, 3, 1), previous), uv_px), np.ones(len(uv_px), dtype=bool)
+        return moved(to_field(flow_px.permute(0, 2, 3, 1), previous), uv_px)
 
 
-@dataclass(frozen=True)
-class DepthPicture:
-    """What RAFT-3D looks at of a frame."""
+class DepthPicture(NamedTuple):
+    """What RAFT-3D looks at of a frame; depth in metres, 0 where missing."""
 
-    rgb: UInt8[np.ndarray, "H W 3"]
-    """Colours."""
+    rgb: Colours
     depth_m: Float32[np.ndarray, "H W"]
-    """Depth along +z in metres, 0 where missing."""
     camera: Camera
-    """Intrinsics."""
 
 
 class Raft3D(Official, Chained[DepthPicture]):
@@ -79,11 +69,11 @@ class Raft3D(Official, Chained[DepthPicture]):
     It runs on CUDA alone: its kernels, ``lietorch`` with ``lietorch_extras``, have to be built there.
     """
 
-    def __init__(self, name: str, rivals: Path, *, device: str = "auto") -> None:
+    def __init__(self, name: str, rivals: Path) -> None:
         with _no_download():
             code = import_code(rivals / "RAFT-3D", "raft3d.raft3d")
             network = code.RAFT3D(Namespace())
-        super().__init__(name, rivals, network, device=device)
+        super().__init__(name, rivals, network)
         self.induced_flow = code.pops.induced_flow
 
     def picture(self, clip: Clip, t: int) -> DepthPicture:
@@ -97,9 +87,7 @@ class Raft3D(Official, Chained[DepthPicture]):
         return DepthPicture(clip.rgb[t], clip.depth_m[t], clip.camera)
 
     @torch.no_grad()
-    def step(
-        self, previous: DepthPicture, picture: DepthPicture, uv_px: Float32[np.ndarray, "M 2"]
-    ) -> tuple[Float32[np.ndarray, "M 2"], Bool[np.ndarray, " M"]]:
+    def step(self, previous: DepthPicture, picture: DepthPicture, uv_px: Points) -> Stepped:
         """The flow at the point, of the field of rigid motions; nothing is found where a frame has no depth at all."""
         if not ((previous.depth_m > 0).any() and (picture.depth_m > 0).any()):
             return uv_px, np.zeros(len(uv_px), dtype=bool)
@@ -110,7 +98,7 @@ class Raft3D(Official, Chained[DepthPicture]):
         lens = torch.tensor([[camera.fx, camera.fy, camera.cx - 0.5, camera.cy - 0.5]], device=self.device)
         motion = self.network(*images, *depths, lens, iters=STEPS_3D)
         flow_px, _, _ = self.induced_flow(motion, depths[0], lens)
-        return moved(to_field(flow_px[..., :2], previous.rgb), uv_px), np.ones(len(uv_px), dtype=bool)
+        return moved(to_field(flow_px[..., :2], previous.rgb), uv_px)
 
 
 def to_maps(values: np.ndarray, device: torch.device) -> Float32[Tensor, "1 C H W"]:

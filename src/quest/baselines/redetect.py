@@ -20,6 +20,9 @@ from quest.data.cut import cut_clip
 from quest.track import Tracker
 from quest.types import LABELS, Clip, Query, State, Tracks
 
+REACH = 0.25
+"""Farthest that a detection is linked, in half widths of the view at the depth of what is linked, and at which a point
+query binds, in half widths of the image."""
 NOTHING_FOUND = "nothing was detected in the first frame"
 
 
@@ -44,53 +47,40 @@ class Redetect:
     followed. From then on, in every ``every``-th frame, detections are linked to tracks one to one, nearest first in
     all (Hungarian), by the distance of their points, or of their pixels where depth is missing. A track that nothing is
     linked to stays where it was, and so do all of them between detections. Nothing is random.
-
-    Args:
-        tracker: whose finder and settings of discovery are used.
-        every: frames from one detection to the next: T, the window of the network.
-        reach: farthest that a detection is linked, in half widths of the view at the depth of what is linked, and at
-            which a point query binds, in half widths of the image.
-        name: what tables call it.
     """
 
     protocols = ("point", "semantic")
 
-    def __init__(self, tracker: Tracker, *, every: int = 4, reach: float = 0.25, name: str = "redetect") -> None:
+    def __init__(self, name: str, tracker: Tracker, *, every: int = 4) -> None:
         self.tracker = tracker
         self.weights_hash = tracker.weights_hash
         self.every = every
-        self.reach = reach
         self.name = name
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        """Track point queries, or what is detected in frame 0.
-
-        Args:
-            clip: frames; depth is needed for world points.
-            queries: point queries; None follows all detections of frame 0.
-
-        Returns:
-            One track per query or detection; NaN before its frame. Visible means linked at the newest detection.
+        """Track point queries, or all that is detected in frame 0; visible means linked at the newest detection.
 
         Raises:
             ConfigError: a query that is not a point.
             InputError: a query outside the clip.
         """
+        flags = (NO_DEPTH,) if clip.depth_m is None else ()
         if queries is None:
-            return self._discover(clip)
+            start = self.detect(clip, 0)
+            inside = start.uv_px.clip(0, (clip.camera.width, clip.camera.height))
+            at = zip(inside.tolist(), start.label, strict=True)
+            queries = [Query.point(0, x, y, name=f"{label} {k}", label=label) for k, ((x, y), label) in enumerate(at)]
+            flags += () if queries else (NOTHING_FOUND,)
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
         rows = _Rows(len(clip), len(queries))
         for t in range(len(clip)):
             rows.hold(t)
-            born = np.flatnonzero(first == t)
+            born, alive = np.flatnonzero(first == t), np.flatnonzero(first < t)
             if len(born) or t % self.every == 0:
                 seen = self.detect(clip, t)
-                alive = np.flatnonzero(first < t)
-                if len(alive) and t % self.every == 0:
+                if t % self.every == 0:
                     self._link(rows, alive, seen, clip, t)
-                if len(born):
-                    self._bind(rows, born, uv_first[born], seen, clip, t)
-        flags = (NO_DEPTH,) if clip.depth_m is None else ()
+                self._bind(rows, born, uv_first[born], seen, clip, t)
         return rows.tracks(clip, query_names(queries), tuple(q.label for q in queries), flags)
 
     def detect(self, clip: Clip, t: int) -> Detections:
@@ -101,50 +91,32 @@ class Redetect:
         point = lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None])[0]
         return Detections(uv_px, point, found.labels, found.p.astype(np.float32))
 
-    def _discover(self, clip: Clip) -> Tracks:
-        start = self.detect(clip, 0)
-        rows = _Rows(len(clip), len(start.label))
-        every_row = np.arange(len(start.label))
-        rows.set(0, every_row, start, every_row)
-        for t in range(1, len(clip)):
-            rows.hold(t)
-            if t % self.every == 0 and len(every_row):
-                self._link(rows, every_row, self.detect(clip, t), clip, t)
-        names = tuple(f"{label} {k}" for k, label in enumerate(start.label))
-        flags = ((NO_DEPTH,) if clip.depth_m is None else ()) + (() if names else (NOTHING_FOUND,))
-        return rows.tracks(clip, names, start.label, flags)
-
     def _bind(
-        self,
-        rows: _Rows,
-        born: np.ndarray,
-        uv_px: Float32[np.ndarray, "B 2"],
-        seen: Detections,
-        clip: Clip,
-        t: int,
+        self, rows: _Rows, born: np.ndarray, uv_px: Float32[np.ndarray, "B 2"], seen: Detections, clip: Clip, t: int
     ) -> None:
         """Point queries begin at the nearest detection; one that has none in reach begins, and stays, at its pixel."""
-        own = cut_clip(clip, slice(t, t + 1))
         rows.uv_px[t, born] = uv_px
-        rows.point_world[t, born] = lift_pixels(own, uv_px[None])[0]
-        half_px = max(clip.camera.width, clip.camera.height) / 2
-        gap = np.linalg.norm(uv_px[:, None] - seen.uv_px[None], axis=-1) / half_px
-        which, detection = link(gap, self.reach)
+        rows.point_world[t, born] = lift_pixels(cut_clip(clip, slice(t, t + 1)), uv_px[None])[0]
+        which, detection = link(_gap_in_image(uv_px, seen, clip))
         rows.set(t, born[which], seen, detection)
 
     def _link(self, rows: _Rows, alive: np.ndarray, seen: Detections, clip: Clip, t: int) -> None:
         rows.visible[t, alive] = False
-        half_px = max(clip.camera.width, clip.camera.height) / 2
-        in_image = np.linalg.norm(rows.uv_px[t, alive][:, None] - seen.uv_px[None], axis=-1) / half_px
-        in_space = np.linalg.norm(rows.point_world[t, alive][:, None] - seen.point_world[None], axis=-1)
-        pose = clip.cam_from_world[t]
-        half_m = (rows.point_world[t, alive] @ pose[2, :3] + pose[2, 3]) * half_px / clip.camera.fx
-        gap = np.where(np.isfinite(in_space), in_space / np.maximum(half_m, 1e-6)[:, None], in_image)
-        which, detection = link(gap, self.reach)
+        point, pose = rows.point_world[t, alive], clip.cam_from_world[t]
+        in_space = np.linalg.norm(point[:, None] - seen.point_world[None], axis=-1)
+        half_m = (point @ pose[2, :3] + pose[2, 3]) * max(clip.camera.width, clip.camera.height) / 2 / clip.camera.fx
+        in_image = _gap_in_image(rows.uv_px[t, alive], seen, clip)
+        which, detection = link(np.where(np.isfinite(in_space), in_space / np.maximum(half_m, 1e-6)[:, None], in_image))
         rows.set(t, alive[which], seen, detection)
 
 
-def link(gap: Float[np.ndarray, "K N"], reach: float) -> tuple[np.ndarray, np.ndarray]:
+def _gap_in_image(uv_px: Float32[np.ndarray, "K 2"], seen: Detections, clip: Clip) -> Float[np.ndarray, "K N"]:
+    """Distances of pixels from detections, in half widths of the image."""
+    gap_px = np.linalg.norm(uv_px[:, None] - seen.uv_px[None], axis=-1)
+    return gap_px / (max(clip.camera.width, clip.camera.height) / 2)
+
+
+def link(gap: Float[np.ndarray, "K N"], reach: float = REACH) -> tuple[np.ndarray, np.ndarray]:
     """Tracks and detections that belong together: as many pairs within reach as possible, then the least distance.
 
     Returns:

@@ -14,38 +14,39 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float32, UInt8
+from jaxtyping import Float32, Int, UInt8
 from torch import Tensor
 
-from quest.baselines.official import OfficialClip, import_code
+from quest.baselines.official import Official, import_code
+from quest.baselines.point_queries import Followed, PointTracker
+from quest.types import Clip
 
 SIDE_PX = 256
 """Of the square into which a picture is stretched, as in their own evaluation."""
 _CHUNK = 64
+Answer = tuple[Float32[Tensor, "T K 2"], Float32[Tensor, "T K"]]
+"""Points (x, y) in the square, and the probabilities that they are visible."""
+Video = Float32[Tensor, "1 T S S 3"]
+Queries = Float32[Tensor, "1 K 3"]
 
 
-class Tapnet(OfficialClip):
+class Tapnet(Official, PointTracker):
     """What they share: pictures and points come in, and answers go out, in the picture's own pixels."""
 
-    def follow(
-        self, rgb: UInt8[np.ndarray, "T H W 3"], queries: Float32[np.ndarray, "K 3"]
-    ) -> tuple[Float32[np.ndarray, "T K 2"], Bool[np.ndarray, "T K"], Float32[np.ndarray, "T K"]]:
+    @torch.no_grad()
+    def follow(self, clip: Clip, first: Int[np.ndarray, " K"], uv_first: Float32[np.ndarray, "K 2"]) -> Followed:
         """Confidence is the probability that the point is visible."""
-        height, width = rgb.shape[1:3]
-        zoom = np.array((width, height), np.float32) / SIDE_PX
-        tyx = queries[:, [0, 2, 1]] / np.array((1, zoom[1], zoom[0]), np.float32)
-        with torch.no_grad():
-            xy, p_visible = self.answer(self._video(rgb), torch.from_numpy(tyx).to(self.device)[None])
+        zoom = np.array((clip.camera.width, clip.camera.height), np.float32) / SIDE_PX
+        tyx = np.column_stack((first, (uv_first / zoom)[:, ::-1])).astype(np.float32)
+        xy, p_visible = self.answer(self._video(clip.rgb), torch.from_numpy(tyx).to(self.device)[None])
         p = p_visible.float().cpu().numpy()
         return xy.float().cpu().numpy() * zoom, p > 0.5, p
 
     @abstractmethod
-    def answer(
-        self, video: Float32[Tensor, "1 T S S 3"], queries: Float32[Tensor, "1 K 3"]
-    ) -> tuple[Float32[Tensor, "T K 2"], Float32[Tensor, "T K"]]:
-        """Points (x, y) in the square, and the probabilities that they are visible."""
+    def answer(self, video: Video, queries: Queries) -> Answer:
+        """What the network says of points (t, y, x)."""
 
-    def _video(self, rgb: UInt8[np.ndarray, "T H W 3"]) -> Float32[Tensor, "1 T S S 3"]:
+    def _video(self, rgb: UInt8[np.ndarray, "T H W 3"]) -> Video:
         small = []
         for frame in rgb:
             maps = torch.from_numpy(np.ascontiguousarray(frame)).to(self.device).permute(2, 0, 1)[None].float()
@@ -56,29 +57,22 @@ class Tapnet(OfficialClip):
 class Tapir(Tapnet):
     """TAPIR and BootsTAPIR; ``causal`` weights see a frame after the other, others the whole clip at once.
 
-    Args:
-        name: what tables call it.
-        rivals: the folder of code and weights.
-        causal: whether the weights are of the online model.
-        boots: whether they are of BootsTAPIR, which has a pyramid and convolutions that TAPIR has not.
-        device: as of :func:`quest.load`.
+    BootsTAPIR has a pyramid and convolutions that TAPIR has not.
     """
 
-    def __init__(self, name: str, rivals: Path, *, causal: bool, boots: bool, device: str = "auto") -> None:
+    def __init__(self, name: str, rivals: Path, *, causal: bool, boots: bool) -> None:
         code = import_code(rivals / "tapnet", "tapnet.torch.tapir_model")
         network = code.TAPIR(pyramid_level=int(boots), extra_convs=boots, use_casual_conv=causal)
-        super().__init__(name, rivals, network, device=device)
+        super().__init__(name, rivals, network)
         self.causal = causal
 
-    def answer(
-        self, video: Float32[Tensor, "1 T S S 3"], queries: Float32[Tensor, "1 K 3"]
-    ) -> tuple[Float32[Tensor, "T K 2"], Float32[Tensor, "T K"]]:
+    def answer(self, video: Video, queries: Queries) -> Answer:
         """Visible is what is neither occluded nor uncertain."""
         said = self._stream(video, queries) if self.causal else self.network(video, queries, query_chunk_size=_CHUNK)
         p_visible = (1 - said["occlusion"][0].sigmoid()) * (1 - said["expected_dist"][0].sigmoid())
         return said["tracks"][0].transpose(0, 1), p_visible.T
 
-    def _stream(self, video: Float32[Tensor, "1 T S S 3"], queries: Float32[Tensor, "1 K 3"]) -> dict[str, Tensor]:
+    def _stream(self, video: Video, queries: Queries) -> dict[str, Tensor]:
         """A frame after the other; the memory of a point is empty when its frame comes."""
         network, first = self.network, queries[0, :, 0].long()
         own, at = first.unique(return_inverse=True)
@@ -113,13 +107,11 @@ class Tapir(Tapnet):
 class TapNext(Tapnet):
     """TAPNext and TAPNext++, a frame after the other."""
 
-    def __init__(self, name: str, rivals: Path, *, device: str = "auto") -> None:
+    def __init__(self, name: str, rivals: Path) -> None:
         code = import_code(rivals / "tapnet", "tapnet.tapnext.tapnext_torch")
-        super().__init__(name, rivals, code.TAPNext(image_size=(SIDE_PX, SIDE_PX)), device=device)
+        super().__init__(name, rivals, code.TAPNext(image_size=(SIDE_PX, SIDE_PX)))
 
-    def answer(
-        self, video: Float32[Tensor, "1 T S S 3"], queries: Float32[Tensor, "1 K 3"]
-    ) -> tuple[Float32[Tensor, "T K 2"], Float32[Tensor, "T K"]]:
+    def answer(self, video: Video, queries: Queries) -> Answer:
         """The network takes up each point in its frame; its answers are (y, x)."""
         yx, logits, state = [], [], None
         for t in range(video.shape[1]):

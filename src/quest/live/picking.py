@@ -42,10 +42,7 @@ class Picking:
     """
 
     def __init__(self, tracker: Tracker, clip: Clip, queries: Sequence[Query], out: Path) -> None:
-        self._tracker = tracker
-        self._clip = clip
-        self._queries = list(queries)
-        self._out = out
+        self._tracker, self._clip, self._queries, self._out = tracker, clip, list(queries), out
         self._feed = Feed()
         self._preview: tuple[Session, threading.Thread] | None = None
         self.saved = 0
@@ -95,17 +92,10 @@ class Picking:
     async def _found(self, request: web.Request) -> web.StreamResponse:
         found = await asyncio.to_thread(self._tracker.find, self._clip.rgb[self._t(request)])
         least = self._tracker.config.prompt_threshold
-        rows = [i for i in range(len(found)) if found.labels[i] in LABELS and found.p[i] > least]
+        uv_px, box_px, p = found.uv_px.tolist(), found.box_px.tolist(), found.p.tolist()
+        rows = [i for i, label in enumerate(found.labels) if label in LABELS and p[i] > least]
         return _json(
-            found=[
-                {
-                    "uv_px": found.uv_px[i].tolist(),
-                    "box_px": found.box_px[i].tolist(),
-                    "label": found.labels[i],
-                    "p": float(found.p[i]),
-                }
-                for i in rows
-            ]
+            found=[{"uv_px": uv_px[i], "box_px": box_px[i], "label": found.labels[i], "p": p[i]} for i in rows]
         )
 
     async def _read(self, request: web.Request) -> list[Query]:

@@ -159,10 +159,7 @@ class Server:
         self, title: str, mode: Literal["live", "pick"], routes: Mapping[str, Handler], *, port: int = 0
     ) -> None:
         require("aiohttp")
-        self._title = title
-        self._mode = mode
-        self._routes = routes
-        self._port = port
+        self._title, self._mode, self._routes, self._port = title, mode, routes, port
         self._secret = secrets.token_urlsafe(16)
         self._loop = asyncio.new_event_loop()
         self._started: threading.Event = threading.Event()

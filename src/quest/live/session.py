@@ -66,7 +66,6 @@ class Shot:
     header: str
     """JSON: the stream's answers as one of its lines (``docs/monitor.md``), events, queries that wait, colours."""
     jpeg: bytes
-    """The picture."""
 
 
 class Session:
@@ -76,9 +75,7 @@ class Session:
         tracker: follows.
         source: frames.
         queries: what to follow; None finds entities, in later frames too.
-        alpha: as in :meth:`quest.track.Tracker.stream`.
-        alpha_frames: likewise.
-        wait: likewise.
+        alpha, alpha_frames, wait: as in :meth:`quest.track.Tracker.stream`.
         record: folder for ``frames.jsonl`` (the answers, a line a frame) and ``edits.jsonl`` (what was asked, with the
             frame); None keeps nothing.
 
@@ -199,32 +196,31 @@ class Session:
             done.set_result(said)
 
     def _do(self, edit: Edit) -> str:
-        stream = self.stream
-        if edit.do in ("pause", "resume"):
-            self._paused = edit.do == "pause"
+        stream, do = self.stream, edit.do
+        if do in ("pause", "resume"):
+            self._paused = do == "pause"
             return "paused: nothing is followed" if self._paused else "goes on"
-        if edit.do == "retire":
+        if do == "retire":
             stream.retire(edit.query)
             return "followed no longer"
-        if edit.do == "rename":
+        if do == "rename":
             stream.rename(edit.query, edit.name)
             return f"is called {edit.name} from now on"
-        if edit.do == "confirm":
+        if do == "confirm":
             stream.confirm(edit.query)
             return "confirmed"
-        if edit.do == "label":
+        if do == "label":
             stream.add(Query.semantic(edit.label or "", edit.name))
             return f"looks for a {edit.label}"
-        if edit.do == "text":
+        if do == "text":
             stream.add(Query.text(edit.words, edit.name))
             return f"looks for {edit.words}"
         x, y = self._now(edit)
-        if edit.do == "place":
-            stream.place(edit.query, x, y)
-            return "followed from there"
-        number = stream.add(Query.point(stream.frame, x, y, name=edit.name, label=edit.label))
+        number = edit.query
+        if do == "point":
+            number = stream.add(Query.point(stream.frame, x, y, name=edit.name, label=edit.label))
         stream.place(number, x, y)  # in the frame that was pointed at, not in the next one
-        return "followed"
+        return "followed" if do == "point" else "followed from there"
 
     def _now(self, edit: Edit) -> tuple[float, float]:
         """Where a pixel of a recent frame is in the newest one.

@@ -1,20 +1,12 @@
 """Calibration, a sequential statistic, alarms: knows when a query silently follows something else."""
 
-from quest.monitor.alarm import Alarm, Verdict
-from quest.monitor.calibration import Calibration, probability
-from quest.monitor.calibration_file import Inputs, read_calibrations, write_calibrations
-from quest.monitor.conformal import Budget
-from quest.monitor.monitor import Monitor, MonitorState
-
-__all__ = [
-    "Alarm",
-    "Budget",
-    "Calibration",
-    "Inputs",
-    "Monitor",
-    "MonitorState",
-    "Verdict",
-    "probability",
-    "read_calibrations",
-    "write_calibrations",
-]
+from quest.monitor.calibration import Calibration as Calibration
+from quest.monitor.calibration import Inputs as Inputs
+from quest.monitor.calibration import probability as probability
+from quest.monitor.calibration import read_calibrations as read_calibrations
+from quest.monitor.calibration import write_calibrations as write_calibrations
+from quest.monitor.conformal import Budget as Budget
+from quest.monitor.monitor import Alarm as Alarm
+from quest.monitor.monitor import Monitor as Monitor
+from quest.monitor.monitor import MonitorState as MonitorState
+from quest.monitor.monitor import Verdict as Verdict

@@ -1,25 +1,33 @@
-"""What the monitor knows from calibration streams, as one line of JSON."""
+"""What the monitor knows from calibration streams, and the file of it: for streams with depth, and colours alone."""
 
 from __future__ import annotations
 
 import bisect
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float, Float64
 
-from quest.errors import ConfigError, WeightsError
+from quest.errors import WeightsError
 from quest.monitor.conformal import Budget, Threshold, least_alpha, threshold
 from quest.monitor.statistic import Cusum
+from quest.untrusted import build, read_json, reading
+from quest.whole_file import whole_file
 
 FORMAT = 4
 """Version of the text."""
 
 Unit = Literal["object", "take"]
 """What a promise is about: other objects, or other takes of the same objects."""
+
+Inputs = Literal["depth", "colours"]
+"""What the frames of a stream bring: colours with depth, or colours alone."""
 
 LOGIT_LIMIT = 8.0
 """Log odds are kept within this: no single frame is surer than 0.99966."""
@@ -69,19 +77,11 @@ class Calibration:
             raise WeightsError(f"monitor: expected block_frames >= 1, got {self.block_frames}; calibrate again")
 
     def logit(self, log_odds: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
-        """Calibrated log odds that a query is lost, within plus and minus :data:`LOGIT_LIMIT`.
-
-        Args:
-            log_odds: the tracker's own; NaN stays NaN.
-        """
+        """Calibrated log odds that a query is lost, from the tracker's own; see :func:`adjusted`."""
         return adjusted(log_odds, slope=self.slope, shift=self.shift)
 
     def threshold(self, alpha: float) -> Threshold:
-        """What loss-free streams of the calibration's length exceed with a probability of at most alpha.
-
-        Raises:
-            ConfigError: alpha is not in (0, 1).
-        """
+        """What loss-free streams of the calibration's length exceed with a probability of at most alpha, in (0, 1)."""
         return threshold(self.maxima, alpha)
 
     @property
@@ -118,17 +118,8 @@ class Calibration:
 
     def to_json(self) -> str:
         """One line of text; maxima are rounded up to four decimals, so that no threshold becomes more eager."""
-        raw = {
-            "format": FORMAT,
-            "slope": self.slope,
-            "shift": self.shift,
-            "statistic": {"drift": self.statistic.drift, "keep": self.statistic.keep},
-            "maxima": (np.ceil(np.round(self.maxima * 10**_DECIMALS, 6)) / 10**_DECIMALS).tolist(),
-            "block_frames": self.block_frames,
-            "about": self.about,
-            "revision": self.revision,
-            "unit": self.unit,
-        }
+        maxima = (np.ceil(np.round(self.maxima * 10**_DECIMALS, 6)) / 10**_DECIMALS).tolist()
+        raw = {"format": FORMAT, **vars(self), "statistic": vars(self.statistic), "maxima": maxima}
         return json.dumps(raw, separators=(",", ":"), allow_nan=False)
 
     @classmethod
@@ -138,28 +129,13 @@ class Calibration:
         Raises:
             WeightsError: the text is damaged, or of another version.
         """
-        try:
-            raw = json.loads(text)
-            if raw["format"] != FORMAT:
+        with reading("monitor: its calibration", WeightsError, "run `quest calibrate` again"):
+            raw = build(dict, json.loads(text), "calibration")
+            if (version := raw.pop("format")) != FORMAT:
                 raise WeightsError(
-                    f"monitor: expected a calibration of format {FORMAT}, got {raw['format']!r}; "
-                    "run `quest calibrate` again"
+                    f"monitor: expected a calibration of format {FORMAT}, got {version!r}; run `quest calibrate` again"
                 )
-            return cls(
-                slope=float(raw["slope"]),
-                shift=float(raw["shift"]),
-                statistic=Cusum(**raw["statistic"]),
-                maxima=np.array(raw["maxima"], np.float64),
-                block_frames=int(raw["block_frames"]),
-                about=str(raw["about"]),
-                revision=int(raw["revision"]),
-                unit=raw["unit"],
-            )
-        except (json.JSONDecodeError, KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
-            raise WeightsError(
-                f"monitor: its calibration cannot be read ({type(error).__name__}: {error}); "
-                "run `quest calibrate` again"
-            ) from error
+            return build(cls, {**raw, "maxima": np.array(raw["maxima"], np.float64)}, "calibration")
 
 
 def adjusted(log_odds: Float[np.ndarray, "*N"], *, slope: float, shift: float) -> Float64[np.ndarray, "*N"]:
@@ -170,3 +146,34 @@ def adjusted(log_odds: Float[np.ndarray, "*N"], *, slope: float, shift: float) -
 def probability(logit: Float[np.ndarray, "*N"]) -> Float64[np.ndarray, "*N"]:
     """Probability of log odds."""
     return 1.0 / (1.0 + np.exp(-logit.astype(np.float64)))
+
+
+def read_calibrations(path: Path | None = None) -> dict[Inputs, Calibration]:
+    """Read the calibrations of a file, by what the frames bring.
+
+    Args:
+        path: a file of `quest calibrate`; None for the one that comes with the package, and an empty dict if none does.
+
+    Raises:
+        WeightsError: there is no such file, or it is damaged.
+    """
+    file = resources.files("quest") / "assets" / "monitor.json" if path is None else path
+    if path is None and not file.is_file():
+        return {}
+    remedy = "make it with `quest calibrate`"
+    with reading(f"monitor {file}", WeightsError, remedy):
+        raw = json.loads(file.read_text(encoding="utf-8")) if path is None else read_json(path, WeightsError, remedy)
+    if not isinstance(raw, dict) or not raw or not raw.keys() <= set(get_args(Inputs)):
+        known = " or ".join(get_args(Inputs))
+        raise WeightsError(f"monitor {file}: expected calibrations for {known}; make it with `quest calibrate`")
+    try:
+        return {inputs: Calibration.from_json(json.dumps(value)) for inputs, value in raw.items()}
+    except WeightsError as error:
+        raise WeightsError(f"{file}: {error}") from error
+
+
+def write_calibrations(path: Path, calibrations: Mapping[Inputs, Calibration]) -> None:
+    """Write at least one calibration to a file, whole or not at all."""
+    raw = {inputs: json.loads(calibration.to_json()) for inputs, calibration in calibrations.items()}
+    with whole_file(path) as partial:
+        partial.write_text(json.dumps(raw, separators=(",", ":")) + "\n", encoding="utf-8")

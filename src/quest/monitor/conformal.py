@@ -21,9 +21,7 @@ LEAST_TAIL = 10
 """With fewer maxima than this in the tail, nothing is extrapolated: the threshold is infinite."""
 
 _FIRST_BLOCK = 0.8
-
 _HEAVIEST = 0.5
-
 _MOST_HALVINGS = 900
 """More would end at zero, which is no probability."""
 
@@ -86,11 +84,7 @@ class Budget:
         return f"alpha {self.alpha:g}" + ("" if self.frames is None else f" in {self.frames} frames")
 
     def since(self, age: Int[np.ndarray, " N"]) -> Int[np.ndarray, " N"]:
-        """Frames since alpha was last given out: blocks count from there.
-
-        Args:
-            age: frames since the start of the stream or the restart.
-        """
+        """Frames since alpha was last given out, of those since the start or the restart: blocks count from there."""
         return age if self.frames is None else age % self.frames
 
     def part(self, *, block: int, restart: int, block_frames: int) -> float:

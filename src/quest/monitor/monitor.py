@@ -6,14 +6,54 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float32, Float64, Int64
 
 from quest.errors import InputError
-from quest.monitor.alarm import Alarm, Verdict
 from quest.monitor.calibration import Calibration, probability
 from quest.monitor.conformal import Budget, Threshold
 
 _KNOWN_THRESHOLDS = 1000
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """The identity of a query is probably lost."""
+
+    name: str
+    """The query's name."""
+    query: int
+    """The query's key."""
+    frame: int
+    """Frame in which the alarm was raised."""
+    stamp_s: float
+    """Time of that frame, seconds."""
+    statistic: float
+    """The query's statistic in that frame."""
+    threshold: float
+    """What it exceeded."""
+    alpha: float
+    """The share of loss-free streams that may alarm; how the threshold was chosen."""
+    reason: str
+    """What speaks for a loss, in words."""
+    extrapolated: bool = False
+    """Whether the threshold lies beyond what the calibration streams can support by themselves and was read off a
+    fitted tail."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the monitor makes of one frame; rows in the order of the keys that were asked."""
+
+    lost_p: Float32[np.ndarray, " K"]
+    """Calibrated probability that the identity is lost; NaN of queries that rest."""
+    statistic: Float32[np.ndarray, " K"]
+    """The sequential statistic, which an alarm compares with its threshold."""
+    open: tuple[Alarm | None, ...]
+    """The alarm of each query that has been raised and not cleared, or None."""
+    raised: tuple[Alarm, ...]
+    """Alarms raised in this frame."""
+    cleared: tuple[Alarm, ...]
+    """Alarms that ended in this frame."""
 
 
 @dataclass
@@ -59,19 +99,15 @@ class Monitor:
         self.state = MonitorState()
 
     def watch(self, key: int, name: str) -> None:
-        """Begin to watch a query; its next frame is its first.
-
-        Args:
-            key: number of the query, unique in the stream.
-            name: what alarms call it.
+        """Begin to watch a query, by a key unique in the stream; its next frame is its first.
 
         Raises:
             InputError: the key is being watched already.
         """
-        if key in self.state.name:
-            raise InputError(f"monitor: query {key} is being watched already; forget it first")
-        self.state.name[key] = name
         state = self.state
+        if key in state.name:
+            raise InputError(f"monitor: query {key} is being watched already; forget it first")
+        state.name[key] = name
         state.statistic = np.append(state.statistic, 0.0)
         state.restart, state.origin = np.append(state.restart, 0), np.append(state.origin, 0)
 
@@ -195,9 +231,8 @@ class Monitor:
 
         That holds for queries that rest too, but not where an alarm is open, which ends by what is seen alone.
         """
-        begins = self._age() % self.calibration.block_frames == 0
-        begins &= np.array([key not in self.state.open for key in self.state.name], dtype=bool)
-        self.state.statistic[begins] = 0.0
+        watched = np.array([key not in self.state.open for key in self.state.name], dtype=bool)
+        self.state.statistic[watched & (self._age() % self.calibration.block_frames == 0)] = 0.0
 
     def _age(self) -> Int64[np.ndarray, " N"]:
         """Frames since the first block of each query began."""

@@ -1,7 +1,6 @@
 """Sequential statistics: evidence collected over frames, per query.
 
-All have one interface, so that the monitor and the rules that it is compared with differ in nothing else. The state
-of N queries is an array of N by :attr:`size` numbers.
+All have one interface, so that the monitor and the rules that it is compared with differ in nothing else.
 """
 
 from __future__ import annotations
@@ -14,29 +13,19 @@ from jaxtyping import Float64
 
 from quest.errors import ConfigError
 
+Evidence = Float64[np.ndarray, " N"]
+Memory = Float64[np.ndarray, "N R"]
+
 
 @runtime_checkable
 class Statistic(Protocol):
-    """Collects evidence; the larger, the more it speaks for a loss.
-
-    Attributes:
-        size: numbers that are remembered per query.
-    """
+    """Collects evidence; the larger, the more it speaks for a loss."""
 
     size: ClassVar[int]
+    """Numbers that are remembered per query."""
 
-    def update(
-        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
-    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
-        """Take in one frame.
-
-        Args:
-            state: from the frame before; zeros at the start.
-            evidence: of this frame.
-
-        Returns:
-            The new state and the value of the statistic.
-        """
+    def update(self, state: Memory, evidence: Evidence) -> tuple[Memory, Evidence]:
+        """The new state and the value of the statistic, from the state of the frame before; zeros at the start."""
         ...
 
 
@@ -63,10 +52,8 @@ class Cusum:
         rise = max(0.0, evidence - self.drift)
         return rise * (frames if self.keep == 1.0 else (1.0 - self.keep**frames) / (1.0 - self.keep))
 
-    def update(
-        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
-    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
-        """Take in one frame; see :class:`Statistic`."""
+    def update(self, state: Memory, evidence: Evidence) -> tuple[Memory, Evidence]:
+        """Take in one frame."""
         value = np.maximum(0.0, self.keep * state[:, 0] + evidence - self.drift)
         return value[:, None], value
 
@@ -83,10 +70,8 @@ class PageHinkley:
     """Rise above the mean that is tolerated in a frame."""
     size: ClassVar[int] = 4
 
-    def update(
-        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
-    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
-        """Take in one frame; see :class:`Statistic`."""
+    def update(self, state: Memory, evidence: Evidence) -> tuple[Memory, Evidence]:
+        """Take in one frame."""
         count, mean, total, least = state.T
         count = count + 1.0
         mean = mean + (evidence - mean) / count
@@ -101,8 +86,6 @@ class Latest:
 
     size: ClassVar[int] = 0
 
-    def update(
-        self, state: Float64[np.ndarray, "N R"], evidence: Float64[np.ndarray, " N"]
-    ) -> tuple[Float64[np.ndarray, "N R"], Float64[np.ndarray, " N"]]:
-        """Take in one frame; see :class:`Statistic`."""
+    def update(self, state: Memory, evidence: Evidence) -> tuple[Memory, Evidence]:
+        """Take in one frame."""
         return state, evidence

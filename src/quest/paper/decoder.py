@@ -69,9 +69,7 @@ class Attention(nn.Module):
     def forward(self, x: Float[Tensor, "B N D"], mask: Bool[Tensor, "N N"] | None = None) -> Float[Tensor, "B N D"]:
         """What they read from each other, to be added to ``x``.
 
-        Args:
-            x: the vectors.
-            mask: True where one (rows) may look at another; each must be allowed at least one.
+        Masks are True where one (rows) may look at another; each must be allowed at least one.
         """
         q, k, v = self.qkv(self.norm(x)).unflatten(-1, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         read = F.scaled_dot_product_attention(q, k, v, attn_mask=mask)

@@ -1,7 +1,7 @@
 """Stage 2: the flow head learns where entities go next, behind a backbone that stays as stage 1 left it.
 
 The truth is the displacement from a window's newest frame to the frame after it at the window's own step, so time
-enters through the window alone (see :mod:`quest.paper.flow_head`): steps of one, two and three stored frames, standing
+enters through the window alone (see :mod:`quest.paper.network`): steps of one, two and three stored frames, standing
 still and going backwards all ask for one more of the same. What is stored may be every sixth frame of a take; a stream
 that gives every frame then has shorter steps than those that were learned from.
 """
@@ -57,12 +57,7 @@ class FlowScores:
 
 
 class StageTwo:
-    """Stage 2: L1 on scene flow.
-
-    Args:
-        network: a network with a flow head (see :func:`with_flow_head`).
-        answered: what it answers for the entities of a batch.
-    """
+    """Stage 2: L1 on scene flow of a network with a flow head; ``answered`` gives its answers for entities."""
 
     name = "stage-2"
 
@@ -82,40 +77,34 @@ class StageTwo:
 
     def losses(self, frames: FrameBatch, truth: WindowTruth) -> dict[str, Float[Tensor, ""]]:
         """L1 of the displacement; what rests counts like what moves, or it would be said to move a little."""
-        answers, flow = self._answer(frames, truth)
+        flow, judged = self._answer(frames, truth)
         error = (flow - truth.flow.nan_to_num()).abs().sum(-1) / truth.unit[:, None]
-        return {"flow": masked_mean(error, _judged(answers, truth))}
+        return {"flow": masked_mean(error, judged)}
 
     def validate(self, sampler: WindowSampler, *, batches: int, device: torch.device) -> FlowScores:
         """EPE3D on the same windows at every call, beside zero flow."""
-        rng = np.random.default_rng(0)
+        rng, errors, lengths = np.random.default_rng(0), [], []
         self.network.eval()
-        epe, zero = [], []
         with torch.no_grad():
             for _ in range(batches):
                 frames, truth = sampler.draw(rng, disturb=False)
                 frames, truth = frames.to(device), truth.to(device)
-                answers, flow = self._answer(frames, truth)
-                mask = _judged(answers, truth)
-                error = (flow - truth.flow).norm(dim=-1) / truth.unit[:, None]
-                epe.append(error[mask].float().cpu())
-                zero.append(_length(truth)[mask].float().cpu())
+                flow, judged = self._answer(frames, truth)
+                for parts, way in ((errors, flow - truth.flow), (lengths, truth.flow)):
+                    parts.append((way.norm(dim=-1) / truth.unit[:, None])[judged].float().cpu())
         self.network.train()
-        error, length = torch.cat(epe), torch.cat(zero)
+        error, length = torch.cat(errors), torch.cat(lengths)
         moving = length > _MOVING
-        return FlowScores(
-            epe=mean_of(error) or 0.0,
-            epe_moving=mean_of(error[moving]) or 0.0,
-            zero=mean_of(length) or 0.0,
-            zero_moving=mean_of(length[moving]) or 0.0,
-            answers=len(error),
-            moving=int(moving.sum()),
+        epe, epe_moving, zero, zero_moving = (
+            mean_of(part) or 0.0 for part in (error, error[moving], length, length[moving])
         )
+        return FlowScores(epe, epe_moving, zero, zero_moving, answers=len(error), moving=int(moving.sum()))
 
-    def _answer(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Answered, Float[Tensor, "B K 3"]]:
+    def _answer(self, frames: FrameBatch, truth: WindowTruth) -> tuple[Float[Tensor, "B K 3"], Bool[Tensor, "B K"]]:
+        """Displacements, and which of them count."""
         with torch.no_grad():
             answers = self._answered(frames, truth)
-        return answers, self.network.displace(answers.embedding)
+        return self.network.displace(answers.embedding), answers.mask[:, -1] & torch.isfinite(truth.flow).all(-1)
 
 
 def with_flow_head(network: PaperNetwork) -> PaperNetwork:
@@ -133,11 +122,3 @@ def _rebuilt(network: PaperNetwork, *, flow: bool) -> PaperNetwork:
     own = network.state_dict()
     other.load_state_dict({name: own.get(name, tensor) for name, tensor in other.state_dict().items()})
     return other.train(network.training)
-
-
-def _judged(answers: Answered, truth: WindowTruth) -> Bool[Tensor, "B K"]:
-    return answers.mask[:, -1] & torch.isfinite(truth.flow).all(-1)
-
-
-def _length(truth: WindowTruth) -> Float[Tensor, "B K"]:
-    return truth.flow.norm(dim=-1) / truth.unit[:, None]

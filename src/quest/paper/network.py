@@ -55,11 +55,12 @@ from quest.model.frames import FrameBatch
 from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 from quest.model.weights import shipped_weights
 from quest.paper.decoder import DecoderLayer, Tokens
-from quest.paper.flow_head import FlowHead
 from quest.types import LABELS
 from quest.untrusted import reading
 
 FORMAT = "quest-paper-1"
+REST = 0.003
+"""Displacements shorter than this, in units of the reference frame, are answered as 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,10 +108,6 @@ class Decoded:
     where: Float[Tensor, "B T K N"]
     """Attention of the layer's first head on the tokens of each frame."""
 
-    def newest(self) -> Decoded:
-        """Of the newest frame alone."""
-        return Decoded(self.embedding[:, -1:], self.where[:, -1:])
-
 
 @dataclass(frozen=True)
 class SlotAnswers:
@@ -140,19 +137,45 @@ class SlotAnswers:
         return SlotAnswers(*(_gather(getattr(self, f.name), slot) for f in fields(self)))
 
 
-class PaperNetwork(nn.Module):
-    """Maps a window of T frames to the answers of K slots in each of them.
+class FlowHead(nn.Module):
+    """Where every query goes next: the 3D displacement from a window's newest frame to the frame after it.
 
-    Attributes:
-        config: its shapes.
-        encoder: of images, frozen.
-        flow: head that stage 2 trains; None without.
+    The frame after it is one step on, and a step is whatever lies between the frames of the window: the head is told of
+    no clock. It starts out by saying that nothing moves. Most things rest most of the time, and a head is never quite
+    still: what it answers below :data:`REST` is rest, but while it learns.
     """
+
+    def __init__(self, width: int, *, window: int) -> None:
+        super().__init__()
+        self.window = window
+        self.norm = nn.LayerNorm(width)
+        self.frame = nn.Linear(width, width)
+        self.age = nn.Parameter(0.02 * torch.randn(window, width))
+        self.fuse = nn.Linear(window * width, width)
+        final = nn.Linear(width, 3)
+        self.out = nn.Sequential(nn.GELU(), nn.Linear(width, width), nn.GELU(), final)
+        nn.init.zeros_(final.weight)
+        nn.init.zeros_(final.bias)
+
+    def forward(self, embedding: Float[Tensor, "B T K D"]) -> Float[Tensor, "B K 3"]:
+        """Displacement to the next frame, in units of the reference frame.
+
+        Of a stream's first frames, before there are as many as in a window, the oldest stands for those before it.
+        """
+        missing = self.window - embedding.shape[1]
+        embedding = torch.cat((embedding[:, :1].expand(-1, missing, -1, -1), embedding), dim=1)
+        x = F.gelu(self.frame(self.norm(embedding)) + self.age[:, None])
+        flow = self.out(self.fuse(x.transpose(1, 2).flatten(2))).float()
+        return flow if self.training else torch.where(flow.norm(dim=-1, keepdim=True) < REST, 0.0, flow)
+
+
+class PaperNetwork(nn.Module):
+    """Maps a window of T frames to the answers of K slots in each of them."""
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
         self.config = config
-        self.encoder = Encoder(config.encoder)
+        self.encoder = Encoder(config.encoder).requires_grad_(requires_grad=False)
         d = config.width
         self.project = nn.Linear(config.encoder.width, d)
         self.place = nn.Parameter(0.02 * torch.randn(config.encoder.grid**2, d))
@@ -191,11 +214,9 @@ class PaperNetwork(nn.Module):
         return decoded
 
     def answer(self, decoded: list[Decoded], frames: FrameBatch) -> SlotAnswers:
-        """What queries say that looked at a window, for all its frames or some.
+        """What queries say that looked at a window, for the frames that are asked for.
 
-        Args:
-            decoded: from :meth:`embed`; the last layer is enough where nothing is learned.
-            frames: the frames that are asked for.
+        Of what :meth:`embed` gives, the last layer is enough where nothing is learned.
         """
         last, (*earlier, (uv, logit)) = decoded[-1], [self._read_off(each) for each in decoded]
         uv_px = uv * self.config.encoder.image_size
@@ -214,10 +235,7 @@ class PaperNetwork(nn.Module):
         return out[..., :2] + decoded.where.float() @ middle, out[..., 2]
 
     def displace(self, embedding: Float[Tensor, "B T K D"]) -> Float[Tensor, "B K 3"]:
-        """Displacement of every query from the window's newest frame to the next, in units of the reference frame.
-
-        Args:
-            embedding: the queries after the decoder, oldest frame first.
+        """As of :class:`FlowHead`, from queries after the decoder, oldest frame first.
 
         Raises:
             ConfigError: the network has no flow head.

@@ -60,9 +60,9 @@ def roll_out(
         network: the network.
         frames: the anchor frame and the window.
         truth: what is true of them.
-        whole: match by all these frames, those of the window too. This is how training learns from a match that is
-            made once per take: of two slots that share an entity between anchor and window, one must answer in both.
-            Without it by the anchor frame alone, as a tracker would and as answers are judged.
+        whole: match by all these frames. This is how training learns from a match that is made once per take: of two
+            slots that share an entity between anchor and window, one must answer in both. Without it by the anchor
+            frame alone, as a tracker would and as answers are judged.
         order: how slots are given away.
     """
     slots = network(frames.during(slice(0, 1))).then(network(frames.during(slice(1, None))))
@@ -175,10 +175,7 @@ LOSSES: dict[str, Loss[SlotRollout]] = {
 class PaperStageOne:
     """Stage 1 of the published network, for :func:`quest.train.loop.fit`.
 
-    Args:
-        network: the network; a flow head stays as it is.
-        changes: weights of losses that are to differ; 0 turns one off.
-        order: how entities get their slots.
+    ``changes`` are weights of losses that are to differ; 0 turns one off. A flow head stays as it is.
     """
 
     name = "paper-stage-1"

@@ -18,13 +18,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from quest.errors import ConfigError, InputError
-from quest.geometry import invert, transform
+from quest.geometry import exact_product, invert, transform
 from quest.geometry.letterbox import Letterbox
+from quest.model.frames import FrameBatch, reference_of
 from quest.model.precision import fast_bfloat16
 from quest.model.weights import find_weights
-from quest.paper.framing import Framer
 from quest.paper.matching import assign_slots, slot_cost
-from quest.paper.network import PaperNetwork, is_paper, read_paper
+from quest.paper.network import Decoded, PaperNetwork, is_paper, read_paper
 from quest.track import Tracker
 from quest.track import load as load_tracker
 from quest.track.tracker import pick_device
@@ -43,12 +43,7 @@ PATIENCE = 8
 class PaperTracker:
     """Follows entities through clips with the published network.
 
-    Args:
-        network: trained network.
-        device: where it runs.
-        weights_hash: SHA-256 of the file that the network came from, for result files.
-        found_above: confidence above which discovery takes a slot.
-        prompt_above: the same of a label.
+    Discovery takes a slot whose confidence is above ``found_above``, a label one above ``prompt_above``.
     """
 
     name = "quest"
@@ -81,37 +76,47 @@ class PaperTracker:
         _check(clip, queries)
         slots = self._slots(clip)
         if queries is None:
-            best = np.argsort(-slots.confidence[0], kind="stable")
-            found = [int(s) for s in best if slots.confidence[0, s] > self.found_above]
-            chosen = [_Choice(f"{slots.label(0, s)} {k}", slots.label(0, s), s, 0) for k, s in enumerate(found)]
+            found = [(s, slots.label(0, s)) for s in slots.best(0) if slots.confidence[0, s] > self.found_above]
+            chosen = [_Choice(f"{label} {k}", label, s, 0) for k, (s, label) in enumerate(found)]
         else:
             chosen = self._choose(slots, queries, Letterbox(clip.camera, self.network.config.encoder.image_size))
         return _tracks(clip, slots, chosen)
 
     def _slots(self, clip: Clip) -> _Slots:
         """What all slots answer in every frame, each seen in a window of the newest T frames."""
-        size = self.network.config.encoder.image_size
-        box = Letterbox(clip.camera, size)
-        framer, reference = Framer(self.network, box.camera, device=self.device), None
-        ring: deque[Tensor] = deque(maxlen=self.network.config.window)
+        config = self.network.config
+        box = Letterbox(clip.camera, config.encoder.image_size)
+        lens = [[box.camera.fx, box.camera.fy, box.camera.cx, box.camera.cy]]
+        intrinsics, reference = torch.tensor(lens, dtype=torch.float32, device=self.device), None
+        ring: deque[Tensor] = deque(maxlen=config.window)
         rows: list[list[np.ndarray]] = []
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, fast_bfloat16(self.device)):
             for t in range(len(clip)):
                 frame = clip.frame(t)
-                depth = framer.depth(None if frame.depth_m is None else box.depth(frame.depth_m))
-                pose = torch.from_numpy(np.asarray(frame.cam_from_world, np.float64))
-                reference = framer.reference(depth, pose) if reference is None else reference
-                frames = framer.frame(box.rgb(frame.rgb), depth, pose, reference)
-                ring.append(frames.features)
-                decoded = self.network.embed(torch.cat(list(ring), dim=1))
-                answers = self.network.answer([decoded[-1].newest()], frames)
-                metric = answers.point[0, 0].cpu().double() * reference.scale.cpu() + reference.center.cpu()
+                depth_m = (
+                    np.zeros((box.size, box.size), np.float32) if frame.depth_m is None else box.depth(frame.depth_m)
+                )
+                depth = torch.from_numpy(np.ascontiguousarray(depth_m)).to(self.device)[None]
+                pose = torch.from_numpy(
+                    np.asarray(frame.cam_from_world, np.float64)
+                )  # on the CPU: not all have doubles
+                if reference is None:
+                    reference = pose, *reference_of(depth, intrinsics, cell_px=config.cell_px)
+                start, centre, scale = reference
+                image = torch.from_numpy(np.ascontiguousarray(box.rgb(frame.rgb))).to(self.device)[None]
+                moved = exact_product(start, invert(pose)).float().to(self.device)
+                features = self.network.encode(image)[:, None].float()
+                frames = FrameBatch(features, depth[None], intrinsics, moved[None, None], centre, scale)
+                ring.append(features)
+                last = self.network.embed(torch.cat(list(ring), dim=1))[-1]
+                answers = self.network.answer([Decoded(last.embedding[:, -1:], last.where[:, -1:])], frames)
+                metric = answers.point[0, 0].cpu().double() * scale.cpu() + centre.cpu()
                 parts = (
-                    box.to_source(answers.uv[0, 0].cpu().numpy() * size),
-                    transform(invert(reference.cam_from_world)[None], metric).numpy(),
+                    box.to_source(answers.uv[0, 0].cpu().numpy() * box.size),
+                    transform(invert(start)[None], metric).numpy(),
                     answers.logit[0, 0].sigmoid().cpu().numpy(),
                     answers.label_logits[0, 0].softmax(-1).cpu().numpy(),
-                    np.array(bool((frames.depth_m > 0).any())),
+                    np.array(bool((depth > 0).any())),
                 )
                 rows.append([np.asarray(part) for part in parts])
         return _Slots(*(np.stack(column) for column in zip(*rows, strict=True)))
@@ -124,22 +129,18 @@ class PaperTracker:
                 if k in chosen or query.kind == "point" or t >= PATIENCE:
                     continue
                 taken = {choice.slot for choice in chosen.values()}
-                fits = [
-                    int(s)
-                    for s in np.argsort(-slots.confidence[t], kind="stable")
-                    if s not in taken and query.label in (None, slots.label(t, int(s)))
-                ]
-                if fits and slots.confidence[t, fits[0]] > self.prompt_above:
-                    label = slots.label(t, fits[0])
-                    chosen[k] = _Choice(query.name or f"{label} {k}", label, fits[0], t)
+                for s in slots.best(t):
+                    label = slots.label(t, s)
+                    if s not in taken and query.label in (None, label):
+                        if slots.confidence[t, s] > self.prompt_above:
+                            chosen[k] = _Choice(query.name or f"{label} {k}", label, s, t)
+                        break
             due = [k for k, query in enumerate(queries) if query.kind == "point" and query.frame == t]
             if due:
                 taken = {choice.slot for choice in chosen.values() if choice.slot is not None}
                 found = _slots_at(slots, t, [queries[k] for k in due], sorted(taken), box)
-                chosen |= {
-                    k: _Choice(queries[k].name or f"point {k}", queries[k].label, slot, t)
-                    for k, slot in zip(due, found, strict=True)
-                }
+                for k, slot in zip(due, found, strict=True):
+                    chosen[k] = _Choice(queries[k].name or f"point {k}", queries[k].label, slot, t)
         unfound = [_Choice(query.name or query.label or query.kind, query.label, None, 0) for query in queries]
         return [chosen.get(k, unfound[k]) for k in range(len(queries))]
 
@@ -153,6 +154,10 @@ class _Slots:
     confidence: Float[np.ndarray, "T K"]
     label_p: Float[np.ndarray, "T K L"]
     has_depth: Bool[np.ndarray, " T"]
+
+    def best(self, frame: int) -> list[int]:
+        """Slots, the most confident first."""
+        return np.argsort(-self.confidence[frame], kind="stable").tolist()
 
     def label(self, frame: int, slot: int) -> str:
         return LABELS[int(self.label_p[frame, slot].argmax())]
@@ -177,15 +182,11 @@ def load(
 ) -> Tracker | PaperTracker:
     """The tracker of any weights: ours (see :func:`quest.track.load`), or the published one where they are its.
 
-    Args:
-        name: as for :func:`quest.track.load`.
-        device: as for :func:`quest.track.load`.
-        monitor: as for :func:`quest.track.load`.
-        engine: as for :func:`quest.track.load`; PyTorch alone runs the published network.
+    Arguments and errors are those of :func:`quest.track.load`, but PyTorch alone runs the published network.
 
     Raises:
+        ConfigError: another engine for the published network.
         WeightsError: no such weights, or they cannot be read.
-        ConfigError: no such device, or another engine for the published network.
     """
     path = find_weights(name)
     if not is_paper(path):
@@ -251,28 +252,19 @@ def _tracks(clip: Clip, slots: _Slots, chosen: Sequence[_Choice]) -> Tracks:
     for i, choice in enumerate(chosen):
         if choice.slot is None:
             continue
-        last = np.full(3, np.nan)
-        for frame in range(choice.frame, t):
-            place, sure = slots.point_world[frame, choice.slot], slots.confidence[frame, choice.slot]
-            known = bool(np.isfinite(place).all())
-            held = not known and bool(np.isfinite(last).all()) and bool(slots.has_depth[frame])
-            last = place if known else last
-            uv[frame, i], confidence[frame, i] = slots.uv_px[frame, choice.slot], sure
-            point[frame, i] = last if held else place
-            inside = (uv[frame, i] >= 0).all() and (uv[frame, i] <= (clip.camera.width, clip.camera.height)).all()
-            visible[frame, i] = sure > 0.5 and inside and not held
-            seen = State.TRACKING if visible[frame, i] else State.HELD
-            state[frame, i] = (State.LOST if sure < LOST_BELOW else seen).value
+        after, frames = slice(choice.frame, None), np.arange(t - choice.frame)
+        uv[after, i], confidence[after, i] = slots.uv_px[after, choice.slot], slots.confidence[after, choice.slot]
+        place = slots.point_world[after, choice.slot]
+        known = np.isfinite(place).all(axis=-1)
+        last = np.maximum.accumulate(np.where(known, frames, -1))
+        held = ~known & (last >= 0) & slots.has_depth[after]
+        point[after, i] = np.where(held[:, None], place[np.maximum(last, 0)], place)
+        inside = ((uv[after, i] >= 0) & (uv[after, i] <= (clip.camera.width, clip.camera.height))).all(axis=-1)
+        sure = confidence[after, i]
+        visible[after, i] = (sure > 0.5) & inside & ~held
+        seen = np.where(visible[after, i], State.TRACKING.value, State.HELD.value)
+        state[after, i] = np.where(sure < LOST_BELOW, State.LOST.value, seen)
     flags = [] if slots.has_depth.all() else ["depth missing in some frames: world points there are NaN"]
     flags += [f"query {c.name!r} found no entity: lost in every frame" for c in chosen if c.slot is None]
-    return Tracks(
-        names=tuple(choice.name for choice in chosen),
-        labels=tuple(choice.label for choice in chosen),
-        uv_px=uv,
-        point_world=point,
-        confidence=confidence,
-        visible=visible,
-        state=state,
-        stamp_s=clip.stamp_s,
-        frame_flags=tuple(flags),
-    )
+    names, labels = tuple(choice.name for choice in chosen), tuple(choice.label for choice in chosen)
+    return Tracks(names, labels, uv, point, confidence, visible, state, clip.stamp_s, tuple(flags))

@@ -14,21 +14,10 @@ import numpy as np
 from jaxtyping import UInt8
 
 from quest.errors import InputError
-from quest.types import LABELS, Take, View
-from quest.viz.ink import (
-    Canvas,
-    blank,
-    draw_box,
-    draw_disc,
-    draw_line,
-    draw_outlined,
-    draw_path,
-    draw_ring,
-    draw_text,
-    fit_text,
-    grid,
-)
-from quest.viz.palette import BACKGROUND, LINE, MUTED, RGB, SURFACE, TEXT, query_colour
+from quest.types import Take, View
+from quest.viz import ink
+from quest.viz.ink import Canvas, draw_box, draw_disc, draw_entity, draw_line, draw_path, draw_text, fit_text, grid
+from quest.viz.palette import LINE, MUTED, RGB, SURFACE, TEXT, entity_colours, query_colour
 
 _MARGIN, _GAP, _HEAD, _NAME, _ROW = 24, 6, 96, 30, 26
 _TINT = 0.5
@@ -53,19 +42,18 @@ def contact_sheet(
             f"contact sheet of {take.info.name!r}: expected a view, a column and tiles of 16 pixels, "
             f"got {len(take.views)}, {columns} and {tile_width_px}"
         )
-    shown = np.unique(np.linspace(0, len(take) - 1, columns).round().astype(int))
-    colours = _entity_colours(take)
+    shown = _shown(take, columns)
+    colours = entity_colours(entity.label for entity in take.info.entities)
     near_m, far_m = _depth_range(take)
     rows: list[Canvas] = []
     for v, view in enumerate(take.views):
-        tiles = [_draw_frame(view, int(t), colours, take.tracked, tile_width_px) for t in shown]
+        tiles = [_draw_frame(view, t, colours, take.tracked, tile_width_px) for t in shown]
         size = f"{view.clip.camera.width} x {view.clip.camera.height} px"
         rows.append(_row(tiles, f"view {v}    {size}    {_camera_motion(view)}"))
         if view.clip.depth_m is not None:
             tiles = [_draw_depth(view.clip.depth_m[t], near_m, far_m, tile_width_px) for t in shown]
-            rows.append(
-                _row(tiles, f"view {v}    depth, {near_m:.2f} m red to {far_m:.2f} m blue, black where missing")
-            )
+            words = f"view {v}    depth, {near_m:.2f} m red to {far_m:.2f} m blue, black where missing"
+            rows.append(_row(tiles, words))
     width = max(rows[0].shape[1], 900)
     foot = _draw_foot(take, shown, colours, width)
     sheet = grid([[part] for part in (*rows, foot)], head=_HEAD, foot=_MARGIN, sides=_MARGIN)
@@ -76,13 +64,9 @@ def contact_sheet(
 def takes_sheet(
     takes: Sequence[Take], *, title: str, columns: int = 8, tile_width_px: int = 224
 ) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw several takes as one picture: a row of frames of the first view of each.
+    """Draw several takes as one picture, below what they have in common: a row of frames of the first view of each.
 
-    Args:
-        takes: what to draw, each with at least one view; a few frames of each are enough.
-        title: what they have in common.
-        columns: frames to show, spread evenly from the first to the last.
-        tile_width_px: width of each frame on the sheet.
+    Columns and widths are as for :func:`contact_sheet`; a few frames of each take are enough.
 
     Raises:
         InputError: there is no take, one has no views, or fewer than one column or pixel is asked for.
@@ -92,34 +76,31 @@ def takes_sheet(
             f"contact sheet {title!r}: expected takes with views, a column and tiles of 16 pixels, "
             f"got {len(takes)} takes, {columns} and {tile_width_px}"
         )
-    rows: list[Canvas] = []
+    rows = []
     for take in takes:
-        shown = np.unique(np.linspace(0, len(take) - 1, columns).round().astype(int))
-        view, colours = take.views[0], _entity_colours(take)
-        tiles = [_draw_frame(view, int(t), colours, take.tracked, tile_width_px) for t in shown]
-        info = take.info
+        info, view = take.info, take.views[0]
+        colours = entity_colours(entity.label for entity in info.entities)
+        tiles = [_draw_frame(view, t, colours, take.tracked, tile_width_px) for t in _shown(take, columns)]
         suite = " ".join(str(word) for word in (info.suite, info.provenance.get("variant", "")) if word)
         facts = (info.name, info.category, suite, f"level {info.level}", f"{take.stamp_s[-1]:.1f} s")
-        rows.append(_row(tiles, "    ".join((*facts, _camera_motion(view)))))
-    sheet = grid([[row] for row in rows], head=_HEAD - 40, foot=_MARGIN, sides=_MARGIN, least_width=600)
-    title = fit_text(title, 24, sheet.shape[1] - 2 * _MARGIN)
-    draw_text(sheet, title, (_MARGIN, 28), size=24, colour=TEXT)
+        rows.append([_row(tiles, "    ".join((*facts, _camera_motion(view))))])
+    sheet = grid(rows, head=_HEAD - 40, foot=_MARGIN, sides=_MARGIN, least_width=600)
+    draw_text(sheet, fit_text(title, 24, sheet.shape[1] - 2 * _MARGIN), (_MARGIN, 28), size=24, colour=TEXT)
     return sheet
 
 
-def _entity_colours(take: Take) -> list[RGB]:
-    """Bright for what is tracked, grey for hinges."""
-    return [query_colour(e) if entity.label in LABELS else MUTED for e, entity in enumerate(take.info.entities)]
+def _shown(take: Take, columns: int) -> list[int]:
+    """Frames, spread evenly from the first to the last."""
+    return np.unique(np.linspace(0, len(take) - 1, columns).round().astype(int)).tolist()
 
 
 def _depth_range(take: Take) -> tuple[float, float]:
     """Depth between which colours are spread, the same for all views."""
-    valid = [view.clip.depth_m[::4, ::4, ::4].ravel() for view in take.views if view.clip.depth_m is not None]
-    depth_m = np.concatenate(valid) if valid else np.zeros(0, np.float32)
-    depth_m = depth_m[depth_m > 0]
-    if depth_m.size == 0:
+    known = [view.clip.depth_m[::4, ::4, ::4] for view in take.views if view.clip.depth_m is not None]
+    valid = [depth_m[depth_m > 0] for depth_m in known]
+    if not any(map(len, valid)):
         return 1.0, 2.0
-    near_m, far_m = np.percentile(depth_m, [1, 99])
+    near_m, far_m = np.percentile(np.concatenate(valid), [1, 99])
     return float(near_m), float(max(far_m, near_m + 1e-3))
 
 
@@ -144,25 +125,10 @@ def _draw_frame(view: View, t: int, colours: list[RGB], tracked: np.ndarray, wid
     size = np.array([width, len(tile)])
     for e, colour in enumerate(colours):
         uv = view.uv_px[t, e].astype(np.float64) * scale
-        if not ((uv > 0) & (uv < size)).all():  # NaN compares false
-            continue
-        xy = (float(uv[0]), float(uv[1]))
-        radius = 3.5 if e in tracked else 2.5
-        if view.visible[t, e]:
-            draw_disc(tile, xy, radius + 1.5, colour=BACKGROUND)
-            draw_disc(tile, xy, radius, colour=colour)
-        else:
-            draw_ring(tile, xy, radius + 1, colour=BACKGROUND, width=4)
-            draw_ring(tile, xy, radius + 1, colour=colour, width=2)
-        _draw_number(tile, e, xy)
+        if ((uv > 0) & (uv < size)).all():  # NaN compares false
+            radius, seen = 3.5 if e in tracked else 2.5, bool(view.visible[t, e])
+            draw_entity(tile, (float(uv[0]), float(uv[1])), str(e), radius=radius, colour=colour, visible=seen)
     return tile
-
-
-def _draw_number(tile: Canvas, number: int, xy: tuple[float, float]) -> None:
-    """Draw an entity's number beside its mark."""
-    right = xy[0] < tile.shape[1] - 24
-    at = (xy[0] + (8 if right else -8), min(max(xy[1] - 8, 8), len(tile) - 8))
-    draw_outlined(tile, str(number), at, size=13, align="left" if right else "right")
 
 
 def _draw_depth(depth_m: np.ndarray, near_m: float, far_m: float, width: int) -> Canvas:
@@ -193,18 +159,15 @@ def _camera_motion(view: View) -> str:
     return f"camera moves up to {moved_m:.2f} m and turns {turned_deg:.1f} deg"
 
 
-def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int, every: int) -> None:
+def _draw_head(head: Canvas, take: Take, shown: list[int], tile_width: int, every: int) -> None:
     info = take.info
     room = head.shape[1] - 2 * _MARGIN
     draw_text(head, fit_text(info.name, 24, room), (_MARGIN, 28), size=24, colour=TEXT)
+    suite = [f"suite {info.suite}"] if info.suite != "standard" else []
     facts = (
-        f"{info.category} {info.object_id} ({info.source})",
-        f"level {info.level}",
-        *([f"suite {info.suite}"] if info.suite != "standard" else []),
-        f"seed {info.seed}",
-        f"{len(take)} frames at {info.frames_per_s / every:g}/s",
-        f"half diagonal {info.half_diagonal_m:.3f} m",
-    )
+        f"{info.category} {info.object_id} ({info.source})", f"level {info.level}", *suite, f"seed {info.seed}",
+        f"{len(take)} frames at {info.frames_per_s / every:g}/s", f"half diagonal {info.half_diagonal_m:.3f} m",
+    )  # fmt: skip
     draw_text(head, fit_text("    ".join(facts), 15, room), (_MARGIN, 56), size=15, colour=MUTED)
     for i, t in enumerate(shown):
         x = _MARGIN + i * (tile_width + _GAP) + tile_width / 2
@@ -212,9 +175,9 @@ def _draw_head(head: Canvas, take: Take, shown: np.ndarray, tile_width: int, eve
         draw_text(head, fit_text(label, 13, tile_width), (x, 84), size=13, colour=TEXT, align="centre")
 
 
-def _draw_foot(take: Take, shown: np.ndarray, colours: list[RGB], width: int) -> Canvas:
+def _draw_foot(take: Take, shown: list[int], colours: list[RGB], width: int) -> Canvas:
     """Left the entities, right the joints over time."""
-    foot = blank(_NAME + max(len(colours), 7) * _ROW + _MARGIN, width)
+    foot = ink.blank(_NAME + max(len(colours), 7) * _ROW + _MARGIN, width)
     left = round(0.55 * width)
     _draw_entities(foot[:, :left], take, colours)
     _draw_joints(foot[:, left + _MARGIN :], take, shown)
@@ -230,16 +193,17 @@ def _draw_entities(area: Canvas, take: Take, colours: list[RGB]) -> None:
     for e, entity in enumerate(take.info.entities):
         y = _NAME + (e + 0.5) * _ROW
         draw_disc(area, (8, y), 5, colour=colours[e])
-        draw_text(area, fit_text(f"{e}   {entity.name}", 14, columns[1] - 30), (22, y), size=14, colour=TEXT)
+        name = fit_text(f"{e}   {entity.name}", 14, columns[1] - 30)
         kind = "fixed" if entity.fixed else take.info.joints[entity.joint].kind
-        draw_text(area, kind, (columns[1], y), size=14, colour=TEXT)
         reach = f"{moves[e]:.2f} m = {moves[e] / take.info.half_diagonal_m:.2f}"
-        draw_text(area, reach, (columns[2], y), size=14, colour=TEXT if take.moved[e] else MUTED)
         seen = "   ".join(f"{100 * view.visible[:, e].mean():.0f} %" for view in take.views)
-        draw_text(area, fit_text(seen, 14, width - columns[3]), (columns[3], y), size=14, colour=TEXT)
+        cells = (name, kind, reach, fit_text(seen, 14, width - columns[3]))
+        for x, cell in zip((22, *columns[1:]), cells, strict=True):
+            still = cell is reach and not take.moved[e]
+            draw_text(area, cell, (x, y), size=14, colour=MUTED if still else TEXT)
 
 
-def _draw_joints(area: Canvas, take: Take, shown: np.ndarray) -> None:
+def _draw_joints(area: Canvas, take: Take, shown: list[int]) -> None:
     """Every joint's position between its limits; vertical lines are the frames shown."""
     draw_text(area, "joints, lower to upper limit", (0, _NAME / 2 + 4), size=13, colour=MUTED)
     width, top, height = area.shape[1] - 8, _NAME + 4, 7 * _ROW - 8

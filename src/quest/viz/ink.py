@@ -7,6 +7,7 @@ the same words on every frame.
 from __future__ import annotations
 
 import unicodedata
+from bisect import bisect_left
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
@@ -21,6 +22,7 @@ from quest.viz.palette import BACKGROUND, RGB, TEXT
 Canvas = UInt8[np.ndarray, "_ _ 3"]
 Number = float | int
 XY = tuple[Number, Number]
+Align = Literal["left", "centre", "right"]
 _SUBPIXEL_BITS = 4
 
 
@@ -30,27 +32,13 @@ def blank(height: int, width: int, colour: RGB = BACKGROUND) -> Canvas:
 
 
 def grid(
-    rows: Sequence[Sequence[Canvas]],
-    *,
-    gap: int = 0,
-    head: int = 0,
-    foot: int = 0,
-    sides: int = 0,
-    least_width: int = 0,
-    colour: RGB = BACKGROUND,
-    behind: RGB = BACKGROUND,
-) -> Canvas:
-    """Pictures beside and below each other, from the top left.
+    rows: Sequence[Sequence[Canvas]], *, gap: int = 0, head: int = 0, foot: int = 0, sides: int = 0,
+    least_width: int = 0, colour: RGB = BACKGROUND, behind: RGB = BACKGROUND,
+) -> Canvas:  # fmt: skip
+    """Pictures of any sizes beside and below each other, from the top left.
 
-    Args:
-        rows: pictures of any sizes.
-        gap: between two pictures.
-        head: free pixels above.
-        foot: below.
-        sides: left and right.
-        least_width: of the room for pictures.
-        colour: of what is free.
-        behind: colour below pictures that are lower than their row.
+    Between two are ``gap`` pixels, and free ones are above, below and left and right. ``colour`` is that of what is
+    free, ``behind`` that below pictures that are lower than their row.
     """
     width = max(least_width, *(sum(len(p[0]) + gap for p in row) - gap for row in rows))
     heights = [max(map(len, row)) for row in rows]
@@ -73,24 +61,14 @@ def text_size(text: str, size: int) -> tuple[int, int]:
     return width, height
 
 
-def draw_text(
-    canvas: Canvas,
-    text: str,
-    xy: XY,
-    *,
-    size: int,
-    colour: RGB,
-    align: Literal["left", "centre", "right"] = "left",
-) -> None:
+def draw_text(canvas: Canvas, text: str, xy: XY, *, size: int, colour: RGB, align: Align = "left") -> None:
     """Draw a line of text; ``xy`` is its left end, middle or right end, vertically centred."""
     mask = _text_mask(text, size)
     shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align]
     blend(canvas, mask, round(xy[0] - shift * mask.shape[1]), round(xy[1] - mask.shape[0] / 2), colour)
 
 
-def draw_outlined(
-    canvas: Canvas, text: str, xy: XY, *, size: int, align: Literal["left", "centre", "right"] = "left"
-) -> None:
+def draw_outlined(canvas: Canvas, text: str, xy: XY, *, size: int, align: Align = "left") -> None:
     """Draw a line of text that reads on any background."""
     x, y = xy
     for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
@@ -98,13 +76,25 @@ def draw_outlined(
     draw_text(canvas, text, xy, size=size, colour=TEXT, align=align)
 
 
+def draw_entity(canvas: Canvas, xy: XY, word: str, *, radius: Number, colour: RGB, visible: bool) -> None:
+    """Draw an entity's mark, filled where it is visible, hollow where not, and a word beside it."""
+    if visible:
+        draw_disc(canvas, xy, radius, colour=colour, edge=1.5)
+    else:
+        draw_ring(canvas, xy, radius + 1, colour=colour, width=2, edge=1)
+    right = xy[0] + text_size(word, 13)[0] + 12 < canvas.shape[1]
+    at = (xy[0] + (8 if right else -8), min(max(xy[1] - 8, 8), len(canvas) - 8))
+    draw_outlined(canvas, word, at, size=13, align="left" if right else "right")
+
+
 def fit_text(text: str, size: int, width: Number) -> str:
     """The text, cut with an ellipsis where it is wider than ``width`` pixels."""
     if text_size(text, size)[0] <= width:
         return text
-    while text and text_size(text + "...", size)[0] > width:
-        text = text[:-1]
-    return text + "..."
+    too_long = bisect_left(
+        range(len(text)), True, key=lambda letters: text_size(text[:letters] + "...", size)[0] > width
+    )
+    return text[: max(too_long - 1, 0)] + "..."
 
 
 def draw_box(
@@ -129,22 +119,14 @@ def draw_line(canvas: Canvas, a: XY, b: XY, *, colour: RGB, width: int = 1, opac
         cv2.line(canvas, _fixed(a), _fixed(b), colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
         return
     margin = width + 2
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    x0, y0 = max(int(low[0]) - margin, 0), max(int(low[1]) - margin, 0)
-    x1, y1 = min(int(high[0]) + margin + 1, canvas.shape[1]), min(int(high[1]) + margin + 1, canvas.shape[0])
-    if x0 >= x1 or y0 >= y1:
+    low = np.maximum(np.minimum(a, b).astype(int) - margin, 0)
+    high = np.minimum(np.maximum(a, b).astype(int) + margin + 1, canvas.shape[1::-1])
+    if (low >= high).any():
         return
-    region = canvas[y0:y1, x0:x1]
+    region = canvas[low[1] : high[1], low[0] : high[0]]
     drawn = region.copy()
-    cv2.line(
-        drawn,
-        _fixed((a[0] - x0, a[1] - y0)),
-        _fixed((b[0] - x0, b[1] - y0)),
-        colour,
-        width,
-        cv2.LINE_AA,
-        _SUBPIXEL_BITS,
-    )
+    start, end = (_fixed((xy[0] - low[0], xy[1] - low[1])) for xy in (a, b))
+    cv2.line(drawn, start, end, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
     cv2.addWeighted(drawn, opacity, region, 1 - opacity, 0, dst=region)
 
 
@@ -163,21 +145,23 @@ def draw_cased_path(canvas: Canvas, path: Float[np.ndarray, "N 2"], *, colour: R
     draw_path(canvas, path, colour=colour, width=width)
 
 
-def draw_disc(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB) -> None:
-    """Draw a filled disc."""
+def draw_disc(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB, edge: Number = 0) -> None:
+    """Draw a filled disc, with a dark edge if asked."""
+    if edge:
+        draw_disc(canvas, centre, radius + edge, colour=BACKGROUND)
     cv2.circle(canvas, _fixed(centre), round(radius * 2**_SUBPIXEL_BITS), colour, -1, cv2.LINE_AA, _SUBPIXEL_BITS)
 
 
-def draw_ring(canvas: Canvas, centre: XY, radius: Number, *, colour: RGB, width: int = 1, dashes: int = 0) -> None:
-    """Draw a circle, or one of ``dashes`` arcs."""
-    if not dashes:
-        cv2.circle(
-            canvas, _fixed(centre), round(radius * 2**_SUBPIXEL_BITS), colour, width, cv2.LINE_AA, _SUBPIXEL_BITS
-        )
-        return
+def draw_ring(
+    canvas: Canvas, centre: XY, radius: Number, *, colour: RGB, width: int = 1, dashes: int = 0, edge: int = 0
+) -> None:
+    """Draw a circle, or one of ``dashes`` arcs, with dark edges if asked."""
+    if edge:
+        draw_ring(canvas, centre, radius, colour=BACKGROUND, width=width + 2 * edge, dashes=dashes)
     axes = (round(radius * 2**_SUBPIXEL_BITS),) * 2
-    for dash in range(dashes):
-        start = 360 * dash / dashes
+    if not dashes:
+        cv2.circle(canvas, _fixed(centre), axes[0], colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
+    for start in (360 * dash / dashes for dash in range(dashes)):
         end = start + 220 / dashes
         cv2.ellipse(canvas, _fixed(centre), axes, 0, start, end, colour, width, cv2.LINE_AA, _SUBPIXEL_BITS)
 
@@ -195,12 +179,9 @@ def blend(canvas: Canvas, mask: UInt8[np.ndarray, "h w"], x: int, y: int, colour
 
 def _fixed(xy: XY) -> tuple[int, int]:
     """Fixed-point coordinates for OpenCV, whose pixel centres are at integers."""
-    return _fixed_value(xy[0]), _fixed_value(xy[1])
-
-
-def _fixed_value(value: Number) -> int:
     limit = 2.0**14  # beyond, OpenCV's fixed-point arithmetic overflows
-    return round((min(max(float(value), -limit), limit) - 0.5) * 2**_SUBPIXEL_BITS)
+    x, y = (round((min(max(float(value), -limit), limit) - 0.5) * 2**_SUBPIXEL_BITS) for value in xy)
+    return x, y
 
 
 @lru_cache(maxsize=32)

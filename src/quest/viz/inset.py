@@ -6,13 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 from quest.viz.ink import Canvas, draw_disc, draw_line, draw_path, draw_ring, draw_text
 from quest.viz.joint_lines import JointLines
 from quest.viz.palette import LINE, MUTED, RGB, TEXT
 
 AXIS_COLOURS: tuple[RGB, ...] = ((255, 107, 107), (105, 219, 124), (92, 160, 255))
-_YAW_RAD, _PITCH_RAD = np.deg2rad(-32.0), np.deg2rad(18.0)
+_TURNED = Rotation.from_euler("yx", [-32.0, 18.0], degrees=True).as_matrix()
+"""First about y, then about x."""
 _SMALLEST_BOX_M = 0.05
 _CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
@@ -41,11 +43,7 @@ class Inset:
         self._unit = unit
         lines = [line for joint in joints if joint for line in (joint.path, joint.axis) if line is not None]
         self._low, self._high = _bounds(point_world, lines)
-        cos, sin = np.cos(_YAW_RAD), np.sin(_YAW_RAD)
-        yaw = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-        cos, sin = np.cos(_PITCH_RAD), np.sin(_PITCH_RAD)
-        pitch = np.array([[1, 0, 0], [0, cos, -sin], [0, sin, cos]])
-        self._rotation = (pitch @ yaw @ cam_from_world[:3, :3])[:2]
+        self._rotation = (_TURNED @ cam_from_world[:3, :3])[:2]
         corners = self._box() @ self._rotation.T
         margin = 26 * unit
         extent = np.maximum(np.ptp(corners, axis=0), 1e-9)
@@ -62,16 +60,13 @@ class Inset:
         corners = self.project(self._box())
         for a, b in _EDGES:
             draw_line(canvas, tuple(corners[a]), tuple(corners[b]), colour=LINE)
-        edge_m = self._high - self._low
-        length_px = 30 * self._unit
         origin = corners[0]
-        for axis, colour in enumerate(AXIS_COLOURS):
-            along = self._rotation[:, axis]
-            tip = origin + along * length_px
+        for name, along, colour in zip("xyz", self._rotation.T, AXIS_COLOURS, strict=True):
+            tip = origin + along * 30 * self._unit
             draw_line(canvas, tuple(origin), tuple(tip), colour=colour, width=max(2, round(2 * self._unit)))
-            label = origin + along * length_px + 9 * self._unit * along / max(float(np.linalg.norm(along)), 0.3)
-            draw_text(canvas, "xyz"[axis], tuple(label), size=round(13 * self._unit), colour=colour, align="centre")
-        text = " x ".join(f"{edge:.2f}" for edge in edge_m) + " m"
+            label = tip + 9 * self._unit * along / max(float(np.linalg.norm(along)), 0.3)
+            draw_text(canvas, name, tuple(label), size=round(13 * self._unit), colour=colour, align="centre")
+        text = " x ".join(f"{edge:.2f}" for edge in self._high - self._low) + " m"
         at = (canvas.shape[1] - 10 * self._unit, canvas.shape[0] - 12 * self._unit)
         draw_text(canvas, text, at, size=round(12 * self._unit), colour=MUTED, align="right")
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Sequence
-from types import TracebackType
+from typing import Any
 
 import numpy as np
 from rich.console import Console, Group, RenderableType
@@ -14,13 +14,13 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from quest.filter.joints import Joint
 from quest.monitor import Budget
 from quest.track import StreamState
 from quest.track.events import Event, Events, Happening
 from quest.tracks import describe_joint
 from quest.types import Query, State
 from quest.viz.palette import query_colour
+from quest.wording import counted
 
 REFRESH_S = 0.2
 """Time between two pictures of the table."""
@@ -33,13 +33,8 @@ WIDE = 110
 STATE_STYLE = {State.TRACKING: "green", State.HELD: "yellow", State.LOST: "bold red"}
 
 EVENT_STYLE: dict[Happening, str] = {
-    "bound": "",
-    "alarm": "bold red",
-    "cleared": "green",
-    "lost": "red",
-    "found": "green",
-    "degraded": "yellow",
-}
+    "bound": "", "alarm": "bold red", "cleared": "green", "lost": "red", "found": "green", "degraded": "yellow",
+}  # fmt: skip
 
 _RATE_FRAMES = 20
 _BAR_WIDTH = 6
@@ -59,33 +54,28 @@ class LiveView:
     """
 
     def __init__(self, console: Console, *, name: str, frames: int | None, budget: Budget | None) -> None:
-        self._console = console
-        self._name = name
-        self._frames = frames
-        self._budget = budget
-        self._live = (
-            Live(console=console, auto_refresh=False, redirect_stdout=False) if console.is_interactive else None
-        )
+        self._console, self._name, self._frames, self._budget = console, name, frames, budget
+        terminal = console.is_interactive
+        self._live = Live(console=console, auto_refresh=False, redirect_stdout=False) if terminal else None
         self._events = Events()
         self._last: deque[Event] = deque(maxlen=EVENTS_SHOWN)
-        self._begun_s = time.monotonic()
-        self._ends_s: deque[float] = deque([self._begun_s], maxlen=_RATE_FRAMES)
-        self._drawn_s = 0.0
-        self._frame = -1
+        self._drawn_s, self._frame = 0.0, -1
+        self._begin()
         self._state: StreamState | None = None
         self._waiting: tuple[Query, ...] = ()
         self._behind_s = 0.0
 
-    def __enter__(self) -> LiveView:
+    def _begin(self) -> None:
         self._begun_s = time.monotonic()
         self._ends_s = deque([self._begun_s], maxlen=_RATE_FRAMES)
+
+    def __enter__(self) -> LiveView:
+        self._begin()
         if self._live is not None:
             self._live.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._live is not None:
             self._live.update(self.picture(), refresh=True)
             self._live.stop()
@@ -120,14 +110,12 @@ class LiveView:
         if self._state is not None:
             state = self._state
             parts += [Text(f"degraded: {flag}", style="yellow") for flag in state.flags]
-            parts += [
-                Text(f"alarm: {alarm.name}, open for {_frames(self._frame - alarm.frame)}: {alarm.reason}", "bold red")
-                for alarm in state.alarm
-                if alarm is not None
-            ]
+            for alarm in filter(None, state.alarm):
+                age = counted(self._frame - alarm.frame, "frame")
+                parts.append(Text(f"alarm: {alarm.name}, open for {age}: {alarm.reason}", "bold red"))
             # Below the alarms, because a terminal that is too low cuts off what is at the end.
             if state.names:
-                parts.append(state_table(state, self._frame, wide=self._console.width >= WIDE))
+                parts.append(_state_table(state, self._frame, wide=self._console.width >= WIDE))
         if self._waiting:
             parts.append(Text(f"not followed: {', '.join(query_words(q) for q in self._waiting)}", style="yellow"))
         parts += [Text(), *(event_line(event) for event in self._last)] if self._last else []
@@ -135,12 +123,9 @@ class LiveView:
 
     def summary(self) -> Text:
         """What has been seen so far, for the end."""
-        seconds = max(self._ends_s[-1] - self._begun_s, 1e-6)
-        frames = self._frame + 1
-        text = Text(
-            f"{self._name}: {_frames(frames) if self._frames is None else f'{frames} of {_frames(self._frames)}'} "
-            f"in {seconds:.1f} s ({frames / seconds:.1f} per s)"
-        )
+        seconds, frames = max(self._ends_s[-1] - self._begun_s, 1e-6), self._frame + 1
+        seen = counted(frames, "frame") if self._frames is None else f"{frames} of {counted(self._frames, 'frame')}"
+        text = Text(f"{self._name}: {seen} in {seconds:.1f} s ({frames / seconds:.1f} per s)")
         if self._budget is None:
             text.append("; no alarms, because the monitor has no calibration", style="yellow")
         else:
@@ -151,81 +136,55 @@ class LiveView:
         return text
 
     def _head(self) -> Text:
-        text = Text(self._name, style="bold")
-        of = "" if self._frames is None else f" (0 to {self._frames - 1})"
-        text.append(f"   frame {max(self._frame, 0)}{of}", style="not bold")
+        parts = [f"frame {max(self._frame, 0)}" + ("" if self._frames is None else f" (0 to {self._frames - 1})")]
         if self._state is not None:
-            text.append(f"   {self._state.stamp_s:.2f} s", style="not bold")
+            parts.append(f"{self._state.stamp_s:.2f} s")
         took_s = self._ends_s[-1] - self._ends_s[0]
         if took_s > 0:
-            text.append(f"   {(len(self._ends_s) - 1) / took_s:.1f} frames/s", style="not bold")
-        if self._behind_s > REFRESH_S:
-            text.append(f"   {self._behind_s:.1f} s behind", style="not bold yellow")
-        if self._budget is None:
-            text.append("   no alarms: monitor without calibration", style="not bold yellow")
-        else:
-            text.append(f"   {self._budget}", style="not bold")
-        return text
+            parts.append(f"{(len(self._ends_s) - 1) / took_s:.1f} frames/s")
+        late = f"   {self._behind_s:.1f} s behind" if self._behind_s > REFRESH_S else ""
+        watched = ("no alarms: monitor without calibration", "yellow") if self._budget is None else f"{self._budget}"
+        said = "".join(f"   {part}" for part in parts)
+        return Text.assemble((self._name, "bold"), said, (late, "yellow"), "   ", watched)
 
 
-def state_table(state: StreamState, frame: int, *, wide: bool) -> Table:
-    """One row per query.
-
-    Args:
-        state: what the stream answered.
-        frame: index of the frame, for the age of alarms.
-        wide: whether there is room for labels and pixels.
-    """
+def _state_table(state: StreamState, frame: int, *, wide: bool) -> Table:
+    """One row per query; where it is wide, with labels and pixels."""
     table = Table(box=None, pad_edge=False, header_style="dim")
-    table.add_column("query", no_wrap=True, max_width=24)
-    if wide:
-        table.add_column("label", no_wrap=True)
-    table.add_column("state", no_wrap=True)
-    if wide:
-        table.add_column("pixel", justify="right", no_wrap=True)
-    table.add_column("x, y, z (m)", justify="right", no_wrap=True)
-    table.add_column("joint", no_wrap=wide)
-    table.add_column("P(lost)", justify="right", no_wrap=True)
-    table.add_column("", width=_BAR_WIDTH)
-    table.add_column("alarm", no_wrap=True)
+    right = {"justify": "right", "no_wrap": True}
+    columns: dict[str, dict[str, Any]] = {
+        "query": {"no_wrap": True, "max_width": 24}, "label": {"no_wrap": True}, "state": {"no_wrap": True},
+        "pixel": right, "x, y, z (m)": right, "joint": {"no_wrap": wide}, "P(lost)": right,
+        "": {"width": _BAR_WIDTH}, "alarm": {"no_wrap": True},
+    }  # fmt: skip
+    shown = [name for name in columns if wide or name not in ("label", "pixel")]
+    for name in shown:
+        table.add_column(name, **columns[name])
     for k, number in enumerate(state.query):
-        alarm, lost_p = state.alarm[k], float(state.lost_p[k])
-        known = np.isfinite(lost_p)
+        alarm, lost_p, joint = state.alarm[k], float(state.lost_p[k]), state.joint[k]
         colour = "red" if lost_p >= _LIKELY else "yellow" if lost_p >= _POSSIBLE else "green"
-        label = [Text(state.labels[k] or "")] if wide else []
-        pixel = [Text(_vector(state.uv_px[k], 1))] if wide else []
-        table.add_row(
-            Text(state.names[k], style="rgb({},{},{})".format(*query_colour(number))),
-            *label,
-            Text(state.state[k].value, style=STATE_STYLE[state.state[k]]),
-            *pixel,
-            Text(_vector(state.point_world[k], 2)),
-            Text(joint_words(state.joint[k], float(state.q[k]))),
-            Text(f"{lost_p:.2f}" if known else "?"),
-            ProgressBar(1.0, lost_p, width=_BAR_WIDTH, complete_style=colour, finished_style=colour) if known else "",
-            Text("" if alarm is None else _frames(frame - alarm.frame), style="bold red"),
-        )
+        bar = ProgressBar(1.0, lost_p, width=_BAR_WIDTH, complete_style=colour, finished_style=colour)
+        known, q = np.isfinite(lost_p), float(state.q[k])
+        cells: dict[str, RenderableType] = {
+            "query": Text(state.names[k], style="rgb({},{},{})".format(*query_colour(number))),
+            "label": Text(state.labels[k] or ""),
+            "state": Text(state.state[k].value, style=STATE_STYLE[state.state[k]]),
+            "pixel": Text(_vector(state.uv_px[k], 1)),
+            "x, y, z (m)": Text(_vector(state.point_world[k], 2)),
+            "joint": Text("?" if joint is None else describe_joint(joint.kind.value, joint.lower, joint.upper, q=q)),
+            "P(lost)": Text(f"{lost_p:.2f}" if known else "?"),
+            "": bar if known else "",
+            "alarm": Text("" if alarm is None else counted(frame - alarm.frame, "frame"), style="bold red"),
+        }
+        table.add_row(*(cells[name] for name in shown))
     return table
-
-
-def joint_words(joint: Joint | None, q: float) -> str:
-    """Kind of a joint, where on it a query is, and in brackets the range that was seen, in metres or degrees.
-
-    Args:
-        joint: in the world, metres; None where it is unknown.
-        q: where on it, metres or radians; NaN where it is unknown.
-    """
-    if joint is None:
-        return "?"
-    return describe_joint(joint.kind.value, joint.lower, joint.upper, q=q)
 
 
 def event_line(event: Event) -> Text:
     """An event in one line."""
-    text = Text(f"frame {event.frame:>4} {event.stamp_s:>7.2f} s  ", style="dim")
-    return text.append(f"{event.name}  " if event.name else "", "not dim").append(
-        event.text, f"not dim {EVENT_STYLE[event.kind]}"
-    )
+    when = f"frame {event.frame:>4} {event.stamp_s:>7.2f} s  "
+    name = f"{event.name}  " if event.name else ""
+    return Text.assemble((when, "dim"), name, (event.text, EVENT_STYLE[event.kind]))
 
 
 def query_words(query: Query) -> str:
@@ -237,7 +196,3 @@ def query_words(query: Query) -> str:
 
 def _vector(values: np.ndarray, digits: int) -> str:
     return " ".join(f"{v:z.{digits}f}" for v in values) if np.isfinite(values).all() else "?"
-
-
-def _frames(count: int) -> str:
-    return f"{count} frame" if count == 1 else f"{count} frames"

@@ -14,8 +14,8 @@ from quest.errors import InputError
 from quest.sim.objects import SimObject
 from quest.sim.portrait import Portrait
 from quest.types import LABELS
-from quest.viz.ink import Canvas, draw_disc, draw_outlined, draw_ring, draw_text, fit_text, grid, text_size
-from quest.viz.palette import BACKGROUND, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
+from quest.viz.ink import Canvas, draw_disc, draw_entity, draw_text, fit_text, grid, text_size
+from quest.viz.palette import BACKGROUND, LOST, MUTED, RGB, SURFACE, TEXT, entity_colours
 from quest.wording import counted
 
 _GAP, _PAD, _HEAD, _ROW = 4, 10, 46, 20
@@ -64,13 +64,9 @@ def size_words(sim_object: SimObject) -> str:
     return f"{width:.2f} x {depth:.2f} x {height:.2f}"
 
 
-def _colours(sim_object: SimObject) -> list[RGB]:
-    return [query_colour(i) if e.label in LABELS else MUTED for i, e in enumerate(sim_object.entities)]
-
-
 def _draw_card(card: Card) -> Canvas:
     thing = card.sim_object
-    colours = _colours(thing)
+    colours = entity_colours(e.label for e in thing.entities)
     tiles = [_draw_portrait(card, portrait, colours) for portrait in card.portraits]
     edge = len(tiles[0])
     width = len(tiles) * (edge + _GAP) - _GAP + 2 * _PAD
@@ -117,25 +113,11 @@ def _draw_portrait(card: Card, portrait: Portrait, colours: list[RGB]) -> Canvas
     followed = sum(e.label in LABELS for e in entities)
     for i, (e, colour) in enumerate(zip(entities, colours, strict=True)):
         uv = portrait.uv_px[i]
-        if not ((uv > 0) & (uv < len(tile))).all():  # NaN compares false
-            continue
-        xy = (float(uv[0]), float(uv[1]))
-        if portrait.visible[i]:
-            draw_disc(tile, xy, 5, colour=BACKGROUND)
-            draw_disc(tile, xy, 3.5, colour=colour)
-        else:
-            draw_ring(tile, xy, 4, colour=BACKGROUND, width=3)
-            draw_ring(tile, xy, 4, colour=colour, width=1)
-        if e.label in LABELS:
-            _draw_word(tile, e.label if followed <= _NAMES_AT_MOST else str(i), xy)
+        if ((uv > 0) & (uv < len(tile))).all():  # NaN compares false
+            word = "" if e.label not in LABELS else e.label if followed <= _NAMES_AT_MOST else str(i)
+            xy, seen = (float(uv[0]), float(uv[1])), bool(portrait.visible[i])
+            draw_entity(tile, xy, word, radius=3.5, colour=colour, visible=seen)
     words = "open" if portrait.opened else "closed"
     cv2.rectangle(tile, (0, len(tile) - 20), (text_size(words, 12)[0] + 12, len(tile)), BACKGROUND, -1)
     draw_text(tile, words, (6, len(tile) - 10), size=12, colour=MUTED)
     return tile
-
-
-def _draw_word(tile: Canvas, word: str, xy: tuple[float, float]) -> None:
-    """A word beside a mark."""
-    right = xy[0] + text_size(word, 12)[0] + 12 < tile.shape[1]
-    at = (xy[0] + (8 if right else -8), min(max(xy[1] - 7, 8), len(tile) - 8))
-    draw_outlined(tile, word, at, size=12, align="left" if right else "right")

@@ -17,17 +17,8 @@ from jaxtyping import UInt8
 from quest.data.video import frame_rate, write_video
 from quest.errors import InputError
 from quest.types import Clip, State, Tracks
-from quest.viz.ink import (
-    Canvas,
-    draw_box,
-    draw_cased_path,
-    draw_disc,
-    draw_line,
-    draw_ring,
-    draw_text,
-    fit_text,
-    text_size,
-)
+from quest.viz import ink
+from quest.viz.ink import Canvas, draw_box, draw_cased_path, draw_disc, draw_line, draw_ring, draw_text, fit_text
 from quest.viz.inset import Inset
 from quest.viz.joint_lines import joint_lines
 from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
@@ -55,16 +46,7 @@ def write_overlay(clip: Clip, tracks: Tracks, path: str | Path, *, trail_s: floa
 
 
 class OverlayPainter:
-    """Draws single frames of an overlay; :func:`write_overlay` makes a video of all.
-
-    Args:
-        clip: the frames that were tracked.
-        tracks: the answers, one per frame of the clip.
-        trail_s: how far back trails reach, seconds.
-
-    Raises:
-        InputError: clip and tracks are of different length.
-    """
+    """Draws single frames of an overlay; arguments and errors are those of :func:`write_overlay`."""
 
     def __init__(self, clip: Clip, tracks: Tracks, *, trail_s: float = 1.0) -> None:
         if len(clip) != len(tracks):
@@ -73,9 +55,8 @@ class OverlayPainter:
             )
         self._clip, self._tracks, self._trail_s = clip, tracks, trail_s
         self._scale = max(1.0, SMALLEST_HEIGHT_PX / clip.camera.height)
-        self._width, self._height = (
-            2 * round(side * self._scale / 2) for side in (clip.camera.width, clip.camera.height)
-        )
+        sides = (clip.camera.width, clip.camera.height)
+        self._width, self._height = (2 * round(side * self._scale / 2) for side in sides)
         self._unit = self._height / 720
         self._panel = 2 * round(180 * self._unit)
         self._footer = 2 * round(18 * self._unit)
@@ -83,13 +64,9 @@ class OverlayPainter:
         self._colours = [query_colour(k) for k in range(len(tracks.names))]
         self._held, self._lost = (np.asarray(tracks.state == state.value) for state in (State.HELD, State.LOST))
         self._joints = joint_lines(tracks)
-        self._inset = Inset(
-            tracks.point_world,
-            clip.cam_from_world[0],
-            joints=self._joints,
-            size=(self._panel, round(0.86 * self._panel)),
-            unit=self._unit,
-        )
+        size = (self._panel, round(0.86 * self._panel))
+        pose = clip.cam_from_world[0]
+        self._inset = Inset(tracks.point_world, pose, joints=self._joints, size=size, unit=self._unit)
         self._tag_side: dict[int, int] = {}
         self._still = self._draw_still()
 
@@ -107,8 +84,7 @@ class OverlayPainter:
         """Frame ``t``."""
         canvas = self._still.copy()
         picture = canvas[: self._height, : self._width]
-        enlarged = self._scale > 1
-        method = cv2.INTER_CUBIC if enlarged else cv2.INTER_AREA
+        method = cv2.INTER_CUBIC if self._scale > 1 else cv2.INTER_AREA
         picture[:] = cv2.resize(self._clip.rgb[t], (self._width, self._height), interpolation=method)
         self._draw_joints(picture, t)
         self._draw_trails(picture, t)
@@ -118,20 +94,19 @@ class OverlayPainter:
             self._draw_mark(picture, tuple(self._uv[t, k]), t, k)
         self._draw_tags(picture, t, known)
         side = canvas[:, self._width :]
-        self._inset.draw_tracks(side[: round(0.86 * self._panel)], t, self._mark_colours(t), self._tracks.visible)
+        colours = [LOST if lost else colour for lost, colour in zip(self._lost[t], self._colours, strict=True)]
+        self._inset.draw_tracks(side[: round(0.86 * self._panel)], t, colours, self._tracks.visible)
         self._draw_rows(side, t)
         self._draw_footer(canvas, t)
         return canvas
 
-    def _mark_colours(self, t: int) -> list[RGB]:
-        return [LOST if self._lost[t, k] else self._colours[k] for k in range(len(self._colours))]
+    def _colour(self, t: int, k: int) -> RGB:
+        return LOST if self._lost[t, k] else HELD if self._held[t, k] else self._colours[k]
 
     def _draw_still(self) -> Canvas:
         """Everything that is the same on all frames."""
-        canvas = np.empty((self._height + self._footer, self._width + self._panel, 3), dtype=np.uint8)
-        canvas[:] = BACKGROUND
+        canvas, u = ink.blank(self._height + self._footer, self._width + self._panel), self._unit
         side = canvas[:, self._width :]
-        u = self._unit
         inset = side[: round(0.86 * self._panel)]
         self._inset.draw_frame(inset)
         for joint, colour in zip(self._joints, self._colours, strict=True):
@@ -157,8 +132,7 @@ class OverlayPainter:
             draw_cased_path(picture, path, colour=colour, width=max(2, round(2 * u)))
             for end in path[[0, -1]]:
                 if np.isfinite(end).all():
-                    draw_disc(picture, tuple(end), 4.5 * u, colour=BACKGROUND)
-                    draw_disc(picture, tuple(end), 3.5 * u, colour=colour)
+                    draw_disc(picture, tuple(end), 3.5 * u, colour=colour, edge=u)
 
     def _pixels(self, point_world: np.ndarray, t: int) -> np.ndarray:
         """Pixels of the picture of world points in a frame; NaN behind the camera."""
@@ -171,23 +145,15 @@ class OverlayPainter:
         stamp_s = self._clip.stamp_s
         first = int(np.searchsorted(stamp_s, stamp_s[t] - self._trail_s))
         width = max(2, round(2.5 * self._unit))
-        for k, colour in enumerate(self._colours):
-            for s in range(first + 1, t + 1):
-                a, b = self._uv[s - 1, k], self._uv[s, k]
-                if not np.abs(a - b).max() > 0.3:  # resting, or NaN
-                    continue
-                if self._held[s, k] and s % 2:  # every other piece is left out: dashed
-                    continue
-                unsure = self._held[s, k] or self._lost[s, k]
-                fade = (s - first) / (t - first)
-                draw_line(
-                    picture,
-                    tuple(a),
-                    tuple(b),
-                    colour=HELD if unsure else colour,
-                    width=width,
-                    opacity=0.15 + 0.75 * fade,
-                )
+        for k, s in np.ndindex(len(self._colours), t - first):
+            s += first + 1
+            a, b = self._uv[s - 1, k], self._uv[s, k]
+            dashed = self._held[s, k] and s % 2  # every other piece is left out
+            if dashed or not np.abs(a - b).max() > 0.3:  # resting, or NaN
+                continue
+            colour = HELD if self._held[s, k] or self._lost[s, k] else self._colours[k]
+            opacity = 0.15 + 0.75 * (s - first) / (t - first)
+            draw_line(picture, tuple(a), tuple(b), colour=colour, width=width, opacity=opacity)
 
     def _draw_mark(self, picture: Canvas, xy: tuple[float, ...], t: int, k: int, *, radius: float = 7.0) -> None:
         u, colour, centre = self._unit, self._colours[k], (xy[0], xy[1])
@@ -199,23 +165,21 @@ class OverlayPainter:
                     a, b = (centre[0] - arm, centre[1] - sign * arm), (centre[0] + arm, centre[1] + sign * arm)
                     draw_line(picture, a, b, colour=colour, width=thickness)
         elif self._held[t, k]:
-            draw_disc(picture, centre, 0.5 * radius + 1.5 * u, colour=BACKGROUND)
-            draw_disc(picture, centre, 0.5 * radius, colour=colour)
-            draw_ring(picture, centre, 1.35 * radius, colour=BACKGROUND, width=width + 2, dashes=5)
-            draw_ring(picture, centre, 1.35 * radius, colour=HELD, width=width, dashes=5)
+            draw_disc(picture, centre, 0.5 * radius, colour=colour, edge=1.5 * u)
+            draw_ring(picture, centre, 1.35 * radius, colour=HELD, width=width, dashes=5, edge=1)
         elif self._tracks.visible[t, k]:
-            draw_disc(picture, centre, radius + 2.5 * u, colour=BACKGROUND)
-            draw_disc(picture, centre, radius + 1.2 * u, colour=(255, 255, 255))
+            draw_disc(picture, centre, radius + 1.2 * u, colour=(255, 255, 255), edge=1.3 * u)
             draw_disc(picture, centre, radius - 0.8 * u, colour=colour)
         else:
-            draw_ring(picture, centre, radius, colour=BACKGROUND, width=width + 2)
-            draw_ring(picture, centre, radius, colour=colour, width=width)
+            draw_ring(picture, centre, radius, colour=colour, width=width, edge=1)
 
     def _tag_text(self, t: int, k: int) -> str:
         if len(self._colours) > MOST_TAGS:
             return str(k)
-        doing = "lost" if self._lost[t, k] else "held" if self._held[t, k] else f"{self._tracks.confidence[t, k]:.2f}"
-        return f"{fit_text(self._name(k), round(15 * self._unit), 150 * self._unit)}  {doing}"
+        return f"{fit_text(self._name(k), round(15 * self._unit), 150 * self._unit)}  {self._doing(t, k)}"
+
+    def _doing(self, t: int, k: int) -> str:
+        return "lost" if self._lost[t, k] else "held" if self._held[t, k] else f"{self._tracks.confidence[t, k]:.2f}"
 
     def _name(self, k: int) -> str:
         name, label = self._tracks.names[k] or f"query {k}", self._tracks.labels[k]
@@ -225,19 +189,14 @@ class OverlayPainter:
         """Place a tag beside every mark where it covers least; a tag moves only if that frees something."""
         u = self._unit
         size, height = round(15 * u), 22 * u
-        taken = [(*(self._uv[t, k] - 9 * u), *(self._uv[t, k] + 9 * u)) for k in known]
-        for joint in filter(None, self._joints):
-            taken += [
-                (*(xy - 6 * u), *(xy + 6 * u)) for xy in self._pixels(joint.path[::6], t) if np.isfinite(xy).all()
-            ]
+        paths = [xy for joint in self._joints if joint for xy in self._pixels(joint.path[::6], t)]
+        marks = [(self._uv[t, k], 9 * u) for k in known] + [(xy, 6 * u) for xy in paths if np.isfinite(xy).all()]
+        taken = [(*(xy - reach), *(xy + reach)) for xy, reach in marks]
         for k in known:
             text = self._tag_text(t, k)
             # Digits differ in width: rounding up keeps the box from trembling.
-            width = -(-text_size(text, size)[0] // 8) * 8 + 26 * u
-            boxes = [
-                _clamped(x, y, width, height, self._width, self._height)
-                for x, y in _sides(self._uv[t, k], width, height, u)
-            ]
+            width = -(-ink.text_size(text, size)[0] // 8) * 8 + 26 * u
+            boxes = _boxes(self._uv[t, k], width, height, u, (self._width, self._height))
             costs = [sum(_overlap(box, other) for other in taken) for box in boxes]
             kept = self._tag_side.get(k)
             best = int(np.argmin(costs))
@@ -246,7 +205,7 @@ class OverlayPainter:
             self._tag_side[k] = best
             x0, y0, x1, y1 = boxes[best]
             taken.append(boxes[best])
-            colour = LOST if self._lost[t, k] else HELD if self._held[t, k] else self._colours[k]
+            colour = self._colour(t, k)
             if best >= 4:  # far from its mark: a leader shows whose it is
                 near = (float(np.clip(self._uv[t, k][0], x0, x1)), float(np.clip(self._uv[t, k][1], y0, y1)))
                 draw_line(picture, tuple(self._uv[t, k]), near, colour=colour, width=max(1, round(u)), opacity=0.8)
@@ -264,43 +223,27 @@ class OverlayPainter:
         if shown < queries:
             shown -= 1
             draw_text(side, f"and {queries - shown} more", (16 * u, bottom - row / 2), size=round(13 * u), colour=MUTED)
-        size = round(15 * u if row > 30 * u else 13 * u)
-        name_width = self._panel - 196 * u
         for k in range(min(shown, queries)):
-            middle = top + (k + 0.5) * row
-            draw_box(
-                side,
-                8 * u,
-                middle - row / 2 + 2 * u,
-                self._panel - 16 * u,
-                row - 4 * u,
-                colour=SURFACE,
-                radius=round(7 * u),
-            )
-            bound = bool(np.isfinite(self._uv[t, k]).all())
-            if bound:
-                self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
-            joint = self._coordinate(t, k)
-            two_lines = bool(joint) and row > 38 * u
-            draw_text(
-                side,
-                fit_text(self._name(k), size, name_width),
-                (40 * u, middle - 8 * u * two_lines),
-                size=size,
-                colour=TEXT if bound else MUTED,
-            )
-            if two_lines:
-                small = round(12 * u)
-                draw_text(side, fit_text(joint, small, name_width), (40 * u, middle + 11 * u), size=small, colour=MUTED)
-            value, colour = f"{self._tracks.confidence[t, k]:.2f}", TEXT
-            if not bound:
-                value, colour = "none yet", MUTED
-            elif self._lost[t, k]:
-                value, colour = "lost", LOST
-            elif self._held[t, k]:
-                value, colour = "held", HELD
-            self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
-            draw_text(side, value, (self._panel - 18 * u, middle), size=size, colour=colour, align="right")
+            self._draw_row(side, t, k, top + (k + 0.5) * row, row)
+
+    def _draw_row(self, side: Canvas, t: int, k: int, middle: float, row: float) -> None:
+        u = self._unit
+        size, small, name_width = round(15 * u if row > 30 * u else 13 * u), round(12 * u), self._panel - 196 * u
+        box = (8 * u, middle - row / 2 + 2 * u, self._panel - 16 * u, row - 4 * u)
+        draw_box(side, *box, colour=SURFACE, radius=round(7 * u))
+        bound = bool(np.isfinite(self._uv[t, k]).all())
+        if bound:
+            self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
+        joint = self._coordinate(t, k)
+        two_lines = bool(joint) and row > 38 * u
+        name, at = fit_text(self._name(k), size, name_width), (40 * u, middle - 8 * u * two_lines)
+        draw_text(side, name, at, size=size, colour=TEXT if bound else MUTED)
+        if two_lines:
+            draw_text(side, fit_text(joint, small, name_width), (40 * u, middle + 11 * u), size=small, colour=MUTED)
+        value = self._doing(t, k) if bound else "none yet"
+        colour = {"none yet": MUTED, "lost": LOST, "held": HELD}.get(value, TEXT)
+        self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
+        draw_text(side, value, (self._panel - 18 * u, middle), size=size, colour=colour, align="right")
 
     def _coordinate(self, t: int, k: int) -> str:
         """Where on its joint a query is, and the range; empty where it has none that moves."""
@@ -316,10 +259,9 @@ class OverlayPainter:
         frames = frames[frames <= t]
         confidence = np.clip(np.nan_to_num(self._tracks.confidence[frames, k].astype(np.float64)), 0, 1)
         x, y = at[0] + size[0] * frames / last, at[1] + size[1] * (1 - confidence)
-        for i in range(1, len(frames)):
-            f = frames[i]
-            colour = LOST if self._lost[f, k] else HELD if self._held[f, k] else self._colours[k]
-            draw_line(side, (x[i - 1], y[i - 1]), (x[i], y[i]), colour=colour, width=max(1, round(1.3 * self._unit)))
+        for i, f in list(enumerate(frames.tolist()))[1:]:
+            width = max(1, round(1.3 * self._unit))
+            draw_line(side, (x[i - 1], y[i - 1]), (x[i], y[i]), colour=self._colour(f, k), width=width)
 
     def _draw_footer(self, canvas: Canvas, t: int) -> None:
         u, frames = self._unit, len(self._clip)
@@ -327,29 +269,25 @@ class OverlayPainter:
         digits = len(str(frames - 1))
         when = f"frame {t:0{digits}d} / {frames - 1}    {self._clip.stamp_s[t]:.2f} s"
         draw_text(canvas, when, (canvas.shape[1] - 14 * u, middle), size=size, colour=TEXT, align="right")
-        room = canvas.shape[1] - text_size(when, size)[0] - 44 * u
+        room = canvas.shape[1] - ink.text_size(when, size)[0] - 44 * u
         left = "    ".join((self._clip.name, *self._tracks.frame_flags))
         draw_text(canvas, fit_text(left, size, room), (14 * u, middle), size=size, colour=MUTED)
         done = canvas.shape[1] * (t + 1) / frames
         draw_box(canvas, 0, self._height, done, max(2, 2 * u), colour=query_colour(0))
 
 
-def _sides(uv: np.ndarray, width: float, height: float, u: float) -> list[tuple[float, float]]:
-    """Top left corners of a tag round a mark: four near ones, then four farther ones."""
-    x, y = float(uv[0]), float(uv[1])
-    near, far = 13 * u, 40 * u
-    places = []
-    for gap in (near, far):
-        up, down = y - gap - height / 2, y + gap - height / 2
-        places += [(x + gap, up), (x + gap, down), (x - gap - width, up), (x - gap - width, down)]
-    return places
-
-
-def _clamped(
-    x: float, y: float, width: float, height: float, right: float, bottom: float
-) -> tuple[float, float, float, float]:
-    x, y = min(max(x, 3.0), right - width - 3), min(max(y, 3.0), bottom - height - 3)
-    return x, y, x + width, y + height
+def _boxes(
+    uv: np.ndarray, width: float, height: float, u: float, size: tuple[int, int]
+) -> list[tuple[float, float, float, float]]:
+    """Places of a tag round a mark, inside the picture: four near ones, then four farther ones."""
+    boxes = []
+    for gap in (13 * u, 40 * u):
+        for x in (uv[0] + gap, uv[0] - gap - width):
+            for y in (uv[1] - gap - height / 2, uv[1] + gap - height / 2):
+                left = min(max(float(x), 3.0), size[0] - width - 3)
+                top = min(max(float(y), 3.0), size[1] - height - 3)
+                boxes.append((left, top, left + width, top + height))
+    return boxes
 
 
 def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:

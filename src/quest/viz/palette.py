@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Iterable
+
+from quest.types import LABELS
 
 RGB = tuple[int, int, int]
 
@@ -35,3 +38,8 @@ def query_colour(index: int) -> RGB:
     hue = 0.08 + 0.84 * ((index * 0.61803398875) % 1.0)
     red, green, blue = colorsys.hsv_to_rgb(hue, 0.5 + 0.2 * (index % 2), 1.0)
     return round(red * 255), round(green * 255), round(blue * 255)
+
+
+def entity_colours(labels: Iterable[str]) -> list[RGB]:
+    """Colours of an object's entities: bright for what is tracked, grey for hinges."""
+    return [query_colour(e) if label in LABELS else MUTED for e, label in enumerate(labels)]

@@ -1,213 +1,288 @@
-"""Takes in Rerun: images, depth as 3D points, entities and their trails, joint axes, cameras, masks, joint positions.
+"""Takes and tracks in Rerun. Timelines are ``frame`` and ``time``.
 
-Below ``world`` are ``entities``, ``trails`` (of the last second), ``joints`` (their axes) and one ``view_N`` per
-camera, whose ``image`` holds ``rgb``, ``depth``, ``links`` and ``entities``; below ``joints`` is one curve per joint.
-Timelines are ``frame`` and ``time``.
+Below ``world`` are ``entities``, ``trails`` (of the last second) and ``joints``. A take has one ``view_N`` per camera,
+whose ``image`` holds ``rgb``, ``depth``, ``links`` and ``entities``, and below ``joints`` one curve per joint. Tracks
+have one ``camera`` with such an image, joints as they are known at the end (the axis of turning with the arc that was
+seen, or the line of sliding), and curves of the entities: ``confidence``, and below ``joints`` the coordinate in
+degrees or metres where it moves. Without depth nothing of tracks is in space.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float, Int
 
 from quest.data.take_format import DEPTH_SCALE_M, encode_depth
 from quest.errors import ConfigError
 from quest.extras import require
-from quest.types import LABELS, Take, View
+from quest.types import LABELS, Camera, Clip, Take, Tracks, View
+from quest.viz.joint_lines import joint_lines
 from quest.viz.palette import HELD, LINE, MUTED, RGB, query_colour
 from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
-    import rerun as rr
     import rerun.blueprint as rrb
 
-APPLICATION = "quest-take"
 TRAIL_S = 1.0
 _JPEG_QUALITY = 90
+_CAMERA = "world/camera"
 
 
-def save_rrd(take: Take, path: str | Path, *, every: int = 1) -> None:
+def save_rrd(take: Take, path: str | Path | None, *, every: int = 1) -> None:
     """Write a take as a Rerun recording, all or nothing.
 
     Args:
         take: the take.
-        path: file to write, ``.rrd`` by custom; its folder is made.
+        path: file to write, ``.rrd`` by custom; its folder is made. None opens Rerun's viewer, or the one that is open.
         every: of a longer take, these are every n-th frame; for the numbers of frames.
+
+    Raises:
+        ConfigError: there is no screen for the viewer.
+        MissingExtraError: the extra ``viz`` is not installed.
+    """
+    check_viewer(on_screen=path is None)
+    log = _Log("quest-take", take.info.name, take.info.half_diagonal_m, np.arange(len(take)) * every, take.stamp_s)
+    log.record(_take_blueprint(take), lambda: _log_take(log, take), path)
+
+
+def save_tracks(clip: Clip, tracks: Tracks, path: str | Path | None) -> None:
+    """Write the tracks of a clip as a Rerun recording, all or nothing.
+
+    Args:
+        clip: the frames that were tracked.
+        tracks: the answers, one per frame of the clip.
+        path: as for :func:`save_rrd`, and so are the errors.
+    """
+    check_viewer(on_screen=path is None)
+    points = tracks.point_world[np.isfinite(tracks.point_world).all(axis=-1)]
+    size_m = max(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) > 1 else 0.0, 0.2)
+    log = _Log("quest-tracks", clip.name, size_m, np.arange(len(clip)), clip.stamp_s)
+    log.record(_tracks_blueprint(clip), lambda: _log_tracks(log, clip, tracks), path)
+
+
+def check_viewer(*, on_screen: bool) -> None:
+    """See before the work whether its result can be shown, on the screen or in a file.
 
     Raises:
         MissingExtraError: the extra ``viz`` is not installed.
-    """
-    recording = new_recording(APPLICATION, take.info.name)
-    with whole_file(Path(path)) as partial:
-        recording.save(partial, default_blueprint=take_blueprint(take))
-        log_take(take, recording, every=every)
-        recording.flush()
-        recording.disconnect()
-
-
-def open_viewer(take: Take, *, every: int = 1) -> None:
-    """Open Rerun's viewer, or the one that is open, on a take.
-
-    Args:
-        take: the take.
-        every: of a longer take, these are every n-th frame; for the numbers of frames.
-
-    Raises:
         ConfigError: there is no screen.
-        MissingExtraError: the extra ``viz`` is not installed.
     """
-    recording = new_recording(APPLICATION, take.info.name)
-    check_screen()
-    recording.spawn(default_blueprint=take_blueprint(take))
-    log_take(take, recording, every=every)
-    recording.flush()
-
-
-def log_take(take: Take, recording: rr.RecordingStream, *, every: int = 1) -> None:
-    """Log everything of a take.
-
-    Args:
-        take: the take.
-        recording: where to.
-        every: of a longer take, these are every n-th frame; for the numbers of frames.
-
-    Raises:
-        MissingExtraError: the extra ``viz`` is not installed.
-    """
-    rerun = require("rerun")
-    colours = [query_colour(e) if entity.label in LABELS else MUTED for e, entity in enumerate(take.info.entities)]
-    recording.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for v, view in enumerate(take.views):
-        _log_camera(rerun, recording, take, view, v)
-    _log_joint_curves(rerun, recording, take, every)
-    for t in range(len(take)):
-        _set_time(recording, take, t, every)
-        _log_world(rerun, recording, take, t, colours)
-        for v, view in enumerate(take.views):
-            _log_view(rerun, recording, view, v, t, colours)
-
-
-def take_blueprint(take: Take) -> rrb.Blueprint:
-    """How the viewer arranges a take: the world on the left, cameras and joints on the right."""
-    rrb = require("rerun.blueprint")
-    images = []
-    for v in range(len(take.views)):
-        origin = f"/world/view_{v}/image"
-        colour = rrb.Spatial2DView(
-            origin=origin, contents=[f"{origin}/rgb", f"{origin}/links", f"{origin}/entities/**"], name=f"view {v}"
-        )
-        depth = rrb.Spatial2DView(origin=origin, contents=[f"{origin}/depth"], name=f"depth {v}")
-        images.append(rrb.Tabs(colour, depth))
-    joints = rrb.TimeSeriesView(origin="/joints", name="joint positions")
-    hidden = [f"- /world/view_{v}/image/links" for v in range(len(take.views))]
-    world = rrb.Spatial3DView(origin="/world", contents=["/world/**", *hidden], name="world")
-    return rrb.Blueprint(
-        rrb.Horizontal(world, rrb.Vertical(rrb.Grid(*images), joints, row_shares=[3, 1]), column_shares=[3, 2]),
-        collapse_panels=True,
-    )
-
-
-def check_screen() -> None:
-    """Raise ConfigError if there is no screen for Rerun's viewer."""
-    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+    require("rerun")
+    if on_screen and sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError(
             "Rerun: there is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set); save a recording with --rrd "
             "FILE and open it elsewhere"
         )
 
 
-def new_recording(application: str, name: str) -> rr.RecordingStream:
-    """A recording that knows no other times than those that are logged.
+class _Log:
+    """A recording that knows no other times than those of its frames, and what takes and tracks have in common.
 
-    Raises:
-        MissingExtraError: the extra ``viz`` is not installed.
+    Args:
+        application: what Rerun calls this kind of recording.
+        name: of the recording.
+        size_m: of what is seen, for the sizes of marks.
+        frames: numbers of the frames.
+        stamp_s: their times.
     """
-    recording = require("rerun").RecordingStream(application)
-    recording.send_recording_name(name)
-    recording.set_log_time_enabled(False)
-    recording.set_log_tick_enabled(False)
-    return recording
+
+    def __init__(
+        self,
+        application: str,
+        name: str,
+        size_m: float,
+        frames: Int[np.ndarray, " T"],
+        stamp_s: Float[np.ndarray, " T"],
+    ) -> None:
+        self.rerun = require("rerun")
+        self.stream: Any = self.rerun.RecordingStream(application)
+        self.stream.send_recording_name(name)
+        self.stream.set_log_time_enabled(False)
+        self.stream.set_log_tick_enabled(False)
+        self.size_m, self.frames, self.stamp_s = size_m, frames, stamp_s.astype(np.float64)
+
+    def record(self, blueprint: rrb.Blueprint, fill: Callable[[], None], path: str | Path | None) -> None:
+        """Fill it into a file, whole or not at all, or into the viewer."""
+        if path is None:
+            self.stream.spawn(default_blueprint=blueprint)
+            fill()
+            self.stream.flush()
+            return
+        with whole_file(Path(path)) as partial:
+            self.stream.save(partial, default_blueprint=blueprint)
+            fill()
+            self.stream.flush()
+            self.stream.disconnect()
+
+    def at(self, t: int) -> None:
+        """What is logged next is of frame ``t``."""
+        self.stream.set_time("frame", sequence=int(self.frames[t]))
+        self.stream.set_time("time", duration=float(self.stamp_s[t]))
+
+    def camera(self, path: str, camera: Camera) -> None:
+        """Intrinsics."""
+        pinhole = self.rerun.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=[camera.width, camera.height],
+            camera_xyz=self.rerun.ViewCoordinates.RDF,
+            image_plane_distance=0.25 * self.size_m,
+        )
+        self.stream.log(f"{path}/image", pinhole, static=True)
+
+    def frame(self, path: str, clip: Clip, t: int) -> None:
+        """Pose where it changes, colours and depth."""
+        pose = clip.cam_from_world[t]
+        if t == 0 or not np.array_equal(pose, clip.cam_from_world[t - 1]):
+            rotation = pose[:3, :3].T
+            moved = self.rerun.Transform3D(translation=-rotation @ pose[:3, 3], mat3x3=rotation)
+            self.stream.log(path, moved)
+        self.stream.log(f"{path}/image/rgb", self.rerun.Image(clip.rgb[t]).compress(jpeg_quality=_JPEG_QUALITY))
+        if clip.depth_m is not None:
+            depth = self.rerun.DepthImage(encode_depth(clip.depth_m[t]), meter=1 / DEPTH_SCALE_M)
+            self.stream.log(f"{path}/image/depth", depth)
+
+    def point(self, name: str, points: Float[np.ndarray, "T 3"], t: int, colour: RGB, trail_colour: RGB) -> None:
+        """Where an entity is, and its trail."""
+        begin = int(np.searchsorted(self.stamp_s, self.stamp_s[t] - TRAIL_S - 1e-6))
+        trail = points[begin : t + 1]
+        trail = trail[np.isfinite(trail).all(axis=-1)]
+        if len(trail):
+            mark = self.rerun.Points3D(
+                trail[-1:], colors=colour, radii=0.02 * self.size_m, labels=name, show_labels=False
+            )
+            self.stream.log(["world", "entities", name], mark)
+            line = self.rerun.LineStrips3D([trail], colors=trail_colour, radii=0.006 * self.size_m)
+            self.stream.log(["world", "trails", name], line)
+
+    def arrow(self, path: list[str], line: Float[np.ndarray, "2 3"], label: str, colour: RGB, **more: Any) -> None:
+        """An axis."""
+        arrow = self.rerun.Arrows3D(
+            origins=line[:1], vectors=line[1:] - line[:1], colors=colour, radii=0.008 * self.size_m, labels=label,
+            show_labels=False,
+        )  # fmt: skip
+        self.stream.log(path, arrow, **more)
+
+    def curve(
+        self, path: list[str], label: str, colour: RGB, values: Float[np.ndarray, " T"], shown: Any = ...
+    ) -> None:
+        """Values over the frames, or over those that are shown."""
+        entity = self.rerun.new_entity_path(path)
+        self.stream.log(entity, self.rerun.SeriesLines(names=label, colors=colour), static=True)
+        times = [
+            self.rerun.TimeColumn("frame", sequence=self.frames[shown]),
+            self.rerun.TimeColumn("time", duration=self.stamp_s[shown]),
+        ]
+        columns = self.rerun.Scalars.columns(scalars=values[shown].astype(np.float64))
+        self.stream.send_columns(entity, times, columns)
 
 
-def _set_time(recording: rr.RecordingStream, take: Take, t: int, every: int) -> None:
-    recording.set_time("frame", sequence=t * every)
-    recording.set_time("time", duration=float(take.stamp_s[t]))
+def _take_blueprint(take: Take) -> rrb.Blueprint:
+    """The world on the left, cameras and joints on the right."""
+    rrb, images = require("rerun.blueprint"), []
+    for v in range(len(take.views)):
+        origin = f"/world/view_{v}/image"
+        contents = [f"{origin}/rgb", f"{origin}/links", f"{origin}/entities/**"]
+        colour = rrb.Spatial2DView(origin=origin, contents=contents, name=f"view {v}")
+        depth = rrb.Spatial2DView(origin=origin, contents=[f"{origin}/depth"], name=f"depth {v}")
+        images.append(rrb.Tabs(colour, depth))
+    joints = rrb.TimeSeriesView(origin="/joints", name="joint positions")
+    hidden = [f"- /world/view_{v}/image/links" for v in range(len(take.views))]
+    world = rrb.Spatial3DView(origin="/world", contents=["/world/**", *hidden], name="world")
+    side = rrb.Vertical(rrb.Grid(*images), joints, row_shares=[3, 1])
+    return rrb.Blueprint(rrb.Horizontal(world, side, column_shares=[3, 2]), collapse_panels=True)
 
 
-def _log_camera(rerun: ModuleType, recording: rr.RecordingStream, take: Take, view: View, v: int) -> None:
-    """What does not change: intrinsics and the names and colours of links."""
-    camera = view.clip.camera
-    pinhole = rerun.Pinhole(
-        image_from_camera=camera.matrix,
-        resolution=[camera.width, camera.height],
-        camera_xyz=rerun.ViewCoordinates.RDF,
-        image_plane_distance=0.25 * take.info.half_diagonal_m,
-    )
-    recording.log(f"world/view_{v}/image", pinhole, static=True)
-    classes = [rerun.AnnotationInfo(id=0, label="background", color=(0, 0, 0, 0))]
+def _tracks_blueprint(clip: Clip) -> rrb.Blueprint:
+    """The picture above the curves of confidence; beside them the world, where there is depth."""
+    rrb, image = require("rerun.blueprint"), f"/{_CAMERA}/image"
+    picture = rrb.Spatial2DView(origin=image, contents=[f"{image}/rgb", f"{image}/entities/**"], name=clip.name)
+    curves = rrb.TimeSeriesView(origin="/confidence", name="confidence")
+    if clip.depth_m is None:
+        return rrb.Blueprint(rrb.Vertical(picture, curves, row_shares=[3, 1]), collapse_panels=True)
+    coordinates = rrb.TimeSeriesView(origin="/joints", name="coordinates on joints")
+    flat = rrb.Vertical(picture, rrb.Horizontal(curves, coordinates), row_shares=[3, 1])
+    world = rrb.Spatial3DView(origin="/world", name="world")
+    return rrb.Blueprint(rrb.Horizontal(world, flat), collapse_panels=True)
+
+
+def _log_take(log: _Log, take: Take) -> None:
+    info = take.info
+    colours = [query_colour(e) if entity.label in LABELS else MUTED for e, entity in enumerate(info.entities)]
+    log.stream.log("world", log.rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    for v, view in enumerate(take.views):
+        log.camera(f"world/view_{v}", view.clip.camera)
+        log.stream.log(f"world/view_{v}/image/links", _link_names(log, take), static=True)
+    for j, joint in enumerate(info.joints):
+        unit = "rad" if joint.kind == "revolute" else "m"
+        colour = query_colour(j) if j in info.moved_joints else LINE
+        log.curve(["joints", joint.name], f"{joint.name} ({unit})", colour, take.joint_position[:, j])
+    for t in range(len(take)):
+        log.at(t)
+        for e, entity in enumerate(info.entities):
+            log.point(entity.name, take.point_world[:, e], t, colours[e], colours[e])
+        for j, joint in enumerate(info.joints):
+            axis = take.joint_axis[t, j]
+            if t == 0 or not np.array_equal(axis, take.joint_axis[t - 1, j]):
+                line = np.stack((axis[:3], axis[:3] + 0.4 * log.size_m * axis[3:]))
+                log.arrow(["world", "joints", joint.name], line, f"{joint.name} ({joint.kind})", HELD)
+        for v, view in enumerate(take.views):
+            log.frame(f"world/view_{v}", view.clip, t)
+            _log_truth(log, f"world/view_{v}/image", view, t, colours)
+
+
+def _link_names(log: _Log, take: Take) -> Any:
+    """Names and colours of links, by the entities that they carry."""
+    classes = [log.rerun.AnnotationInfo(id=0, label="background", color=(0, 0, 0, 0))]
     for link in range(take.link_pose.shape[1]):
         carried = [e for e, entity in enumerate(take.info.entities) if entity.link == link]
         names = ", ".join(take.info.entities[e].name for e in carried)
         colour = query_colour(carried[0]) if carried else HELD
         label = f"link {link}" + (f" ({names})" if names else "")
-        classes.append(rerun.AnnotationInfo(id=1 + link, label=label, color=colour))
-    recording.log(f"world/view_{v}/image/links", rerun.AnnotationContext(classes), static=True)
+        classes.append(log.rerun.AnnotationInfo(id=1 + link, label=label, color=colour))
+    return log.rerun.AnnotationContext(classes)
 
 
-def _log_joint_curves(rerun: ModuleType, recording: rr.RecordingStream, take: Take, every: int) -> None:
-    times = [
-        rerun.TimeColumn("frame", sequence=np.arange(len(take)) * every),
-        rerun.TimeColumn("time", duration=take.stamp_s.astype(np.float64)),
-    ]
-    for j, joint in enumerate(take.info.joints):
-        unit = "rad" if joint.kind == "revolute" else "m"
-        colour = query_colour(j) if j in take.info.moved_joints else LINE
-        path = rerun.new_entity_path(["joints", joint.name])
-        recording.log(path, rerun.SeriesLines(names=f"{joint.name} ({unit})", colors=colour), static=True)
-        values = take.joint_position[:, j].astype(np.float64)
-        recording.send_columns(path, times, rerun.Scalars.columns(scalars=values))
-
-
-def _log_world(rerun: ModuleType, recording: rr.RecordingStream, take: Take, t: int, colours: list[RGB]) -> None:
-    size_m = take.info.half_diagonal_m
-    begin = int(np.searchsorted(take.stamp_s, take.stamp_s[t] - TRAIL_S - 1e-6))
-    for e, entity in enumerate(take.info.entities):
-        point = rerun.Points3D(
-            take.point_world[t, e][None], colors=colours[e], radii=0.02 * size_m, labels=entity.name, show_labels=False
-        )
-        recording.log(["world", "entities", entity.name], point)
-        trail = rerun.LineStrips3D([take.point_world[begin : t + 1, e]], colors=colours[e], radii=0.006 * size_m)
-        recording.log(["world", "trails", entity.name], trail)
-    for j, joint in enumerate(take.info.joints):
-        if t > 0 and np.array_equal(take.joint_axis[t, j], take.joint_axis[t - 1, j]):
-            continue
-        axis = take.joint_axis[t, j]
-        arrow = rerun.Arrows3D(
-            origins=axis[None, :3], vectors=0.4 * size_m * axis[None, 3:], colors=HELD, radii=0.008 * size_m,
-            labels=f"{joint.name} ({joint.kind})", show_labels=False,
-        )  # fmt: skip
-        recording.log(["world", "joints", joint.name], arrow)
-
-
-def _log_view(rerun: ModuleType, recording: rr.RecordingStream, view: View, v: int, t: int, colours: list[RGB]) -> None:
-    clip, base = view.clip, f"world/view_{v}"
-    if t == 0 or not np.array_equal(clip.cam_from_world[t], clip.cam_from_world[t - 1]):
-        rotation, translation = clip.cam_from_world[t, :3, :3].T, clip.cam_from_world[t, :3, 3]
-        pose = rerun.Transform3D(translation=-rotation @ translation, mat3x3=rotation)
-        recording.log(base, pose)
-    recording.log(f"{base}/image/rgb", rerun.Image(clip.rgb[t]).compress(jpeg_quality=_JPEG_QUALITY))
-    if clip.depth_m is not None:
-        depth = rerun.DepthImage(encode_depth(clip.depth_m[t]), meter=1 / DEPTH_SCALE_M)
-        recording.log(f"{base}/image/depth", depth)
-    recording.log(f"{base}/image/links", rerun.SegmentationImage(view.link_id[t], opacity=0.3))
+def _log_truth(log: _Log, image: str, view: View, t: int, colours: list[RGB]) -> None:
+    """Links, and entities that are seen and that are not."""
+    log.stream.log(f"{image}/links", log.rerun.SegmentationImage(view.link_id[t], opacity=0.3))
     for name, shown in (("seen", view.visible[t]), ("hidden", ~view.visible[t] & np.isfinite(view.uv_px[t]).all(-1))):
         chosen = np.flatnonzero(shown)
-        marks = rerun.Points2D(
-            view.uv_px[t, chosen], colors=[colours[e] if name == "seen" else MUTED for e in chosen], radii=3.0
-        )
-        recording.log(f"{base}/image/entities/{name}", marks)
+        colour = [colours[e] if name == "seen" else MUTED for e in chosen]
+        log.stream.log(f"{image}/entities/{name}", log.rerun.Points2D(view.uv_px[t, chosen], colors=colour, radii=3.0))
+
+
+def _log_tracks(log: _Log, clip: Clip, tracks: Tracks) -> None:
+    log.stream.log("world", log.rerun.ViewCoordinates.RDF, static=True)
+    log.camera(_CAMERA, clip.camera)
+    bound = np.asarray(np.isfinite(tracks.uv_px).all(axis=-1))
+    for k, name in enumerate(tracks.names):
+        log.curve(["confidence", name], name, query_colour(k), tracks.confidence[:, k], bound[:, k])
+    for t in range(len(clip)):
+        log.at(t)
+        log.frame(_CAMERA, clip, t)
+        for k in np.flatnonzero(bound[t]).tolist():
+            name, colour = tracks.names[k], query_colour(k) if tracks.visible[t, k] else MUTED
+            label = f"{name} ({tracks.state[t, k]})"
+            mark = log.rerun.Points2D(tracks.uv_px[t, k][None], colors=colour, radii=4.0, labels=label)
+            log.stream.log([*_CAMERA.split("/"), "image", "entities", name], mark)
+            log.point(name, tracks.point_world[:, k], t, colour, query_colour(k))
+    joints = tracks.joints
+    for k, (name, lines) in enumerate(zip(tracks.names, joint_lines(tracks), strict=True)):
+        if joints is None or lines is None:
+            continue
+        colour, label = query_colour(k), f"{name}: {joints.describe(k)}"
+        path = log.rerun.LineStrips3D(
+            [lines.path, *lines.arms], colors=colour, show_labels=False, labels=[label, *("" for _ in lines.arms)],
+            radii=[0.008 * log.size_m, *(0.002 * log.size_m for _ in lines.arms)],
+        )  # fmt: skip
+        log.stream.log(["world", "joints", name, "path"], path, static=True)
+        if lines.axis is not None:
+            log.arrow(["world", "joints", name, "axis"], lines.axis, label, colour, static=True)
+        factor, unit = (180 / np.pi, "deg") if joints.kind[k] == "revolute" else (1.0, "m")
+        log.curve(["joints", name], f"{name} ({unit})", colour, factor * joints.q[:, k].astype(np.float64))

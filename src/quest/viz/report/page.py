@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,13 +17,10 @@ from quest.extras import require
 from quest.tracks import read_tracks
 from quest.types import Tracks
 from quest.untrusted import require_file
-from quest.viz.narrate import narrate
+from quest.viz.narrate import alarm_spans, narrate, summarise
 from quest.viz.palette import HELD, LOST
-from quest.viz.report.drift import Drift
-from quest.viz.report.plots import coordinates, drift_plot, time_lines, world
+from quest.viz.report.plots import Drift, Thinning, coordinates, drift_plot, time_lines, world
 from quest.viz.report.run_record import RunRecord, read_run
-from quest.viz.report.summary import alarm_spans, summarise
-from quest.viz.report.thinning import Thinning
 from quest.whole_file import whole_file
 from quest.wording import counted
 
@@ -38,8 +35,7 @@ _JOINERS = "\u200c\u200d"
 """Invisible, and part of how some scripts and pictographs are written."""
 
 
-@dataclass(frozen=True)
-class Video:
+class Video(NamedTuple):
     """The overlay video, or why there is none."""
 
     uri: str | None
@@ -121,41 +117,30 @@ def _content(folder: Path, tracks: Tracks, record: RunRecord | None, drift: Drif
         frame_flags=tuple(shown(flag, longest=500) for flag in tracks.frame_flags),
         stamp_s=tracks.stamp_s - tracks.stamp_s[0],
     )
-    thinning, alarms = Thinning.of(len(tracks), len(tracks.names)), alarm_spans(tracks)
-    words = narrate(tracks)
+    thinning, alarms, words = Thinning.of(len(tracks), len(tracks.names)), alarm_spans(tracks), narrate(tracks)
     video, lines, joints = _video(folder, tracks, record), time_lines(tracks, thinning), coordinates(tracks, thinning)
     space, truth = world(tracks, thinning), None if isinstance(drift, str) else drift_plot(tracks, drift, thinning)
-    plots = [plot for plot in (lines, *joints, space, truth) if plot is not None]
     knots = np.unique(np.linspace(0, len(tracks) - 1, min(len(tracks), _MOST_KNOTS)).astype(int))
-    clock = {"frames": len(tracks), "frames_per_s": video.frames_per_s, "knots": knots.tolist()}
-    clock["stamp_s"] = np.round(tracks.stamp_s[knots], 4).tolist()
+    clock = {
+        "frames": len(tracks), "frames_per_s": video.frames_per_s, "knots": knots.tolist(),
+        "stamp_s": np.round(tracks.stamp_s[knots], 4).tolist(),
+    }  # fmt: skip
+    poses = tracks.cam_from_world
     return {
         "name": shown(folder.resolve().name if record is None else record.recording.name),
-        "what": _what(tracks, record),
-        "record": record,
+        "what": _what(tracks, record), "record": record, "tracks": tracks, "video": video,
         "mismatch": record is not None and record.recording.frames != len(tracks),
         "words": words[:MOST_SENTENCES] or ["No entity was asked for or found."],
         "more_words": max(len(words) - MOST_SENTENCES, 0),
         "lines": summarise(tracks, alarms),
-        "alarms": alarms[:MOST_ALARMS],
-        "more_alarms": max(len(alarms) - MOST_ALARMS, 0),
+        "alarms": alarms[:MOST_ALARMS], "more_alarms": max(len(alarms) - MOST_ALARMS, 0),
         "monitored": tracks.lost_p is not None and bool(np.isfinite(tracks.lost_p).any()),
-        "tracks": tracks,
-        "video": video,
-        "time_lines": lines,
-        "coordinates": joints,
-        "joints": _joint_rows(tracks),
-        "world": space,
-        "poses": tracks.cam_from_world is not None and bool(np.isfinite(tracks.cam_from_world).any()),
-        "drift": drift,
-        "drift_plot": truth,
-        "drift_rows": [] if isinstance(drift, str) else _drift_rows(tracks, drift),
-        "plots": {"clock": clock, "plots": [vars(plot) for plot in plots]},
-        "bin_frames": thinning.width,
-        "colours": {"held": HELD, "lost": LOST},
-        "shown": shown,
-        "version": __version__,
-    }
+        "time_lines": lines, "coordinates": joints, "world": space, "drift_plot": truth, "drift": drift,
+        "joints": _joint_rows(tracks), "drift_rows": [] if isinstance(drift, str) else _drift_rows(tracks, drift),
+        "poses": poses is not None and bool(np.isfinite(poses).any()),
+        "plots": {"clock": clock, "plots": [vars(plot) for plot in (lines, *joints, space, truth) if plot is not None]},
+        "bin_frames": thinning.width, "colours": {"held": HELD, "lost": LOST}, "shown": shown, "version": __version__,
+    }  # fmt: skip
 
 
 def shown(text: str, *, longest: int = _LONGEST_NAME) -> str:
@@ -169,15 +154,12 @@ def shown(text: str, *, longest: int = _LONGEST_NAME) -> str:
 
 def _what(tracks: Tracks, record: RunRecord | None) -> str:
     """The recording in a line."""
-    said = [
-        counted(len(tracks), "frame"),
-        f"{tracks.stamp_s[-1]:.2f} s",
-        counted(len(tracks.names), "query", "queries"),
-    ]
+    source = []
     if record is not None:
         camera = record.recording.camera
-        said[2:2] = [f"{camera.width} × {camera.height} px", "with depth" if record.recording.has_depth else "no depth"]
-    return ", ".join(said)
+        source = [f"{camera.width} × {camera.height} px", "with depth" if record.recording.has_depth else "no depth"]
+    length, queries = f"{tracks.stamp_s[-1]:.2f} s", counted(len(tracks.names), "query", "queries")
+    return ", ".join((counted(len(tracks), "frame"), length, *source, queries))
 
 
 def _video(folder: Path, tracks: Tracks, record: RunRecord | None) -> Video:
@@ -192,10 +174,8 @@ def _video(folder: Path, tracks: Tracks, record: RunRecord | None) -> Video:
     except RecordingError as error:
         return Video(None, f"The video cannot be shown: {shown(str(error), longest=300)}.")
     if path.stat().st_size > MOST_VIDEO_BYTES:
-        size, most = path.stat().st_size / 2**20, MOST_VIDEO_BYTES / 2**20
-        return Video(
-            None, f"overlay.mp4 has {size:.0f} MiB and is not part of this page, which takes up to {most:.0f}."
-        )
+        size, most = (f"{size / 2**20:.0f}" for size in (path.stat().st_size, MOST_VIDEO_BYTES))
+        return Video(None, f"overlay.mp4 has {size} MiB and is not part of this page, which takes up to {most}.")
     uri = f"data:video/mp4;base64,{base64.b64encode(path.read_bytes()).decode()}"
     odd = info.frames not in (0, len(tracks))
     note = f"The video has {info.frames} frames, the tracks have {len(tracks)}: it is of another run." if odd else ""

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import html
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
 from quest.types import State, Tracks
 from quest.viz.joint_lines import JointLines, joint_lines
+from quest.viz.narrate import spans
 from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, TEXT, query_colour
-from quest.viz.report.drift import Drift
-from quest.viz.report.summary import runs
-from quest.viz.report.thinning import Thinning
 
 ROW_PX = 58
 """Height of a query's time line."""
@@ -27,7 +25,73 @@ _SMALLEST_BOX_M = 0.1
 _TOP, _FOOT, _STRIP = 0.32, 0.74, 0.86
 """Where in its row P(lost) is 1 and 0, and the middle of the strip of states."""
 
+MOST_BINS = 1000
+"""Per line: about as many as a screen is wide, in pixels."""
+_MOST_TOGETHER = 64 * MOST_BINS
+_FEWEST_BINS = 50
+
 Trace = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Drift:
+    """How far tracks are from the truth, each beside the entity that it was assigned to."""
+
+    entity: tuple[str | None, ...]
+    """Name of the entity per query; None where none was near it at first."""
+    distance: Float[np.ndarray, "T K"]
+    """Normalised units; NaN where the query has no entity, and before it is bound."""
+    accuracy: Float[np.ndarray, " K"]
+    """Share of frames in which the answer is nearest to its own entity and within :attr:`gate`; NaN likewise."""
+    gate: float
+    """Normalised units; an answer that is farther from every entity has no identity."""
+    unit_m: float
+    """Metres of a normalised unit."""
+    missing: float
+    """Distance of an answer without a world point, normalised units."""
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """Frames in bins of equal length, for plots of fewer frames than there are, without a loss of peaks and alarms.
+
+    Without need for it every frame is a bin of its own.
+    """
+
+    frames: int
+    """How many there are."""
+    width: int
+    """Frames in a bin; the last may have fewer."""
+
+    @classmethod
+    def of(cls, frames: int, lines: int) -> Thinning:
+        """Bins that keep a page with so many lines bounded."""
+        bins = max(_FEWEST_BINS, min(MOST_BINS, _MOST_TOGETHER // max(lines, 1)))
+        return cls(frames, -(-frames // bins))
+
+    def starts(self) -> Int[np.ndarray, " B"]:
+        """First frame of each bin."""
+        return np.arange(0, self.frames, self.width)
+
+    def every(self) -> Int[np.ndarray, " N"]:
+        """One frame per bin, and the last one."""
+        return np.unique([*self.starts(), self.frames - 1])
+
+    def extremes(self, values: Float[np.ndarray, " T"]) -> Int[np.ndarray, " N"]:
+        """Frames with the smallest and the largest value of each bin; NaN where a bin has nothing else."""
+        lost = np.isnan(values)
+        low = self._binned(np.where(lost, np.inf, values), np.inf).argmin(axis=1)
+        high = self._binned(np.where(lost, -np.inf, values), -np.inf).argmax(axis=1)
+        return np.unique(np.concatenate([self.starts() + low, self.starts() + high]))
+
+    def largest(self, values: Shaped[np.ndarray, " T"]) -> Shaped[np.ndarray, " B"]:
+        """Largest of the values of each bin, which are not negative."""
+        return self._binned(values, 0).max(axis=1)
+
+    def _binned(self, values: np.ndarray, fill: float) -> np.ndarray:
+        padded = np.full(len(self.starts()) * self.width, fill, dtype=values.dtype)
+        padded[: self.frames] = values
+        return padded.reshape(-1, self.width)
 
 
 @dataclass(frozen=True)
@@ -56,14 +120,9 @@ def time_lines(tracks: Tracks, thinning: Thinning) -> Plot | None:
     edge_s = _edges_s(tracks.stamp_s)
     left, right = float(edge_s[0]), float(edge_s[-1])
     rows = np.arange(queries)
-    data = [
-        {
-            **_line("scale", LINE, 1),
-            "x": [left, right, None] * 2 * queries,
-            "y": _values(np.stack([rows + _TOP] * 2 + [rows * np.nan] + [rows + _FOOT] * 2 + [rows * np.nan], 1)),
-            "hoverinfo": "skip",
-        }
-    ]
+    levels = np.stack([rows + _TOP] * 2 + [rows * np.nan] + [rows + _FOOT] * 2 + [rows * np.nan], 1)
+    scale = {"x": [left, right, None] * 2 * queries, "y": _values(levels), "hoverinfo": "skip"}
+    data = [_line("scale", LINE, 1) | scale]
     for k in range(queries):
         data += [*_alarm_bars(tracks, k, thinning, edge_s), _state_bars(tracks, k, thinning, edge_s)]
         if tracks.lost_p is not None and np.isfinite(tracks.lost_p[:, k]).any():
@@ -73,19 +132,12 @@ def time_lines(tracks: Tracks, thinning: Thinning) -> Plot | None:
         | {"font": {"color": _css(query_colour(k)), "size": 13}}
         for k, name in enumerate(tracks.names)
     ]
+    ticks = {"tickvals": [y for k in range(queries) for y in (k + _TOP, k + _FOOT)], "ticktext": ["1", "0"] * queries}
+    rows_axis = {"range": [queries, 0], "fixedrange": True, "showgrid": False, "zeroline": False, **ticks}
     height = ROW_PX * queries + 56
-    rows_axis = {
-        "range": [queries, 0],
-        "fixedrange": True,
-        "showgrid": False,
-        "zeroline": False,
-        "tickvals": [y for k in range(queries) for y in (k + _TOP, k + _FOOT)],
-        "ticktext": ["1", "0"] * queries,
-        "tickfont": {"size": 10},
-    }
-    layout = _layout(height, _seconds(left, right), yaxis=rows_axis, barmode="overlay", annotations=labels)
+    more = {"yaxis": rows_axis | {"tickfont": {"size": 10}}, "barmode": "overlay", "annotations": labels}
     about = f"Time lines of P(lost), alarms and states of {', '.join(tracks.names)}; the tables say the same in words."
-    return Plot("time-lines", about, height, data, layout)
+    return Plot("time-lines", about, height, data, _layout(height, _seconds(left, right), **more))
 
 
 def coordinates(tracks: Tracks, thinning: Thinning) -> list[Plot]:
@@ -101,27 +153,22 @@ def coordinates(tracks: Tracks, thinning: Thinning) -> list[Plot]:
                 values[np.isfinite(values)] = np.unwrap(values[np.isfinite(values)])
             data.append(_over_time(tracks, k, values * factor, thinning))
         if data:
-            plots.append(
-                _lines_plot(f"joint-{kind}", f"Coordinate of {kind} joints over time, {axis}", tracks, data, axis)
-            )
+            about = f"Coordinate of {kind} joints over time, {axis}"
+            plots.append(_lines_plot(f"joint-{kind}", about, tracks, data, axis))
     return plots
 
 
 def drift_plot(tracks: Tracks, drift: Drift, thinning: Thinning) -> Plot:
     """Distance from the truth over time."""
-    data = [
-        _over_time(tracks, k, drift.distance[:, k], thinning)
-        for k, entity in enumerate(drift.entity)
-        if entity is not None
-    ]
-    axis = "distance, normalised"
-    plot = _lines_plot(
-        "drift", "Distance of each answer from its true entity over time, normalised units", tracks, data, axis
-    )
+    known = [k for k, entity in enumerate(drift.entity) if entity is not None]
+    data = [_over_time(tracks, k, drift.distance[:, k], thinning) for k in known]
+    about = "Distance of each answer from its true entity over time, normalised units"
+    plot = _lines_plot("drift", about, tracks, data, "distance, normalised")
     line = {"color": _css(MUTED), "dash": "dash", "width": 1}
     gate = {"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": drift.gate, "y1": drift.gate, "line": line}
     plot.layout["yaxis"] |= {"rangemode": "tozero"}
-    return replace(plot, layout=plot.layout | {"shapes": [gate]})
+    plot.layout["shapes"] = [gate]
+    return plot
 
 
 def world(tracks: Tracks, thinning: Thinning) -> Plot | None:
@@ -143,9 +190,8 @@ def world(tracks: Tracks, thinning: Thinning) -> Plot | None:
         data += _camera_traces(poses[thinning.every()] if len(poses) == len(tracks) else poses)
     if not data:
         return None
-    layout = _layout(
-        520, {}, scene=_scene(data, poses), showlegend=_named(data), margin={"l": 0, "r": 0, "t": 0, "b": 0}
-    )
+    margin = dict.fromkeys("lrtb", 0)
+    layout = _layout(520, {}, scene=_scene(data, poses), showlegend=_named(data), margin=margin)
     about = "Tracks, joints and the camera in the world, metres, all axes at one scale; the tables hold the numbers."
     return Plot("world", about, 520, data, layout, timed=False)
 
@@ -194,28 +240,17 @@ def _joint_traces(name: str, joint: JointLines | None, colour: RGB, group: str) 
 
 
 def _space(name: str, points: Float[np.ndarray, "N 3"], colour: RGB, width: int, *, mode: str = "lines") -> Trace:
-    return {
-        "type": "scatter3d",
-        "mode": mode,
-        "name": _plain(name),
-        **{axis: _values(points[:, i]) for i, axis in enumerate("xyz")},
-        "line": {"color": _css(colour), "width": width},
-        "hovertemplate": "x %{x:.3f} m<br>y %{y:.3f} m<br>z %{z:.3f} m",
-    }
+    places = {axis: _values(points[:, i]) for i, axis in enumerate("xyz")}
+    hover = {"hovertemplate": "x %{x:.3f} m<br>y %{y:.3f} m<br>z %{z:.3f} m"}
+    return _line(name, colour, width) | {"type": "scatter3d", "mode": mode} | places | hover
 
 
 def _lost_line(tracks: Tracks, k: int, thinning: Thinning) -> Trace:
     assert tracks.lost_p is not None
-    frames = thinning.extremes(tracks.lost_p[:, k].astype(np.float64))
-    lost_p = tracks.lost_p[frames, k].astype(np.float64)
-    return {
-        **_line(tracks.names[k], query_colour(k), 2),
-        "mode": _mode(frames),
-        "x": _values(tracks.stamp_s[frames]),
-        "y": _values(k + _FOOT + (_TOP - _FOOT) * lost_p),
-        "customdata": _values(lost_p, digits=3),
-        "hovertemplate": "P(lost) %{customdata} at %{x:.2f} s",
-    }
+    lost_p = tracks.lost_p[:, k].astype(np.float64)
+    line, shown = _over_time(tracks, k, lost_p, thinning), lost_p[thinning.extremes(lost_p)]
+    said = {"customdata": _values(shown, digits=3), "hovertemplate": "P(lost) %{customdata} at %{x:.2f} s"}
+    return line | {"y": _values(k + _FOOT + (_TOP - _FOOT) * shown)} | said
 
 
 def _state_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> Trace:
@@ -223,50 +258,39 @@ def _state_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) 
     bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)
     codes = sum(np.where(tracks.state[:, k] == state, code, 0) for state, code in _CODES.items())
     worst = thinning.largest(np.where(bound, codes, 0))
-    spans = [(first, end) for first, end in runs(worst) if worst[first]]
+    worst_of = spans(worst)
     colours = (TEXT, query_colour(k), HELD, LOST)
     words = {code: state for state, code in _CODES.items()}
-    return _bars(tracks, k, spans, thinning, edge_s) | {
-        "width": 0.12,
-        "marker": {"color": [_css(colours[worst[first]]) for first, _ in spans], "line": {"width": 0}},
-        "customdata": [words[int(worst[first])] for first, _ in spans],
-        "hovertemplate": "%{customdata} from %{base:.2f} s for %{x:.2f} s",
-    }
+    fill = {"color": [_css(colours[worst[first]]) for first, _ in worst_of], "line": {"width": 0}}
+    said = [words[int(worst[first])] for first, _ in worst_of]
+    hover = {"customdata": said, "hovertemplate": "%{customdata} from %{base:.2f} s for %{x:.2f} s"}
+    return _bars(tracks, k, worst_of, thinning, edge_s) | {"width": 0.12, "marker": fill} | hover
 
 
 def _alarm_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> list[Trace]:
     if tracks.alarm is None or not tracks.alarm[:, k].any():
         return []
     alarmed = thinning.largest(tracks.alarm[:, k])
-    bars = _bars(tracks, k, [(first, end) for first, end in runs(alarmed) if alarmed[first]], thinning, edge_s)
+    bars = _bars(tracks, k, spans(alarmed), thinning, edge_s)
     fill = {"color": f"rgba({LOST[0]},{LOST[1]},{LOST[2]},0.28)", "line": {"color": _css(LOST), "width": 1}}
     y = [k + 0.62] * len(bars["y"])
     return [bars | {"y": y, "width": 0.7, "marker": fill, "hovertemplate": "alarm from %{base:.2f} s for %{x:.2f} s"}]
 
 
-def _bars(tracks: Tracks, k: int, spans: Sequence[tuple[int, int]], thinning: Thinning, edge_s: np.ndarray) -> Trace:
+def _bars(tracks: Tracks, k: int, bins: Sequence[tuple[int, int]], thinning: Thinning, edge_s: np.ndarray) -> Trace:
     """Bars over spans of bins."""
-    ends = np.array(spans, dtype=int).reshape(-1, 2) * thinning.width
+    ends = np.array(bins, dtype=int).reshape(-1, 2) * thinning.width
     from_s, until_s = edge_s[np.minimum(ends, thinning.frames)].T
-    return {
-        "type": "bar",
-        "orientation": "h",
-        "name": _plain(tracks.names[k]),
-        "base": _values(from_s),
-        "x": _values(until_s - from_s),
-        "y": [k + _STRIP] * len(spans),
-    }
+    bars = {"type": "bar", "orientation": "h", "name": _plain(tracks.names[k]), "y": [k + _STRIP] * len(bins)}
+    return bars | {"base": _values(from_s), "x": _values(until_s - from_s)}
 
 
 def _over_time(tracks: Tracks, k: int, values: Float[np.ndarray, " T"], thinning: Thinning) -> Trace:
     frames = thinning.extremes(values)
-    return {
-        **_line(tracks.names[k], query_colour(k), 2),
-        "mode": _mode(frames),
-        "x": _values(tracks.stamp_s[frames]),
-        "y": _values(values[frames]),
-        "hovertemplate": "%{y} at %{x:.2f} s",
-    }
+    # A line through one point is not seen.
+    trace = _line(tracks.names[k], query_colour(k), 2) | {"mode": "lines" if len(frames) > 2 else "lines+markers"}
+    points = {"x": _values(tracks.stamp_s[frames]), "y": _values(values[frames])}
+    return trace | points | {"hovertemplate": "%{y} at %{x:.2f} s"}
 
 
 def _lines_plot(id: str, about: str, tracks: Tracks, data: list[Trace], axis: str) -> Plot:
@@ -280,17 +304,9 @@ def _named(data: list[Trace]) -> bool:
     return len([trace for trace in data if trace.get("showlegend", True)]) <= MOST_NAMED
 
 
-def _mode(frames: Int[np.ndarray, " N"]) -> str:
-    return "lines" if len(frames) > 2 else "lines+markers"  # a line through one point is not seen
-
-
 def _line(name: str, colour: RGB, width: int) -> Trace:
-    return {
-        "type": "scatter",
-        "mode": "lines",
-        "name": _plain(name),
-        "line": {"color": _css(colour), "width": width},
-    }
+    line = {"color": _css(colour), "width": width}
+    return {"type": "scatter", "mode": "lines", "name": _plain(name), "line": line}
 
 
 def _layout(height: int, xaxis: dict[str, Any], **more: Any) -> dict[str, Any]:
@@ -311,12 +327,7 @@ def _layout(height: int, xaxis: dict[str, Any], **more: Any) -> dict[str, Any]:
 
 
 def _seconds(left: float, right: float) -> dict[str, Any]:
-    return {
-        "title": {"text": "time, s"},
-        "range": [left, right],
-        "gridcolor": _css(LINE),
-        "zeroline": False,
-    }
+    return {"title": {"text": "time, s"}, "range": [left, right], "gridcolor": _css(LINE), "zeroline": False}
 
 
 def _edges_s(stamp_s: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T1"]:
