@@ -9,14 +9,15 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from quest.errors import InputError
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value
+from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums
 from quest.evaluation.records import Discovery, EntityRecord
-from quest.evaluation.summary import READINGS, Reading, precision_sums, recall_sums, record_sums
+from quest.evaluation.summary import READINGS, discovery_values, record_sums
 from quest.evaluation.take_suite import TakeSuite
 
 PAIRED = ("ape", "ape_2d", "d100", "acc")
@@ -25,92 +26,30 @@ PAIRED = ("ape", "ape_2d", "d100", "acc")
 
 @dataclass(frozen=True)
 class Answers:
-    """What one variant answered in one seed.
-
-    Attributes:
-        variant: its name in the table.
-        seed: of its training.
-        records: per take, view and entity.
-        discoveries: per take and view of the semantic protocol.
-        reference: the variant that it is compared with; None for the reference itself.
-    """
+    """What one variant answered in one seed."""
 
     variant: str
+    """Its name in the table."""
     seed: int
+    """Of its training."""
     records: tuple[EntityRecord, ...]
+    """Per take, view and entity."""
     discoveries: tuple[Discovery, ...] = ()
+    """Per take and view of the semantic protocol."""
     reference: str | None = None
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Metrics of one row, or their differences (variant - reference); None where nothing was counted.
-
-    ``docs/metrics.md`` defines them.
-    """
-
-    ape: Value | None
-    ape_2d: Value | None
-    d100: Value | None
-    acc: Value | None
-    precision: Value | None = None
-    recall: Value | None = None
-
-
-@dataclass(frozen=True)
-class SeedScores:
-    """One seed's means."""
-
-    seed: int
-    ape: float
-    d100: float
-    acc: float
-
-
-@dataclass(frozen=True)
-class AblationRow:
-    """One row of a table.
-
-    Attributes:
-        variant: its name.
-        protocol: ``point`` or ``semantic``.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        suite: of the simulator, with its variant; ``standard`` for ordinary takes.
-        level: how many joints move one after the other.
-        reading: ``all`` entities or those that ``moved``.
-        objects: how many different objects.
-        takes: how many takes.
-        tracks: how many (take, view, entity), each counted once however many seeds answered it.
-        metrics: pooled over seeds.
-        reference: what the differences are from; None for the reference itself.
-        difference: variant - reference over the answers of the same seeds; None for the reference itself, and where it
-            has no answers under this protocol.
-        seeds: every seed by itself.
-    """
-
-    variant: str
-    protocol: str
-    part: str
-    source: str
-    suite: str
-    level: int
-    reading: Reading
-    objects: int
-    takes: int
-    tracks: int
-    metrics: Scores
-    reference: str | None
-    difference: Scores | None
-    seeds: tuple[SeedScores, ...]
+    """The variant that it is compared with; None for the reference itself."""
 
 
 Key = tuple[str, str, str, str, int, str]
 Numbered = tuple[int, EntityRecord]
 
 
-def ablation_rows(answers: Sequence[Answers], *, resamples: int, seed: int) -> tuple[AblationRow, ...]:
+def ablation_rows(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[dict[str, Any]]:
     """Rows per protocol, part, source, suite, level, reading and variant, in the order of the variants.
+
+    ``metrics`` are pooled over seeds, ``tracks`` count each (take, view, entity) once, ``seeds`` has every seed by
+    itself, and ``difference`` is variant - reference over the answers of the same seeds: None for the reference, and
+    where it has no answers under this protocol.
 
     Args:
         answers: of all variants and seeds.
@@ -139,11 +78,12 @@ def ablation_rows(answers: Sequence[Answers], *, resamples: int, seed: int) -> t
     rows = []
     for key in sorted(groups):
         for variant, reference in references.items():
-            own = groups[key].get(variant)
+            own, other = groups[key].get(variant), groups[key].get(reference or "")
             if own:
-                other = groups[key].get(reference) if reference else None
-                rows.append(_row(key, variant, reference, own, other, found[key][variant], resamples, seed))
-    return tuple(rows)
+                head = dict(zip(("protocol", "part", "source", "suite", "level", "reading"), key, strict=True))
+                row = _row(variant, own, other, found[key][variant], head["protocol"] == "semantic", resamples, seed)
+                rows.append({"variant": variant, "reference": reference} | head | row)
+    return rows
 
 
 def _key(kept: EntityRecord | Discovery, reading: str) -> Key:
@@ -152,49 +92,38 @@ def _key(kept: EntityRecord | Discovery, reading: str) -> Key:
 
 
 def _row(
-    key: Key,
     variant: str,
-    reference: str | None,
     own: list[Numbered],
     other: list[Numbered] | None,
     found: list[Discovery],
+    semantic: bool,
     resamples: int,
     seed: int,
-) -> AblationRow:
-    protocol, part, source, suite, level, reading = key
-    records = [record for _, record in own]
-    names = sorted({r.subject.object_id for r in records} | {d.subject.object_id for d in found})
-    place = {name: i for i, name in enumerate(names)}
-    draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
-    owner = np.array([place[r.subject.object_id] for r in records])
-    sums = _sums(records)
-    metrics = {name: mean_value(s, owner, draws) for name, s in sums.items()}
-    if protocol == "semantic":
-        metrics["recall"] = mean_value(recall_sums(records), owner, draws)
-    if found:
-        of = np.array([place[d.subject.object_id] for d in found])
-        metrics["precision"] = mean_value(precision_sums(found), of, draws)
+) -> dict[str, Any]:
+    def object_of(kept: EntityRecord | Discovery) -> str:
+        return kept.subject.object_id
+
+    pool = Pool([r for _, r in own], object_of, resamples=resamples, seed=seed, objects=map(object_of, found))
+    sums, of_seed = _sums(pool.records), np.array([s for s, _ in own])
+    seeds = []
+    for number in np.unique(of_seed).tolist():
+        chosen = of_seed == number
+        means = {name: Sums(s.total[chosen], s.count[chosen]).mean() for name, s in sums.items()}
+        seeds.append({"seed": number} | {name: means[name] for name in ("ape", "d100", "acc")})
+    found_values = discovery_values(pool, found, semantic=semantic)
     difference = None
-    if other and {s for s, _ in own} & {s for s, _ in other}:
+    if other and set(of_seed.tolist()) & {s for s, _ in other}:
         kept, gap = _paired(variant, own, other)
-        owner = np.array([place[r.subject.object_id] for r in kept])
-        difference = Scores(**{name: mean_value(gap[name], owner, draws) for name in PAIRED})
-    return AblationRow(
-        variant=variant,
-        protocol=protocol,
-        part=part,
-        source=source,
-        suite=suite,
-        level=level,
-        reading="moved" if reading == "moved" else "all",
-        objects=len({r.subject.object_id for r in records}),
-        takes=len({r.take for r in records}),
-        tracks=len({(r.take, r.view, r.entity) for r in records}),
-        metrics=Scores(**metrics),
-        reference=reference,
-        difference=difference,
-        seeds=_per_seed(own, sums),
-    )
+        difference = {name: pool.of(kept).ratio(gap[name]) for name in PAIRED}
+    return {
+        "objects": pool.objects,
+        "takes": len({r.take for r in pool.records}),
+        "tracks": len({(r.take, r.view, r.entity) for r in pool.records}),
+        "metrics": {name: pool.ratio(s) for name, s in sums.items()}
+        | {name: found_values[name] for name in ("precision", "recall")},
+        "difference": difference,
+        "seeds": seeds,
+    }
 
 
 def _sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:
@@ -218,14 +147,3 @@ def _paired(variant: str, own: list[Numbered], other: list[Numbered]) -> tuple[l
         if not np.array_equal(a[name].count, b[name].count):
             raise InputError(f"ablation: {variant!r} and its reference were asked about different frames")
     return list(mine.values()), {name: Sums(a[name].total - b[name].total, a[name].count) for name in PAIRED}
-
-
-def _per_seed(own: list[Numbered], sums: dict[str, Sums]) -> tuple[SeedScores, ...]:
-    seed = np.array([s for s, _ in own])
-
-    def mean(name: str, chosen: np.ndarray) -> float:
-        return Sums(sums[name].total[chosen], sums[name].count[chosen]).mean()
-
-    return tuple(
-        SeedScores(int(s), *(mean(name, seed == s) for name in ("ape", "d100", "acc"))) for s in np.unique(seed)
-    )

@@ -20,42 +20,38 @@ LOSSES_3D = ("vel", "acc", "geo")
 
 @dataclass(frozen=True)
 class Variant:
-    """What is trained.
-
-    Attributes:
-        name: of its folder.
-        network: what it is.
-        losses: weights of losses that differ from the published ones.
-        windows: how windows are drawn.
-        order: how entities get their slots.
-    """
+    """What is trained."""
 
     name: str
+    """Of its folder."""
     network: PaperConfig = field(default_factory=PaperConfig)
+    """What it is."""
     losses: dict[str, float] = field(default_factory=dict)
+    """Weights of losses that differ from the published ones."""
     windows: WindowConfig = field(default_factory=WindowConfig)
+    """How windows are drawn."""
     order: Order = "match"
+    """How entities get their slots."""
 
 
 @dataclass(frozen=True)
 class Line:
-    """One row of a table.
-
-    Attributes:
-        label: what the table calls it.
-        variant: whose weights.
-        tracker: which tracker answers: ``quest`` with these weights, or one that needs none.
-        reference: label of the row that it is compared with; None for the reference.
-    """
+    """One row of a table."""
 
     label: str
+    """What the table calls it."""
     variant: Variant
+    """Whose weights."""
     tracker: str = "quest"
+    """Which tracker answers: ``quest`` with these weights, or one that needs none."""
     reference: str | None = None
+    """Label of the row that it is compared with; None for the reference."""
 
 
 FULL = Variant("full")
 """The published network."""
+RIVALS = {"hold still": "hold-still"}
+"""Trackers of rows that are not of the network."""
 
 
 def without(name: str, *losses: str) -> Variant:
@@ -63,21 +59,46 @@ def without(name: str, *losses: str) -> Variant:
     return Variant(f"no-{name}", losses=dict.fromkeys(losses, 0.0))
 
 
-def no_3d() -> Variant:
-    """Pixel losses alone, and windows without depth. The network never sees it; the tracker lifts by it as ever."""
-    return replace(without("3d", *LOSSES_3D), windows=WindowConfig(depth_drop_share=1.0))
-
-
 def lines_of(table: TableName) -> tuple[Line, ...]:
-    """The rows of a table; the first is what the others are compared with, or has its size among theirs."""
-    rows = {
-        "parts": _parts(),
+    """The rows of a table; the reference of the others is the published network, under the label of its row."""
+    from_map = PaperConfig(place_from="map")
+    every = {"early": 1.0, "conf": 0.0, "exists": 0.3, "where": 0.3}
+    published = [name for name, loss in LOSSES.items() if loss.weight > 0]
+    # Without 3D: pixel losses alone, and windows without depth. The tracker lifts by depth as ever.
+    flat = replace(without("3d", *LOSSES_3D), windows=WindowConfig(depth_drop_share=1.0))
+    rows: dict[TableName, dict[str, Variant]] = {
+        "parts": {
+            "full": FULL, "no 3D": flat, "no smoothness": without("smoothness", "vel", "acc"), "hold still": FULL
+        },
         "window": _sizes("window", "T", (2, 4, 8)),
         "slots": _sizes("slots", "K", (4, 8, 16)),
-        "losses": _losses(),
-        "remedies": _remedies(),
+        "losses": {"all losses": FULL} | {f"no {loss}": without(loss, loss) for loss in published},
+        # What is said to help the prediction of sets, one by one and together.
+        "remedies": {
+            "as published": FULL,
+            "loss at every layer": Variant("early", losses={"early": 1.0}),
+            "confidence: it exists": Variant("exists", losses={"conf": 0.0, "exists": 0.3}),
+            "entity i has slot i": Variant("order", order="entity"),
+            "place off the map": Variant("map", from_map, losses={"where": 0.3}),
+            "all four": Variant("remedies", from_map, every, order="entity"),
+        },
+    }  # fmt: skip
+    own = next(label for label, variant in rows[table].items() if variant == FULL)
+    return tuple(
+        Line(
+            label, variant, label.replace(" ", "-") if label == "hold still" else "quest", None if label == own else own
+        )
+        for label, variant in rows[table].items()
+    )
+
+
+def _sizes(name: str, symbol: str, sizes: Sequence[int]) -> dict[str, Variant]:
+    """The published network with another number of frames or queries."""
+    networks = {size: replace(FULL.network, **{name: size}) for size in sizes}  # type: ignore[arg-type]
+    return {
+        f"{symbol} = {size}": FULL if network == FULL.network else Variant(f"{name}-{size}", network)
+        for size, network in networks.items()
     }
-    return tuple(rows[table])
 
 
 def chosen_lines(tables: Sequence[TableName], variants: Sequence[str]) -> dict[TableName, tuple[Line, ...]]:
@@ -99,44 +120,3 @@ def chosen_lines(tables: Sequence[TableName], variants: Sequence[str]) -> dict[T
         for table, each in lines.items()
         if asked[table]
     }
-
-
-def _parts() -> list[Line]:
-    return [
-        Line("full", FULL),
-        Line("no 3D", no_3d(), reference="full"),
-        Line("no smoothness", without("smoothness", "vel", "acc"), reference="full"),
-        Line("hold still", FULL, "hold-still", "full"),
-    ]
-
-
-def _sizes(field_name: str, symbol: str, sizes: Sequence[int]) -> list[Line]:
-    """The published network with another number of frames or queries."""
-    published = getattr(FULL.network, field_name)
-    own = f"{symbol} = {published}"
-    lines = []
-    for size in sizes:
-        network = replace(FULL.network, **{field_name: size})  # type: ignore[arg-type]
-        variant = FULL if size == published else Variant(f"{field_name}-{size}", network)
-        lines.append(Line(f"{symbol} = {size}", variant, reference=None if size == published else own))
-    return lines
-
-
-def _losses() -> list[Line]:
-    own = "all losses"
-    published = [name for name, loss in LOSSES.items() if loss.weight > 0]
-    return [Line(own, FULL), *(Line(f"no {loss}", without(loss, loss), reference=own) for loss in published)]
-
-
-def _remedies() -> list[Line]:
-    """What is said to help the prediction of sets, one by one and together."""
-    own, from_map = "as published", PaperConfig(place_from="map")
-    variants = {
-        "loss at every layer": Variant("early", losses={"early": 1.0}),
-        "confidence: it exists": Variant("exists", losses={"conf": 0.0, "exists": 0.3}),
-        "entity i has slot i": Variant("order", order="entity"),
-        "place off the map": Variant("map", from_map, losses={"where": 0.3}),
-        "all four": Variant("remedies", from_map, {"early": 1.0, "conf": 0.0, "exists": 0.3, "where": 0.3},
-                            order="entity"),
-    }  # fmt: skip
-    return [Line(own, FULL), *(Line(label, variant, reference=own) for label, variant in variants.items())]

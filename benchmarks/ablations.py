@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ import torch
 import tyro
 from ablation_rows import Answers, ablation_rows
 from ablation_variants import TABLES, Line, TableName, Variant, chosen_lines
-from cached_encoder import CachedEncoder
+from cached_encoder import serve_cached
 from rich.console import Console
 
 from quest.baselines import TRACKERS
@@ -39,7 +40,7 @@ from quest.evaluation.records import read_records
 from quest.evaluation.report import provenance, write_report
 from quest.evaluation.results import Results, Run, read_results, records_path, write_results
 from quest.evaluation.runner import evaluate, has_protocol
-from quest.evaluation.selection import select_takes
+from quest.evaluation.selection import Chosen, hash_of, select_in
 from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne
 from quest.paper.tracker import PaperTracker
@@ -97,16 +98,15 @@ class Ablations:
         """Every run, every answer, every table."""
         console = Console(highlight=False)
         lines = chosen_lines(self.tables, self.variants)
-        test = TestTakes.open(self)
         needed = {line.variant.name: line.variant for each in lines.values() for line in each}
         for seed in self.seeds:
             for number, item in enumerate(needed.values(), start=1):
                 console.print(f"seed {seed}, variant {number}/{len(needed)}: {item.name}")
                 weights = self._trained(item, seed, console)
                 names = {line.tracker for each in lines.values() for line in each if line.variant == item}
-                self._answer(item, seed, weights, sorted(names), test, console)
+                self._answer(item, seed, weights, sorted(names), console)
         for table, each in lines.items():
-            self._write(table, each, test)
+            self._write(table, each)
             console.print(f"wrote {self.out / f'{table}.json'}")
         return 0
 
@@ -184,20 +184,20 @@ class Ablations:
 
     # Evaluation
 
-    def _answer(
-        self, item: Variant, seed: int, weights: Path, names: Sequence[str], test: TestTakes, console: Console
-    ) -> None:
+    def _answer(self, item: Variant, seed: int, weights: Path, names: Sequence[str], console: Console) -> None:
         """Every tracker's answers with these weights, as far as they are not there yet."""
         for name in names:
-            if self._answered(item, seed, name, weights, test):
+            if self._answered(self._answers_file(item, seed, name), weights):
                 continue
             start_s = time.monotonic()
             one = self._tracker(weights) if name == PaperTracker.name else TRACKERS[name].build(name)
             protocols: list[ProtocolName] = [p for p in self.protocols if has_protocol(one, p)]
-            found = [evaluate(s, takes, [one], protocols=protocols) for s, takes in test.parts] if protocols else []
+            found = (
+                [evaluate(s, takes, [one], protocols=protocols) for s, takes in self.test_takes] if protocols else []
+            )
             run = Run.ended(
                 start_s,
-                data_hash=test.data_hash,
+                data_hash=hash_of(self.test_takes),
                 weights=item.name,
                 weights_hash=file_hash(weights),
                 resamples=self.resamples,
@@ -211,51 +211,45 @@ class Ablations:
 
     def _tracker(self, weights: Path) -> ClipTracker:
         network = read_paper(weights).network
-        CachedEncoder(self.work / "encoded").serve(network)
+        serve_cached(network, self.work / "encoded")
         return PaperTracker(network, device=pick_device("auto"))
 
     def _answers_file(self, item: Variant, seed: int, tracker: str) -> Path:
         return self.work / "runs" / item.name / f"seed-{seed}" / "answers" / f"{tracker}.json"
 
-    def _answered(self, item: Variant, seed: int, tracker: str, weights: Path, test: TestTakes) -> bool:
-        file = self._answers_file(item, seed, tracker)
+    def _answered(self, file: Path, weights: Path) -> bool:
         if not file.exists():
             return False
         results = read_results(file)
-        run, asked = results.run, set(results.notes)
-        same = run.data_hash == test.data_hash and run.weights_hash == file_hash(weights)
-        return same and asked >= {*self.protocols}
+        same = results.run.data_hash == hash_of(self.test_takes) and results.run.weights_hash == file_hash(weights)
+        return same and {*results.notes} >= {*self.protocols}
 
     # Tables
 
-    def _write(self, table: str, lines: Sequence[Line], test: TestTakes) -> None:
+    def _write(self, table: str, lines: Sequence[Line]) -> None:
         answers, commits = [], set()
-        for line, seed, file in self._answered_lines(lines):
+        for line, seed in product(lines, self.seeds):
+            file = self._answers_file(line.variant, seed, line.tracker)
             records = read_records(records_path(file)) if records_path(file).exists() else ()
-            answers.append(Answers(line.label, seed, records, read_results(file).discoveries, line.reference))
+            results = read_results(file)
+            answers.append(Answers(line.label, seed, records, results.discoveries, line.reference))
             settings = json.loads((file.parents[1] / "settings.json").read_text(encoding="utf-8"))
-            commits |= {settings["commit"], read_results(file).run.commit}
-        rows = ablation_rows(answers, resamples=self.resamples, seed=0)
-        report = provenance() | {
-            "steps": self.steps,
-            "batch": self.batch,
-            "optimizer": self.optimizer,
-            "learning_rate": self.learning_rate,
-            "seeds": list(self.seeds),
+            commits |= {settings["commit"], results.run.commit}
+        same = ("steps", "batch", "optimizer", "learning_rate", "seeds", "training_hash", "resamples")
+        report = provenance() | {name: getattr(self, name) for name in same} | {
             "run_commits": sorted(commits),
-            "n_takes": test.takes,
-            "data_hash": test.data_hash,
-            "training_hash": self.training_hash,
+            "n_takes": sum(len(takes) for _, takes in self.test_takes),
+            "data_hash": hash_of(self.test_takes),
             "encoder": file_hash(self.encoder),
-            "resamples": self.resamples,
-            "rows": [asdict(row) for row in rows],
-        }
+            "rows": ablation_rows(answers, resamples=self.resamples, seed=0),
+        }  # fmt: skip
         write_report(report, self.out / f"{table}.json")
 
-    def _answered_lines(self, lines: Sequence[Line]) -> Iterator[tuple[Line, int, Path]]:
-        for line in lines:
-            for seed in self.seeds:
-                yield line, seed, self._answers_file(line.variant, seed, line.tracker)
+    @cached_property
+    def test_takes(self) -> Chosen:
+        """Takes to evaluate on, by store."""
+        choice = {"split": self.split, "levels": self.level, "same_objects": self.same_objects}
+        return select_in([TakeStore(path) for path in self.test], **choice)
 
     @cached_property
     def training_hash(self) -> str:
@@ -265,40 +259,6 @@ class Ablations:
         return combined_hash(
             (f"{role}/{name}", store.data_hash(name)) for role, store in stores for name in store.names()
         )
-
-
-@dataclass(frozen=True)
-class TestTakes:
-    """What is evaluated on: takes by store, and one hash over all."""
-
-    parts: tuple[tuple[TakeStore, dict[str, SplitPart]], ...]
-    data_hash: str
-
-    @property
-    def takes(self) -> int:
-        """How many."""
-        return sum(len(takes) for _, takes in self.parts)
-
-    @classmethod
-    def open(cls, asked: Ablations) -> TestTakes:
-        """Choose the takes.
-
-        Raises:
-            ConfigError: none is left, or one comes twice.
-        """
-        stores = [TakeStore(path) for path in asked.test]
-        infos = {name: info for store in stores for name, info in store.infos().items()}
-        chosen = select_takes(infos, split=asked.split, levels=asked.level, same_objects=asked.same_objects)
-        parts: list[tuple[TakeStore, dict[str, SplitPart]]] = [
-            (store, {name: chosen[name] for name in store.names() if name in chosen}) for store in stores
-        ]
-        kept = tuple(part for part in parts if part[1])
-        tested = [name for _, takes in kept for name in takes]
-        twice = sorted(name for name in tested if tested.count(name) > 1)
-        if twice:
-            raise ConfigError(f"take {twice[0]}: two stores of --test have it; leave one of them away")
-        digest = combined_hash((name, store.data_hash(name)) for store, takes in kept for name in takes)
-        return cls(kept, digest)
 
 
 if __name__ == "__main__":

@@ -14,36 +14,29 @@ from quest.paper.network import PaperNetwork
 from quest.whole_file import whole_file
 
 
-class CachedEncoder:
-    """Looks frames up by their letterboxed colours, and encodes each once.
+def serve_cached(network: PaperNetwork, root: Path) -> None:
+    """Make a network read tokens instead of computing them, as far as they are there.
+
+    Frames are looked up by their letterboxed colours, and each is encoded once.
 
     Args:
+        network: changed in place.
         root: folder of the files; those of one encoder are in one of its folders.
     """
+    encode, folder = network.encode, root / weights_digest(network.encoder)[:12]
+    folder.mkdir(parents=True, exist_ok=True)
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    def read(rgb: Tensor) -> Tensor:
+        return torch.stack([one(image) for image in rgb])
 
-    def serve(self, network: PaperNetwork) -> None:
-        """Make a network read tokens instead of computing them, as far as they are there.
+    def one(image: Tensor) -> Tensor:
+        file = folder / f"{_digest(image)}.npy"
+        if not file.exists():
+            with whole_file(file) as partial, partial.open("wb") as out:
+                np.save(out, encode(image[None])[0].detach().half().cpu().numpy())
+        return torch.from_numpy(np.load(file)).to(image.device).float()
 
-        Args:
-            network: changed in place.
-        """
-        encode, folder = network.encode, self._root / weights_digest(network.encoder)[:12]
-        folder.mkdir(parents=True, exist_ok=True)
-
-        def read(rgb: Tensor) -> Tensor:
-            return torch.stack([one(image) for image in rgb])
-
-        def one(image: Tensor) -> Tensor:
-            file = folder / f"{_digest(image)}.npy"
-            if not file.exists():
-                with whole_file(file) as partial, partial.open("wb") as out:
-                    np.save(out, encode(image[None])[0].detach().half().cpu().numpy())
-            return torch.from_numpy(np.load(file)).to(image.device).float()
-
-        network.encode = read  # type: ignore[method-assign]
+    network.encode = read  # type: ignore[method-assign]
 
 
 def _digest(image: Tensor) -> str:

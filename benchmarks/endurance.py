@@ -21,9 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 import tyro
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 import quest
 from benchmarks.sensor_faults import BLIND, DEGRADED, DEPTH
@@ -42,52 +40,37 @@ RESAMPLES = 1000
 
 @dataclass(frozen=True)
 class Reading:
-    """What was measured after some frames.
-
-    Attributes:
-        frames: frames done.
-        resident_bytes: memory of the process that is in use.
-        cpu_s: time of the processor so far, all threads.
-        wall_s: time so far.
-    """
+    """What was measured after some frames."""
 
     frames: int
+    """Frames done."""
     resident_bytes: int
+    """Memory of the process that is in use."""
     cpu_s: float
+    """Time of the processor so far, all threads."""
     wall_s: float
+    """Time so far."""
 
 
 @dataclass(frozen=True)
 class Change:
-    """How the time per frame changed from the second tenth of a run to the last.
-
-    Attributes:
-        early_ms: median time per frame over the readings of the second tenth.
-        late_ms: over those of the last.
-        percent: change of the medians, percent of the early one.
-        low: lower end of the 95 % interval, bootstrap over readings.
-        high: upper end.
-        readings: in each tenth.
-    """
+    """How the time per frame changed from the second tenth of a run to the last."""
 
     early_ms: float
+    """Median time per frame over the readings of the second tenth."""
     late_ms: float
+    """Over those of the last."""
     percent: float
+    """Change of the medians, percent of the early one."""
     low: float
+    """Lower end of the 95 % interval, bootstrap over readings."""
     high: float
     readings: int
+    """In each tenth."""
 
 
 def forth_and_back(t: int, frames: int) -> int:
-    """Frame of a clip at step ``t`` when it is played to its end, back to its start, and so on.
-
-    Args:
-        t: step, from 0.
-        frames: of the clip.
-
-    Raises:
-        InputError: the clip has fewer than two frames.
-    """
+    """Frame of a clip at step ``t``, from 0, when it is played to its end, back to its start, and so on."""
     if frames < 2:
         raise InputError(f"clip: expected at least 2 frames to play forth and back, got {frames}")
     period = 2 * (frames - 1)
@@ -109,15 +92,7 @@ def resident_bytes() -> int:
 
 
 def memory_growth(readings: Sequence[Reading], *, since: int) -> tuple[float, float]:
-    """Growth of the resident memory after some frames, in percent: at the end, and at its highest.
-
-    Args:
-        readings: in order.
-        since: the first reading after at least so many frames is the reference.
-
-    Raises:
-        InputError: no reading is that late.
-    """
+    """Growth of the resident memory in percent since a frame: at the end, and at its highest."""
     late = [r.resident_bytes for r in readings if r.frames >= since]
     if not late:
         raise InputError(f"readings: expected one after {since} frames, got none; run for longer")
@@ -125,16 +100,7 @@ def memory_growth(readings: Sequence[Reading], *, since: int) -> tuple[float, fl
 
 
 def time_change(readings: Sequence[Reading], *, clock: str, seed: int = 0) -> Change:
-    """Time per frame in the last tenth of the frames against the second.
-
-    Args:
-        readings: in order, evenly spaced, the first before any frame.
-        clock: ``cpu_s`` or ``wall_s``.
-        seed: of the bootstrap.
-
-    Raises:
-        InputError: a tenth holds no reading.
-    """
+    """Time per frame, by ``cpu_s`` or ``wall_s``, in the last tenth of evenly spaced readings against the second."""
     frames = np.array([r.frames for r in readings])
     per_frame_ms = 1e3 * np.diff([getattr(r, clock) for r in readings]) / np.diff(frames)
     tenth = -(-10 * frames[1:] // frames[-1])  # 1 to 10; a reading belongs to the frames before it
@@ -244,9 +210,9 @@ class Endurance:
             report = about | self._found(readings) | seen
             console.print(_line(readings))
             if self.out is not None:
-                write_report(report | {"readings": [asdict(r) for r in readings]}, self.out)
+                write_report(report | {"readings": readings}, self.out)
         found = self._found(readings)
-        console.print(_table(found))
+        console.print_json(data=found)
         return 0 if found["passed"] else 1
 
     def _found(self, readings: list[Reading]) -> dict[str, Any]:
@@ -269,19 +235,6 @@ def _line(readings: list[Reading]) -> str:
     before, now = readings[-2:]
     cpu_ms = 1e3 * (now.cpu_s - before.cpu_s) / (now.frames - before.frames)
     return f"{now.frames:>7} frames  {now.resident_bytes / 2**20:7.1f} MiB  {cpu_ms:6.2f} ms/frame  {now.wall_s:7.0f} s"
-
-
-def _table(found: dict[str, Any]) -> Table:
-    memory, cpu, wall = found["memory_growth_percent"], found["cpu_change"], found["wall_change"]
-    table = Table(title=f"{found['frames_done']} frames", box=box.SIMPLE_HEAD)
-    for heading in ("", "change %", "95 %", "accepted %"):
-        table.add_column(heading, justify="right" if heading else "left")
-    name = f"memory since frame {memory['since_frame']} (peak {memory['peak']:+.2f})"
-    table.add_row(name, f"{memory['end']:+.2f}", "", f"{MEMORY_PERCENT:g}")
-    for name, change, accepted in (("processor", cpu, f"{TIME_PERCENT:g}"), ("wall", wall, "")):
-        name = f"{name} time per frame, {change['early_ms']:.2f} to {change['late_ms']:.2f} ms"
-        table.add_row(name, f"{change['percent']:+.2f}", f"{change['low']:+.2f} to {change['high']:+.2f}", accepted)
-    return table
 
 
 if __name__ == "__main__":

@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -56,12 +56,8 @@ class GenerationSpeed:
         specs = plan_takes(procedural_objects(self.takes + 1, 0), levels=(self.level,), takes_per_object=1)
         timed: list[tuple[float, ...]] = []
         profiler = cProfile.Profile() if self.profile else None
-        with (
-            tempfile.TemporaryDirectory() as folder,
-            ObjectShelf() as shelf,
-            ThreadPoolExecutor(1) as writer,
-        ):
-            store, writing = TakeStore(folder), _done()
+        with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as writer:
+            store, shelf, writing = TakeStore(folder), ObjectShelf(), _done()
             for spec in specs:
                 if profiler and timed:
                     profiler.enable()
@@ -81,7 +77,7 @@ class GenerationSpeed:
             timed[-1] = (last[0], last[1] + rest[0], last[2] + rest[1], *last[3:])
         result = _summary(np.array(timed[1:])) | {"first_take_s": timed[0][1], "level": self.level}
         result |= provenance() | {"load": os.getloadavg()[0], "renderer": str(renderer.device)}
-        Console().print_json(data=result)
+        Console().print_json(data=result, default=asdict)
         if profiler:
             pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
         if self.out is not None:
@@ -133,10 +129,10 @@ def _bare_loop(stage: Stage, take: Take) -> np.ndarray:
 def _summary(timed: np.ndarray) -> dict[str, Any]:
     frames = timed[:, 0]
     return {
-        "frames_per_s": _interval(timed, lambda t: t[..., 0].sum(-1) / t[..., 1].sum(-1)),
-        "bare_frames_per_s": _interval(timed, lambda t: t[..., 0].sum(-1) / t[..., 3].sum(-1)),
-        "share_of_bare": _interval(timed, lambda t: t[..., 3].sum(-1) / t[..., 1].sum(-1)),
-        "share_of_bare_processor_time": _interval(timed, lambda t: t[..., 4].sum(-1) / t[..., 2].sum(-1)),
+        "frames_per_s": interval_over(timed, lambda t: t[..., 0].sum(-1) / t[..., 1].sum(-1)),
+        "bare_frames_per_s": interval_over(timed, lambda t: t[..., 0].sum(-1) / t[..., 3].sum(-1)),
+        "share_of_bare": interval_over(timed, lambda t: t[..., 3].sum(-1) / t[..., 1].sum(-1)),
+        "share_of_bare_processor_time": interval_over(timed, lambda t: t[..., 4].sum(-1) / t[..., 2].sum(-1)),
         "per_take": [
             {"frames": int(n), "generate_s": g, "generate_cpu_s": gc, "bare_s": b, "bare_cpu_s": bc}
             for n, g, gc, b, bc in zip(frames, *np.round(timed.T[1:], 3).tolist(), strict=True)
@@ -144,12 +140,6 @@ def _summary(timed: np.ndarray) -> dict[str, Any]:
         "n_takes": len(timed),
         "n_frames": int(frames.sum()),
     }
-
-
-def _interval(timed: np.ndarray, statistic: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-    """A statistic of the takes, and its 95 % bootstrap interval over takes."""
-    low, high = interval_over(timed, statistic)
-    return {"mean": float(statistic(timed)), "low": low, "high": high}
 
 
 def _done() -> Future[None]:

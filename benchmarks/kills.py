@@ -188,13 +188,7 @@ class Kills:
 
 
 def run(command: Sequence[str], folder: Path, *, after_s: float | None = None) -> int:
-    """The exit code of a command of quest; it is killed after some seconds.
-
-    Args:
-        command: its words; OUT stands for the folder.
-        folder: where it writes.
-        after_s: when it is killed; None for never.
-    """
+    """The exit code of a command of quest, in which OUT stands for the folder; it may be killed after some seconds."""
     folder.mkdir(parents=True, exist_ok=True)
     words = [sys.executable, "-m", "quest", *(word.replace("OUT", str(folder)) for word in command)]
     with (folder / ".log").open("ab") as log:

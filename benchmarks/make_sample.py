@@ -105,11 +105,11 @@ class MakeSample:
     def run(self) -> int:
         """Render takes and write their views as recordings."""
         renderer = Renderer()
-        with ObjectShelf() as shelf:
-            for name in self.clip:
-                scene = SCENES[name]
-                take = film(name, scene, shelf.load("procedural", scene.object_id), self.size, renderer)
-                write(take, self.out / name)
+        shelf = ObjectShelf()
+        for name in self.clip:
+            scene = SCENES[name]
+            take = film(name, scene, shelf.load("procedural", scene.object_id), self.size, renderer)
+            write(take, self.out / name)
         return 0
 
 

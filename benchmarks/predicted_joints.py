@@ -12,28 +12,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
 import tyro
 from jaxtyping import Float, Float32
-from rich import box
-from rich.console import Console
-from rich.table import Table
 
 import quest
-from quest.data.provenance import combined_hash
+from quest.data.split import SplitPart
 from quest.data.store import TakeStore
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
-from quest.evaluation.metrics import Sums
-from quest.evaluation.protocols import first_visible
-from quest.evaluation.report import provenance, shown, write_report
-from quest.evaluation.selection import select_takes
+from quest.evaluation.bootstrap import Pool
+from quest.evaluation.protocols import first_visible, true_queries
+from quest.evaluation.study import Study
 from quest.filter.joints import Joint, JointKind
 from quest.track import StreamState, Tracker
-from quest.types import Query, Take
+from quest.types import Take
 
 FAR = {JointKind.REVOLUTE: float(np.radians(45)), JointKind.PRISMATIC: 0.15}
 """A joint is judged when it has gone this far from rest: radians, metres."""
@@ -45,23 +40,7 @@ NONE = "none"
 
 @dataclass(frozen=True)
 class JointAnswer:
-    """What a tracker said of the joint of one moved entity in one view.
-
-    Attributes:
-        take: name of the take.
-        view: index of the view.
-        entity: the entity's name.
-        object_id: the object.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        suite: of the simulator.
-        level: how many joints move one after the other.
-        moment: ``far``, the first frame where the true joint has gone as far as :data:`FAR`, or ``end``, the last one.
-        frame: that frame.
-        kind: true kind.
-        said: the kind that was said; :data:`NONE` without a joint.
-        axis_error_deg: angle between the said and the true axis as lines; None without a moving joint.
-    """
+    """What a tracker said of the joint of one moved entity in one view."""
 
     take: str
     view: int
@@ -72,10 +51,15 @@ class JointAnswer:
     suite: str
     level: int
     moment: Moment
+    """``far``, the first frame where the true joint has gone as far as :data:`FAR`, or ``end``, the last one."""
     frame: int
+    """That frame."""
     kind: str
+    """The true one."""
     said: str
+    """The kind that was said; :data:`NONE` without a joint."""
     axis_error_deg: float | None
+    """Angle between the said and the true axis as lines; None without a moving joint."""
 
     @property
     def right(self) -> bool:
@@ -83,62 +67,14 @@ class JointAnswer:
         return self.said == self.kind
 
 
-@dataclass(frozen=True)
-class JointRow:
-    """Answers of one kind of joint at one moment.
-
-    Attributes:
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        suite: of the simulator.
-        kind: true kind.
-        moment: when.
-        levels: of the takes.
-        objects: how many.
-        takes: how many.
-        answers: how many (take, view, entity).
-        without: answers without a joint.
-        static: answers that say it does not move.
-        kind_right: share whose kind is right; without a joint and static count as wrong.
-        axis_error_deg: median over those whose kind is right; None without any.
-        axis_p90_deg: their 90 % quantile.
-    """
-
-    part: str
-    source: str
-    suite: str
-    kind: str
-    moment: Moment
-    levels: tuple[int, ...]
-    objects: int
-    takes: int
-    answers: int
-    without: int
-    static: int
-    kind_right: Value | None
-    axis_error_deg: Value | None
-    axis_p90_deg: float | None
-
-
 def judge_view(tracker: Tracker, take: Take, view: int, *, part: str) -> tuple[JointAnswer, ...]:
-    """Track a view as the protocol ``point`` does, alarms off, and judge the joints of the entities that move.
-
-    Args:
-        tracker: it says joints.
-        take: with ground truth.
-        view: index of the view.
-        part: part of the object split.
-    """
+    """Track a view as the protocol ``point`` does, alarms off, and judge the joints of the entities that move."""
     truth = take.views[view]
     scored, first = first_visible(truth.visible, take.tracked)
     moments = moments_of(take)
     if not set(scored.tolist()) & moments.keys():
         return ()
-    queries = [
-        Query.point(int(t), float(truth.uv_px[t, e, 0]), float(truth.uv_px[t, e, 1]), name=f"query-{k}")
-        for k, (e, t) in enumerate(zip(scored, first, strict=True))
-    ]
-    stream = tracker.stream(truth.clip.camera, queries, alpha=None)
+    stream = tracker.stream(truth.clip.camera, true_queries(truth, scored, first), alpha=None)
     answers = []
     for t in range(len(take)):
         frame = truth.clip.frame(t)
@@ -176,12 +112,7 @@ def joint_of(state: StreamState, query: int) -> Joint | None:
 
 
 def axis_error_deg(said: Float[np.ndarray, "3"], true: Float32[np.ndarray, "3"]) -> float:
-    """Angle between two axes as lines, 0 to 90 degrees.
-
-    Args:
-        said: unit direction.
-        true: unit direction.
-    """
+    """Angle between two unit directions as lines, 0 to 90 degrees."""
     cross, dot = np.linalg.norm(np.cross(said, true.astype(np.float64))), abs(float(said @ true))
     return float(np.degrees(np.arctan2(cross, dot)))
 
@@ -209,122 +140,52 @@ def _answer(
     )
 
 
-def joint_rows(answers: Sequence[JointAnswer], *, resamples: int, seed: int) -> tuple[JointRow, ...]:
+def joint_rows(answers: Sequence[JointAnswer], *, resamples: int, seed: int) -> list[dict[str, Any]]:
     """Rows per part, source, suite, true kind and moment, levels together.
 
-    Args:
-        answers: of one tracker.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap; every row draws from a generator of its own.
+    ``without`` a joint and ``static`` count as wrong kinds; errors of axes are over answers whose kind is right.
     """
+    names = ("part", "source", "suite", "kind", "moment")
     groups: dict[tuple, list[JointAnswer]] = defaultdict(list)
-    for a in answers:
-        groups[(a.part, a.source, a.suite, a.kind, a.moment)].append(a)
-    return tuple(_row(key, groups[key], resamples=resamples, seed=seed) for key in sorted(groups, reverse=True))
-
-
-def _row(key: tuple, group: list[JointAnswer], *, resamples: int, seed: int) -> JointRow:
-    names = sorted({a.object_id for a in group})
-    draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
-    owner = np.array([names.index(a.object_id) for a in group])
-    right = np.array([a.right for a in group])
-    error = np.array([np.nan if a.axis_error_deg is None else a.axis_error_deg for a in group])
-    part, source, suite, kind, moment = key
-    return JointRow(
-        part=part,
-        source=source,
-        suite=suite,
-        kind=kind,
-        moment=moment,
-        levels=tuple(sorted({a.level for a in group})),
-        objects=len(names),
-        takes=len({a.take for a in group}),
-        answers=len(group),
-        without=sum(a.said == NONE for a in group),
-        static=sum(a.said == JointKind.STATIC for a in group),
-        kind_right=mean_value(Sums(right.astype(np.float64), np.ones(len(right))), owner, draws),
-        axis_error_deg=median_value(error[right], owner[right], draws),
-        axis_p90_deg=float(np.quantile(error[right], 0.9)) if right.any() else None,
-    )
+    for answer in answers:
+        groups[attrgetter(*names)(answer)].append(answer)
+    rows = []
+    for key in sorted(groups, reverse=True):
+        pool = Pool(groups[key], attrgetter("object_id"), resamples=resamples, seed=seed)
+        right = pool.where(attrgetter("right"))
+        errors = np.array([a.axis_error_deg for a in right.records], np.float64)
+        rows.append(
+            dict(zip(names, key, strict=True))
+            | {
+                "levels": sorted({a.level for a in pool.records}),
+                "objects": pool.objects,
+                "takes": len({a.take for a in pool.records}),
+                "answers": len(pool.records),
+                "without": sum(a.said == NONE for a in pool.records),
+                "static": sum(a.said == JointKind.STATIC for a in pool.records),
+                "kind_right": pool.mean(attrgetter("right")),
+                "axis_error_deg": right.median(attrgetter("axis_error_deg")),
+                "axis_p90_deg": float(np.quantile(errors, 0.9)) if len(errors) else None,
+            }
+        )
+    return rows
 
 
 @dataclass(frozen=True)
-class PredictedJoints:
+class PredictedJoints(Study):
     """Shares of right kinds and axis errors of the tracker's joints."""
-
-    takes: str
-    """Folder of the take store."""
-    split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation",)
-    """Parts of the object split."""
-    level: tuple[int, ...] = ()
-    """Levels; all by default."""
-    objects: tuple[str, ...] = ()
-    """Object ids; all by default."""
-    weights: str = "quest-s16"
-    """Name or file of the weights."""
-    resamples: int = 1000
-    """Of the bootstrap over objects."""
-    seed: int = 0
-    """Of the bootstrap."""
-    out: Path | None = None
-    """Result file."""
 
     def run(self) -> int:
         """Track take by take, print, write."""
-        store, console = TakeStore(self.takes), Console(width=170, highlight=False)
-        chosen = select_takes(store.infos(), split=self.split, levels=self.level, objects=self.objects)
         tracker = quest.load(self.weights)
-        about = self._about(tracker, combined_hash((name, store.data_hash(name)) for name in chosen))
-        answers: list[JointAnswer] = []
-        rows: tuple[JointRow, ...] = ()
-        for i, (name, part) in enumerate(chosen.items(), start=1):
+
+        def judge(store: TakeStore, name: str, part: SplitPart) -> list[JointAnswer]:
             take = store.read(name)
-            for view in range(len(take.views)):
-                answers += judge_view(tracker, take, view, part=part)
-            rows = joint_rows(answers, resamples=self.resamples, seed=self.seed)
-            console.print(f"{i}/{len(chosen)} {name}: {len(answers)} answers so far")
-            if self.out is not None:
-                done = {"takes_done": i, "complete": i == len(chosen), "rows": [asdict(row) for row in rows]}
-                write_report(about | done | {"answers": [asdict(a) for a in answers]}, self.out)
-        console.print(_table(rows))
-        return 0
+            return [answer for v in range(len(take.views)) for answer in judge_view(tracker, take, v, part=part)]
 
-    def _about(self, tracker: Tracker, data_hash: str) -> dict[str, Any]:
-        return provenance() | {
-            "weights": self.weights,
-            "weights_hash": tracker.weights_hash,
-            "data_hash": data_hash,
-            "far_deg": float(np.degrees(FAR[JointKind.REVOLUTE])),
-            "far_m": FAR[JointKind.PRISMATIC],
-            "resamples": self.resamples,
-            "seed": self.seed,
-        }
-
-
-def _table(rows: tuple[JointRow, ...]) -> Table:
-    table = Table(
-        title="joints from predicted tracks",
-        box=box.SIMPLE_HEAD,
-        caption="95 % bootstrap over objects; axis: median where the kind is right; far: the first frame at 45 degrees "
-        "or 15 cm",
-    )
-    headings = ("objects", "suite", "joint", "when", "objects/takes/answers", "none", "static", "kind right %")
-    for heading in (*headings, "axis error, degrees", "p90"):
-        table.add_column(heading, justify="left" if heading in headings[:4] else "right")
-    for row in rows:
-        table.add_row(
-            f"{row.source}, {row.part}",
-            row.suite,
-            row.kind,
-            row.moment,
-            f"{row.objects}/{row.takes}/{row.answers}",
-            str(row.without),
-            str(row.static),
-            shown(row.kind_right, factor=100, decimals=0),
-            shown(row.axis_error_deg, decimals=1),
-            "-" if row.axis_p90_deg is None else f"{row.axis_p90_deg:.1f}",
-        )
-    return table
+        far = {"far_deg": float(np.degrees(FAR[JointKind.REVOLUTE])), "far_m": FAR[JointKind.PRISMATIC]}
+        about = {"weights_hash": tracker.weights_hash} | far
+        return self.measure(judge, joint_rows, about, lambda answers: {"answers": answers})
 
 
 if __name__ == "__main__":

@@ -13,25 +13,22 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import tyro
-from jaxtyping import Int
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 from quest.errors import InputError
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
+from quest.evaluation.bootstrap import Pool, Value
 from quest.evaluation.drift import clopper_pearson
-from quest.evaluation.metrics import Sums
 from quest.evaluation.records import EntityRecord
-from quest.evaluation.report import gather, origins_json, provenance, shown, write_report
+from quest.evaluation.report import gather, provenance, rows_table, write_report
 from quest.evaluation.stream_record import runs
-from quest.evaluation.summary import Row, summarise
+from quest.evaluation.summary import summarise
 from quest.evaluation.take_suite import TakeSuite
 
 STILL = "hold-still"
@@ -46,22 +43,17 @@ AFTER_FRAMES = 5
 MOVING = 0.02
 """An entity was seen moving if it was visible at least so far from where it was asked for, normalised units."""
 
-Beside = Literal["alike", "alone", "both"]
-
 
 @dataclass(frozen=True)
 class Episode:
-    """One tracker's answers to one entity that is hidden and maybe seen again.
-
-    Attributes:
-        record: all its answers.
-        start: first hidden frame.
-        end: frame in which it is seen again; the number of frames if it never is.
-    """
+    """One tracker's answers to one entity that is hidden and maybe seen again."""
 
     record: EntityRecord
+    """All its answers."""
     start: int
+    """First hidden frame."""
     end: int
+    """Frame in which it is seen again; the number of frames if it never is."""
 
     @property
     def held_before(self) -> bool:
@@ -83,66 +75,23 @@ class Episode:
 
 @dataclass(frozen=True)
 class Share:
-    """A share with two intervals.
-
-    Attributes:
-        hits: how often.
-        trials: of how many.
-        share: hits / trials.
-        low: lower end of the exact 95 % interval, which takes the trials to be independent.
-        high: upper end.
-        over_objects: the same share with its bootstrap interval over objects.
-    """
+    """A share with two intervals."""
 
     hits: int
     trials: int
     share: float
     low: float
+    """Lower end of the exact 95 % interval, which takes the trials to be independent."""
     high: float
     over_objects: Value
+    """The same share with its bootstrap interval over objects."""
 
 
-@dataclass(frozen=True)
-class ReappearanceRow:
-    """Episodes of one tracker; None where there are none to judge.
-
-    Attributes:
-        tracker: its name.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        beside: whether a look-alike stays in view (``alike``), none does (``alone``), or ``both`` together.
-        objects: how many.
-        takes: how many.
-        episodes: how many.
-        judged: how many of them can be judged after they are seen again.
-        hidden_frames: median length.
-        held_before: share whose identity was right just before.
-        ape_hidden: mean distance over the hidden frames.
-        held_again: share of the judged whose identity is right when they are judged.
-        held_again_if_before: the same of those that were held just before.
-        distance_again: median distance when judged.
-        distance_end: median distance of the same at the end of the take.
-    """
-
-    tracker: str
-    part: str
-    source: str
-    beside: Beside
-    objects: int
-    takes: int
-    episodes: int
-    judged: int
-    hidden_frames: float
-    held_before: Share | None
-    ape_hidden: Value | None
-    held_again: Share | None
-    held_again_if_before: Share | None
-    distance_again: Value | None
-    distance_end: Value | None
-
-
-def reappearances(records: Sequence[EntityRecord], *, resamples: int, seed: int) -> tuple[ReappearanceRow, ...]:
+def reappearances(records: Sequence[EntityRecord], *, resamples: int, seed: int) -> list[dict[str, Any]]:
     """Rows per part, source, look-alike and tracker, of the suite ``occlusion`` in the protocol ``point``.
+
+    ``beside``: whether a look-alike stays in view (``alike``), none does (``alone``), or ``both`` together. Shares and
+    distances after an entity is seen again are over the ``judged``; None where there are none.
 
     Args:
         records: of any trackers, :data:`STILL` among them; other suites and protocols are left out.
@@ -156,11 +105,11 @@ def reappearances(records: Sequence[EntityRecord], *, resamples: int, seed: int)
     order: dict[str, int] = {}
     for episode in episodes(records):
         s = episode.record.subject
-        beside: Beside = "alike" if TakeSuite.of(episode.record.take).look_alike else "alone"
+        beside = "alike" if TakeSuite.of(episode.record.take).look_alike else "alone"
         rank = order.setdefault(s.tracker, len(order))
         for kind in (beside, "both"):
             groups[(s.part, s.source, kind, rank, s.tracker)].append(episode)
-    return tuple(_row(key, groups[key], resamples=resamples, seed=seed) for key in sorted(groups))
+    return [_row(key, groups[key], resamples=resamples, seed=seed) for key in sorted(groups)]
 
 
 def episodes(records: Sequence[EntityRecord]) -> list[Episode]:
@@ -186,12 +135,7 @@ def episodes(records: Sequence[EntityRecord]) -> list[Episode]:
 
 
 def hidden_after_moving(record: EntityRecord, still: EntityRecord) -> tuple[int, int] | None:
-    """First hidden frame, and frame seen again, of the first long enough run after the entity was seen moving.
-
-    Args:
-        record: an entity's visibility.
-        still: the answers of :data:`STILL` to the same entity in the same view.
-    """
+    """First hidden frame, and frame seen again, of the first long enough run after the entity was seen moving."""
     first = record.first_frame
     away = np.abs(still.distance - still.distance[first]) >= MOVING
     seen_moving = away & record.visible & (np.arange(len(away)) >= first)
@@ -201,55 +145,37 @@ def hidden_after_moving(record: EntityRecord, still: EntityRecord) -> tuple[int,
     return None
 
 
-def _row(key: tuple, group: list[Episode], *, resamples: int, seed: int) -> ReappearanceRow:
+def _row(key: tuple, group: list[Episode], *, resamples: int, seed: int) -> dict[str, Any]:
     part, source, beside, _, tracker = key
-    names = sorted({e.record.subject.object_id for e in group})
-    draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
-
-    def owner(of: list[Episode]) -> Int[np.ndarray, " N"]:
-        return np.array([names.index(e.record.subject.object_id) for e in of], dtype=int)
-
-    def median(distance: Callable[[Episode], float], of: list[Episode]) -> Value | None:
-        return median_value(np.array([distance(e) for e in of], dtype=np.float64), owner(of), draws)
-
-    judged = [e for e in group if e.judged_at is not None]
-    held = [e for e in judged if e.held_before]
-    hidden = Sums(
-        np.array([e.record.distance[e.start : e.end].sum(dtype=np.float64) for e in group]),
-        np.array([e.end - e.start for e in group], dtype=np.float64),
-    )
-    return ReappearanceRow(
-        tracker=tracker,
-        part=part,
-        source=source,
-        beside=beside,
-        objects=len(names),
-        takes=len({e.record.take for e in group}),
-        episodes=len(group),
-        judged=len(judged),
-        hidden_frames=float(np.median(hidden.count)),
-        held_before=share_of([e.held_before for e in group], owner(group), draws),
-        ape_hidden=mean_value(hidden, owner(group), draws),
-        held_again=share_of([e.held_again for e in judged], owner(judged), draws),
-        held_again_if_before=share_of([e.held_again for e in held], owner(held), draws),
-        distance_again=median(lambda e: e.record.distance[e.judged_at or 0], judged),
-        distance_end=median(lambda e: e.record.distance[-1], judged),
-    )
+    pool = Pool(group, lambda e: e.record.subject.object_id, resamples=resamples, seed=seed)
+    judged = pool.where(lambda e: e.judged_at is not None)
+    return {
+        "tracker": tracker,
+        "part": part,
+        "source": source,
+        "beside": beside,
+        "objects": pool.objects,
+        "takes": len({e.record.take for e in group}),
+        "episodes": len(group),
+        "judged": len(judged.records),
+        "hidden_frames": float(np.median([e.end - e.start for e in group])),
+        "held_before": share_of(pool, attrgetter("held_before")),
+        "ape_hidden": pool.mean(
+            lambda e: e.record.distance[e.start : e.end].sum(dtype=np.float64), lambda e: e.end - e.start
+        ),
+        "held_again": share_of(judged, attrgetter("held_again")),
+        "held_again_if_before": share_of(judged.where(attrgetter("held_before")), attrgetter("held_again")),
+        "distance_again": judged.median(lambda e: e.record.distance[e.judged_at]),
+        "distance_end": judged.median(lambda e: e.record.distance[-1]),
+    }
 
 
-def share_of(flags: Sequence[bool], owner: Int[np.ndarray, " N"], draws: Int[np.ndarray, "B O"]) -> Share | None:
-    """The share of True with both intervals; None where there are no flags.
-
-    Args:
-        flags: one per trial.
-        owner: index of each trial's object.
-        draws: from :func:`quest.evaluation.bootstrap.draw_objects`.
-    """
-    value = mean_value(Sums(np.array(flags, dtype=np.float64), np.ones(len(flags))), owner, draws)
+def share_of(pool: Pool[Episode], flag: Callable[[Episode], bool]) -> Share | None:
+    """The share of episodes for which something is true, with both intervals; None without episodes."""
+    value, hits = pool.mean(flag), len(pool.where(flag).records)
     if value is None:
         return None
-    low, high = clopper_pearson(sum(flags), len(flags))
-    return Share(sum(flags), len(flags), value.mean, low, high, value)
+    return Share(hits, value.count, value.mean, *clopper_pearson(hits, value.count), value)
 
 
 @dataclass(frozen=True)
@@ -274,9 +200,10 @@ class Reappearance:
             resamples=self.resamples,
             seed=self.seed,
         )
-        console = Console(width=230)
-        console.print(_hidden_table(hidden))
-        console.print(_lockers_table(lockers))
+        console = Console(highlight=False)
+        plain = [vars(row) | {"metrics": vars(row.metrics)} for row in lockers]
+        for title, rows in (("suite occlusion", hidden), ("suite lockers", plain)):
+            console.print(rows_table(title, rows))
         if self.out is not None:
             report = provenance() | {
                 "least_hidden": LEAST_HIDDEN,
@@ -284,60 +211,12 @@ class Reappearance:
                 "moving": MOVING,
                 "resamples": self.resamples,
                 "seed": self.seed,
-                "origins": origins_json(origins),
-                "occlusion": [asdict(row) for row in hidden],
-                "lockers": [asdict(row) for row in lockers],
+                "origins": origins,
+                "occlusion": hidden,
+                "lockers": lockers,
             }
             write_report(report, self.out)
         return 0
-
-
-def _hidden_table(rows: tuple[ReappearanceRow, ...]) -> Table:
-    table = Table(
-        title=f"suite occlusion: moved entities hidden for {LEAST_HIDDEN} frames or more after they were seen moving",
-        box=box.SIMPLE_HEAD,
-        caption="shares in percent with exact 95 % intervals, distances with 95 % bootstrap over objects",
-    )
-    headings = ("objects", "beside", "tracker", "objects/takes", "hidden", "held before", "APE hidden")
-    for heading in (*headings, "held again", "of those held before", "median then", "at the end"):
-        table.add_column(heading, justify="left" if heading in ("objects", "beside", "tracker") else "right")
-    for row in rows:
-        table.add_row(
-            f"{row.source}, {row.part}",
-            row.beside,
-            row.tracker,
-            f"{row.objects}/{row.takes}",
-            f"{row.hidden_frames:.0f}",
-            _share(row.held_before),
-            shown(row.ape_hidden),
-            _share(row.held_again),
-            _share(row.held_again_if_before),
-            shown(row.distance_again),
-            shown(row.distance_end),
-        )
-    return table
-
-
-def _lockers_table(rows: tuple[Row, ...]) -> Table:
-    table = Table(title="suite lockers", box=box.SIMPLE_HEAD, caption="95 % bootstrap over objects")
-    for heading in ("objects", "of", "tracker", "objects/takes/tracks", "switches per 1,000 frames", "Acc %"):
-        table.add_column(heading, justify="left" if heading in ("objects", "of", "tracker") else "right")
-    for row in rows:
-        table.add_row(
-            f"{row.source}, {row.part}",
-            row.reading,
-            row.tracker,
-            f"{row.objects}/{row.takes}/{row.tracks}",
-            shown(row.metrics.switches, decimals=2),
-            shown(row.metrics.acc, factor=100, decimals=1),
-        )
-    return table
-
-
-def _share(share: Share | None) -> str:
-    if share is None:
-        return "-"
-    return f"{100 * share.share:.0f} ({100 * share.low:.0f} to {100 * share.high:.0f}) of {share.trials}"
 
 
 if __name__ == "__main__":

@@ -24,36 +24,33 @@ import tempfile
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from itertools import product
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 import tyro
 from jaxtyping import Bool, Float
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
-from quest.data.provenance import combined_hash, file_hash
+from quest.data.provenance import file_hash
+from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, WeightsError
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value
-from quest.evaluation.metrics import Sums
+from quest.evaluation.bootstrap import Pool
 from quest.evaluation.protocols import START_FRAMES
-from quest.evaluation.report import provenance, shown, write_report
-from quest.evaluation.selection import select_takes
+from quest.evaluation.study import Study
 from quest.model.frames import FrameBatch
 from quest.model.weights import find_weights
 from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne
 from quest.track.tracker import pick_device
 from quest.train.feature_cache import CachedView, FeatureCache
-from quest.train.plan import WindowPlan
 from quest.train.settings import WindowConfig
-from quest.train.windows import WindowSampler, WindowTruth
+from quest.train.windows import WindowPlan, WindowSampler, WindowTruth
 
 ANSWERS = ("head", "zero", "lifted", "lifted-truth")
 READINGS = ("all", "moved", "moving")
@@ -63,83 +60,42 @@ MOVED, MOVING = 0.1, 0.005
 
 @dataclass(frozen=True)
 class FlowRecord:
-    """Errors of one entity in one view, summed over the frames that have a next one.
-
-    Attributes:
-        take: name of the take.
-        view: name of the prepared view.
-        object_id: the object.
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        suite: of the simulator.
-        level: how many joints move one after the other.
-        stride: frames between the frames of a window.
-        moved: whether the entity is at some time more than 0.1 from rest.
-        total: sum of errors per answer, normalised units.
-        count: frames.
-        moving_total: the same over steps that are longer than 0.005.
-        moving_count: how many those are.
-    """
+    """Errors of one entity in one view, summed over the frames that have a next one."""
 
     take: str
     view: str
+    """Name of the prepared view."""
     object_id: str
     part: str
     source: str
     suite: str
     level: int
     stride: int
+    """Frames between the frames of a window."""
     moved: bool
+    """Whether the entity is at some time more than 0.1 from rest."""
     total: dict[str, float]
+    """Sum of errors per answer, normalised units."""
     count: int
+    """Frames."""
     moving_total: dict[str, float]
+    """The same over steps that are longer than 0.005."""
     moving_count: int
-
-
-@dataclass(frozen=True)
-class FlowRow:
-    """EPE3D of takes that go together.
-
-    Attributes:
-        part: part of the object split.
-        source: ``partnet-mobility`` or ``procedural``.
-        suite: of the simulator.
-        level: how many joints move one after the other.
-        stride: frames between the frames of a window, and to the one that is asked for.
-        reading: of :data:`READINGS`.
-        objects: how many.
-        takes: how many.
-        entities: how many (take, view, entity).
-        epe: EPE3D per answer, normalised units.
-    """
-
-    part: str
-    source: str
-    suite: str
-    level: int
-    stride: int
-    reading: str
-    objects: int
-    takes: int
-    entities: int
-    epe: dict[str, Value]
+    """How many those are."""
 
 
 @dataclass(frozen=True)
 class ViewFlow:
-    """Errors in one view.
-
-    Attributes:
-        error: per answer, normalised units; NaN where there is nothing to judge.
-        length: true displacement, normalised units.
-        scored: entities that are seen where slots are matched.
-        moved: entities that are at some time more than 0.1 from rest.
-    """
+    """Errors in one view."""
 
     error: dict[str, Float[np.ndarray, "T K"]]
+    """Per answer, normalised units; NaN where there is nothing to judge."""
     length: Float[np.ndarray, "T K"]
+    """True displacement, normalised units."""
     scored: Bool[np.ndarray, " K"]
+    """Entities that are seen where slots are matched."""
     moved: Bool[np.ndarray, " K"]
+    """Entities that are at some time more than 0.1 from rest."""
 
 
 def flow_errors(
@@ -147,12 +103,7 @@ def flow_errors(
 ) -> ViewFlow | None:
     """Errors of all answers in one view; None where no entity is seen in the first frames, or no frame has a next one.
 
-    Args:
-        network: with a flow head, in evaluation mode, on the device.
-        view: prepared with the network's encoder.
-        stride: frames between the frames of a window.
-        device: where to compute.
-        batch: windows at a time.
+    The network has a flow head and is in evaluation mode on the device; the view was prepared with its encoder.
 
     Raises:
         ConfigError: the stride is not at least 1.
@@ -175,12 +126,7 @@ def flow_errors(
 
 
 def records_of(flow: ViewFlow, **subject: object) -> tuple[FlowRecord, ...]:
-    """One record per scored entity.
-
-    Args:
-        flow: errors in a view.
-        subject: the first eight fields of a record.
-    """
+    """One record per scored entity; ``subject`` has the first eight fields."""
     records = []
     for k in np.flatnonzero(flow.scored):
         known = np.isfinite(np.stack([error[:, k] for error in flow.error.values()])).all(axis=0)
@@ -198,53 +144,23 @@ def records_of(flow: ViewFlow, **subject: object) -> tuple[FlowRecord, ...]:
     return tuple(records)
 
 
-def flow_rows(records: Sequence[FlowRecord], *, resamples: int, seed: int) -> tuple[FlowRow, ...]:
-    """Rows per part, source, suite, level, stride and reading.
-
-    Args:
-        records: of one network.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap; every row draws from a generator of its own.
-    """
+def flow_rows(records: Sequence[FlowRecord], *, resamples: int, seed: int) -> list[dict[str, Any]]:
+    """EPE3D per part, source, suite, level, stride and reading."""
+    names = ("part", "source", "suite", "level", "stride")
     groups: dict[tuple, list[FlowRecord]] = defaultdict(list)
-    for r in records:
-        groups[(r.part, r.source, r.suite, r.level, r.stride)].append(r)
+    for record in records:
+        groups[attrgetter(*names)(record)].append(record)
     rows = []
-    for key in sorted(groups):
-        for reading in READINGS:
-            chosen = [r for r in groups[key] if reading == "all" or r.moved]
-            row = _row(key, reading, chosen, resamples=resamples, seed=seed)
-            rows += [] if row is None else [row]
-    return tuple(rows)
-
-
-def _row(key: tuple, reading: str, chosen: list[FlowRecord], *, resamples: int, seed: int) -> FlowRow | None:
-    moving = reading == "moving"
-    count = np.array([float(r.moving_count if moving else r.count) for r in chosen])
-    if not count.sum():
-        return None
-    names = sorted({r.object_id for r in chosen})
-    owner = np.array([names.index(r.object_id) for r in chosen])
-    draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
-    epe = {}
-    for answer in ANSWERS:
-        total = np.array([(r.moving_total if moving else r.total)[answer] for r in chosen])
-        value = mean_value(Sums(total, count), owner, draws)
-        assert value is not None
-        epe[answer] = value
-    part, source, suite, level, stride = key
-    return FlowRow(
-        part=part,
-        source=source,
-        suite=suite,
-        level=level,
-        stride=stride,
-        reading=reading,
-        objects=len(names),
-        takes=len({r.take for r in chosen}),
-        entities=int((count > 0).sum()),
-        epe=epe,
-    )
+    for key, reading in product(sorted(groups), READINGS):
+        total, count = ("moving_total", "moving_count") if reading == "moving" else ("total", "count")
+        chosen = [r for r in groups[key] if reading == "all" or r.moved]
+        pool = Pool(chosen, attrgetter("object_id"), resamples=resamples, seed=seed)
+        judged = pool.where(attrgetter(count))
+        if judged.records:
+            counts = {"objects": pool.objects, "takes": len({r.take for r in chosen}), "entities": len(judged.records)}
+            epe = {a: pool.mean(lambda r, a=a, t=total: getattr(r, t)[a], attrgetter(count)) for a in ANSWERS}
+            rows.append(dict(zip(names, key, strict=True)) | {"reading": reading} | counts | {"epe": epe})
+    return rows
 
 
 def _plans(view: CachedView, anchor: int, *, window: int, stride: int, batch: int) -> Iterator[WindowPlan]:
@@ -284,29 +200,15 @@ def _difference(point: Float[Tensor, "B 2 K 3"]) -> Float[Tensor, "B K 3"]:
 
 
 @dataclass(frozen=True)
-class SceneFlow:
+class SceneFlow(Study):
     """EPE3D of weights with a flow head, per source, suite, level and stride."""
 
-    takes: str
-    """Folder of the take store; takes with every frame."""
-    weights: str
+    weights: str = tyro.MISSING
     """Name or file of weights with a flow head (quest train --stage 2)."""
-    split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation",)
-    """Parts of the object split."""
-    level: tuple[int, ...] = ()
-    """Levels; all by default."""
-    objects: tuple[str, ...] = ()
-    """Object ids; all by default."""
     stride: tuple[int, ...] = (1, 6)
     """Frames between the frames of a window, and to the one that is asked for."""
     cache: Path | None = None
     """Folder of the feature cache; a temporary one by default."""
-    resamples: int = 1000
-    """Of the bootstrap over objects."""
-    seed: int = 0
-    """Of the bootstrap."""
-    out: Path | None = None
-    """Result file."""
 
     def run(self) -> int:
         """Measure take by take, print, write."""
@@ -314,71 +216,21 @@ class SceneFlow:
         network = read_paper(path).network.to(device)
         if network.flow is None:
             raise WeightsError(f"{self.weights}: no flow head in it; train one with `quest train --stage 2`")
-        store, console = TakeStore(self.takes), Console(width=170, highlight=False)
-        chosen = select_takes(store.infos(), split=self.split, levels=self.level, objects=self.objects)
-        about = self._about(path, combined_hash((name, store.data_hash(name)) for name in chosen))
-        records: list[FlowRecord] = []
-        rows: tuple[FlowRow, ...] = ()
+        about = {"weights_hash": file_hash(path), "moved": MOVED, "moving": MOVING}
         with nullcontext(self.cache) if self.cache else tempfile.TemporaryDirectory() as folder:
             features = FeatureCache(Path(folder), network.encoder)
-            for i, (name, part) in enumerate(chosen.items(), start=1):
+
+            def judge(store: TakeStore, name: str, part: SplitPart) -> list[FlowRecord]:
                 list(features.build(store, [name], device=device))
-                info = store.infos()[name]
-                for view in features.views([name]):
-                    for stride in self.stride:
-                        flow = flow_errors(network, view, stride=stride, device=device)
-                        if flow is not None:
-                            records += records_of(
-                                flow,
-                                take=name,
-                                view=view.name,
-                                object_id=info.object_id,
-                                part=part,
-                                source=info.source,
-                                suite=info.suite,
-                                level=info.level,
-                                stride=stride,
-                            )
-                rows = flow_rows(records, resamples=self.resamples, seed=self.seed)
-                console.print(f"{i}/{len(chosen)} {name}: {len(records)} records so far")
-                if self.out is not None:
-                    done = {"takes_done": i, "complete": i == len(chosen), "rows": [asdict(row) for row in rows]}
-                    write_report(about | done, self.out)
-        console.print(_table(rows))
-        return 0
+                info, records = store.infos()[name], list[FlowRecord]()
+                take = {key: getattr(info, key) for key in ("object_id", "source", "suite", "level")} | {"take": name}
+                for view, stride in product(features.views([name]), self.stride):
+                    flow = flow_errors(network, view, stride=stride, device=device)
+                    if flow is not None:
+                        records += records_of(flow, view=view.name, part=part, stride=stride, **take)
+                return records
 
-    def _about(self, path: Path, data_hash: str) -> dict[str, Any]:
-        return provenance() | {
-            "weights": self.weights,
-            "weights_hash": file_hash(path),
-            "data_hash": data_hash,
-            "moved": MOVED,
-            "moving": MOVING,
-            "resamples": self.resamples,
-            "seed": self.seed,
-        }
-
-
-def _table(rows: tuple[FlowRow, ...]) -> Table:
-    table = Table(
-        title="EPE3D, normalised units per step",
-        box=box.SIMPLE_HEAD,
-        caption=f"95 % bootstrap over objects; moved: more than {MOVED} from rest at some time; moving: of these, "
-        f"steps longer than {MOVING}",
-    )
-    for heading in ("objects", "suite", "L", "stride", "reading", "objects/takes/entities", *ANSWERS):
-        table.add_column(heading, justify="left" if heading in ("objects", "suite", "reading") else "right")
-    for row in rows:
-        table.add_row(
-            f"{row.source}, {row.part}",
-            row.suite,
-            str(row.level),
-            str(row.stride),
-            row.reading,
-            f"{row.objects}/{row.takes}/{row.entities}",
-            *(shown(row.epe[answer], decimals=4) for answer in ANSWERS),
-        )
-    return table
+            return self.measure(judge, flow_rows, about)
 
 
 if __name__ == "__main__":

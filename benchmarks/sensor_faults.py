@@ -18,16 +18,14 @@ import cv2
 import numpy as np
 import torch
 import tyro
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
 import quest
 from quest.data.store import TakeStore
 from quest.evaluation.drift import clopper_pearson
 from quest.evaluation.real.run import shown
 from quest.evaluation.real.sets import open_set
-from quest.evaluation.report import provenance, write_report
+from quest.evaluation.report import provenance, rows_table, write_report
 from quest.track.state import StreamState
 from quest.track.tracker import Tracker
 from quest.types import Clip, Frame, Query
@@ -181,7 +179,8 @@ class SensorFaults:
             console.print(f"{player.source}, {player.clip.name}, {player.inputs}", markup=False)
             if self.out is not None:
                 write_report(self._report(played, frames, flags, tracker), self.out)
-        console.print(_table(self._report(played, frames, flags, tracker)["rows"]))
+        title = f"flagged within {WITHIN} frames; found again after {AFTER}"
+        console.print(rows_table(title, self._report(played, frames, flags, tracker)["rows"]))
         console.print(f"false flags: {flags} of {frames} frames without a fault")
         return 0
 
@@ -239,20 +238,6 @@ def _row(fault: str, where: str, played: Sequence[Played]) -> dict[str, Any]:
         "found_again": found / queries if queries else None,
         "found_again_interval": list(clopper_pearson(found, queries)) if queries else None,
     }
-
-
-def _table(rows: Sequence[dict[str, Any]]) -> Table:
-    table = Table(title=f"flagged within {WITHIN} frames; found again after {AFTER}", box=box.SIMPLE_HEAD)
-    for heading in ("source", "fault", "plays", "flagged %", "tracking while blind %", "queries", "found again %"):
-        table.add_column(heading, justify="left" if heading in ("source", "fault") else "right")
-    for row in rows:
-        blind, found = row["tracking_while_blind"], row["found_again"]
-        table.add_row(
-            row["source"], row["fault"], str(row["plays"]), f"{100 * row['flagged']:.0f}",
-            "" if blind is None else f"{100 * blind:.0f}", str(row["queries"]),
-            "" if found is None else f"{100 * found:.0f}",
-        )  # fmt: skip
-    return table
 
 
 if __name__ == "__main__":

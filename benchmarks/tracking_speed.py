@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -68,7 +68,7 @@ class TrackingSpeed:
             "rows": [{"queries": count, **_summary(np.array(turns))} for count, turns in frames_ms.items()],
             "discovery_ms": {"median": float(np.median(discovery_ms)), "n": len(discovery_ms)},
         }
-        Console(highlight=False).print_json(data=result)
+        Console(highlight=False).print_json(data=result, default=asdict)
         if self.out is not None:
             about = {"weights": self.weights, "weights_hash": tracker.weights_hash, "threads": torch.get_num_threads()}
             about |= {"device": device_name(tracker.device), "load": os.getloadavg()[0]}
@@ -103,13 +103,12 @@ def played_ms(stream: Stream, clip: Clip, *, frames: int | None = None) -> Float
 
 def _summary(turns_ms: Float[np.ndarray, "R T"]) -> dict[str, Any]:
     """Median and 95 % quantile of a frame, and frames per second with a 95 % bootstrap interval over turns."""
-    low, high = interval_over(turns_ms, lambda drawn: 1e3 / drawn.mean(axis=(-2, -1)))
     return {
         "turns": len(turns_ms),
         "frames": turns_ms.size,
         "median_ms": float(np.median(turns_ms)),
         "p95_ms": float(np.quantile(turns_ms, 0.95)),
-        "frames_per_s": {"mean": float(1e3 / turns_ms.mean()), "low": low, "high": high},
+        "frames_per_s": interval_over(turns_ms, lambda drawn: 1e3 / drawn.mean(axis=(-2, -1))),
     }
 
 

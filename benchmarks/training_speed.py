@@ -18,7 +18,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,7 @@ class TrainingSpeed:
             turns = self._turns(network, sampler, Path(scratch), fabric)
         frames = self.steps * self.windows.batch * (network.config.window + 1)
         result = _summary(np.array(turns), frames)
-        Console(highlight=False).print_json(data=result)
+        Console(highlight=False).print_json(data=result, default=asdict)
         if self.out is not None:
             about = {"network": "paper", "batch": self.windows.batch}
             about |= {
@@ -166,15 +166,11 @@ def _finish(device: torch.device) -> None:
 
 
 def _summary(turns: np.ndarray, frames: int) -> dict[str, Any]:
-    def interval(statistic: Callable[[np.ndarray], np.ndarray]) -> dict[str, float]:
-        low, high = interval_over(turns, statistic)
-        return {"mean": float(statistic(turns)), "low": low, "high": high}
-
     size = frames * len(turns)
     return {
-        "frames_per_s": interval(lambda t: size / t[..., 0].sum(-1)),
-        "bare_frames_per_s": interval(lambda t: size / t[..., 1].sum(-1)),
-        "share_of_bare": interval(lambda t: t[..., 1].sum(-1) / t[..., 0].sum(-1)),
+        "frames_per_s": interval_over(turns, lambda t: size / t[..., 0].sum(-1)),
+        "bare_frames_per_s": interval_over(turns, lambda t: size / t[..., 1].sum(-1)),
+        "share_of_bare": interval_over(turns, lambda t: t[..., 1].sum(-1) / t[..., 0].sum(-1)),
         "turns": [{"loop_s": round(loop, 4), "bare_s": round(bare, 4)} for loop, bare in turns.tolist()],
         "n_turns": len(turns),
         "n_frames": size,

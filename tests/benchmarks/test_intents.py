@@ -108,10 +108,7 @@ def test_rows_are_over_objects():
     good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0, 0.01, 0.02, 1.0, 0.95, 0.0, 0.1, 1.0, 1.0)
     bad = replace(good, take="u", object_id="laptop-2", lift_acc=0.5, lift_ape=0.4)
     (row,) = intent_rows([good, replace(good, view=1), bad], resamples=200)
-    assert (row.objects, row.takes, row.views) == (2, 2, 3)
-    assert row.both is not None
-    assert row.both.mean == pytest.approx(2 / 3)
-    assert row.lift_ape is not None
-    assert row.lift_ape.mean == pytest.approx((0.02 + 0.02 + 0.4) / 3)
-    assert row.both.low is not None
-    assert row.both.low <= row.both.mean
+    assert (row["objects"], row["takes"], row["views"]) == (2, 2, 3)
+    assert row["both"].mean == pytest.approx(2 / 3)
+    assert row["lift_ape"].mean == pytest.approx((0.02 + 0.02 + 0.4) / 3)
+    assert row["both"].low <= row["both"].mean

@@ -73,15 +73,13 @@ def test_rows():
         answer(moment="end"),
         answer(kind="prismatic"),
     ]
-    rows = {(r.kind, r.moment): r for r in joint_rows(answers, resamples=100, seed=0)}
+    rows = {(r["kind"], r["moment"]): r for r in joint_rows(answers, resamples=100, seed=0)}
     assert set(rows) == {("revolute", "far"), ("revolute", "end"), ("prismatic", "far")}
     row = rows["revolute", "far"]
-    assert (row.answers, row.objects, row.without, row.static, row.levels) == (8, 8, 1, 1, (1, 4))
-    assert row.kind_right is not None
-    assert (row.kind_right.mean, row.kind_right.count) == (5 / 8, 8)
-    assert row.axis_error_deg is not None
-    assert (row.axis_error_deg.mean, row.axis_error_deg.count) == (2.0, 5)
-    assert rows["prismatic", "far"].axis_error_deg is None
+    assert [row[name] for name in ("answers", "objects", "without", "static", "levels")] == [8, 8, 1, 1, [1, 4]]
+    assert (row["kind_right"].mean, row["kind_right"].count) == (5 / 8, 8)
+    assert (row["axis_error_deg"].mean, row["axis_error_deg"].count) == (2.0, 5)
+    assert rows["prismatic", "far"]["axis_error_deg"] is None
 
 
 def test_a_view_is_judged(take: Take):

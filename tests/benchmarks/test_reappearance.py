@@ -75,34 +75,28 @@ def test_shares_and_distances():
         follows[END : END + 5] = 2
         follows[END + 5] = 2 if i < 2 else 1  # two are not held again
         records += answers(distance, object_id=f"desk-{i}", alike=i < 4, follows=follows)
-    rows = {r.beside: r for r in reappearances(records, resamples=100, seed=0) if r.tracker == "quest"}
+    rows = {r["beside"]: r for r in reappearances(records, resamples=100, seed=0) if r["tracker"] == "quest"}
     row = rows["both"]
-    assert (row.objects, row.takes, row.episodes, row.judged, row.hidden_frames) == (6, 6, 6, 6, END - START)
-    assert row.held_before is not None
-    assert row.held_again is not None
-    assert row.held_again_if_before is not None
-    assert (row.held_before.hits, row.held_before.trials) == (5, 6)
-    assert (row.held_again.hits, row.held_again.trials) == (4, 6)
-    assert (row.held_again_if_before.hits, row.held_again_if_before.trials) == (4, 5)
-    assert row.held_again.low == pytest.approx(0.2228, abs=1e-4)  # Clopper and Pearson, 4 of 6
-    assert row.held_again.high == pytest.approx(0.9567, abs=1e-4)
-    assert row.held_again.over_objects.low is not None
-    assert row.ape_hidden is not None
-    assert row.distance_again is not None
-    assert row.distance_end is not None
-    assert row.ape_hidden.mean == pytest.approx(0.5)
-    assert row.ape_hidden.count == 6 * (END - START)
-    assert row.distance_again.mean == pytest.approx(0.25)
-    assert row.distance_end.mean == pytest.approx(0.5)
-    assert (rows["alike"].episodes, rows["alone"].episodes) == (4, 2)
-    assert rows["alone"].held_again is not None
-    assert rows["alone"].held_again.share == 1.0
+    counts = ("objects", "takes", "episodes", "judged", "hidden_frames")
+    assert [row[name] for name in counts] == [6, 6, 6, 6, END - START]
+    held = [row[name] for name in ("held_before", "held_again", "held_again_if_before")]
+    assert [(share.hits, share.trials) for share in held] == [(5, 6), (4, 6), (4, 5)]
+    assert held[1].low == pytest.approx(0.2228, abs=1e-4)  # Clopper and Pearson, 4 of 6
+    assert held[1].high == pytest.approx(0.9567, abs=1e-4)
+    assert held[1].over_objects.low is not None
+    assert row["ape_hidden"].mean == pytest.approx(0.5)
+    assert row["ape_hidden"].count == 6 * (END - START)
+    assert row["distance_again"].mean == pytest.approx(0.25)
+    assert row["distance_end"].mean == pytest.approx(0.5)
+    assert (rows["alike"]["episodes"], rows["alone"]["episodes"]) == (4, 2)
+    assert rows["alone"]["held_again"].share == 1.0
 
 
 def test_what_is_not_seen_again_long_enough_is_not_judged():
     (row, _) = reappearances(answers(np.full(FRAMES, 0.1), visible=hidden(20, 55)), resamples=10, seed=0)[2:]
-    assert (row.tracker, row.beside, row.episodes, row.judged) == ("quest", "both", 1, 0)
-    assert row.held_before is not None
-    assert row.ape_hidden is not None
-    assert (row.held_again, row.held_again_if_before, row.distance_again, row.distance_end) == (None,) * 4
-    assert reappearances(answers(np.zeros(FRAMES), visible=hidden(20, 54)), resamples=10, seed=0)[-1].judged == 1
+    assert (row["tracker"], row["beside"], row["episodes"], row["judged"]) == ("quest", "both", 1, 0)
+    assert row["held_before"] is not None
+    assert row["ape_hidden"] is not None
+    assert {row[n] for n in ("held_again", "held_again_if_before", "distance_again", "distance_end")} == {None}
+    seen = answers(np.zeros(FRAMES), visible=hidden(20, 54))
+    assert reappearances(seen, resamples=10, seed=0)[-1]["judged"] == 1

@@ -13,7 +13,6 @@ import pytest
 from PIL import Image
 
 from quest.cli import main as program
-from quest.cli.data import finite
 from quest.cli.takes import write_picture
 from quest.data.store import TakeStore
 from quest.data.verify import Check
@@ -26,8 +25,8 @@ from tests.synthetic import make_take
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two takes, the second of fewer entities."""
     folder = tmp_path_factory.mktemp("store") / "takes"
-    store = TakeStore(folder)
-    store.write(make_take(frames=12, views=2, size=(64, 48), name="panels"))
+    store, take = TakeStore(folder), make_take(frames=12, views=2, size=(64, 48), name="panels")
+    store.write(replace(take, info=replace(take.info, category="[i]Panels")))
     store.write(make_take(frames=10, views=2, entities=1, size=(64, 48), seed=1, name="single"))
     return folder
 
@@ -51,7 +50,7 @@ def quest(*arguments: object) -> int:
 def test_ls(whole: Path, broken: Path, capsys: pytest.CaptureFixture[str]):
     assert quest("ls", whole) == 0
     out = capsys.readouterr().out
-    assert all(word in out for word in ("panels", "single", "Panels", "standard", "2 takes, 44 frames"))
+    assert all(word in out for word in ("panels", "single", "[i]Panels", "standard", "2 takes, 44 frames"))
     assert quest("ls", whole / "single.zarr") == 0
     assert "panels" not in capsys.readouterr().out.replace("Panels", "")
     assert quest("ls", broken) == 1
@@ -60,43 +59,25 @@ def test_ls(whole: Path, broken: Path, capsys: pytest.CaptureFixture[str]):
     assert "torn" not in captured.out
 
 
-def test_names_with_brackets(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    store, take = TakeStore(tmp_path / "takes"), make_take(frames=9, views=1, size=(64, 48))
-    store.write(replace(take, info=replace(take.info, name="chest[old]-1", category="[i]Chest")))
-    assert quest("ls", tmp_path / "takes") == 0
-    out = capsys.readouterr().out
-    assert "chest[old]-1" in out
-    assert "[i]Chest" in out
-
-
-def test_show_the_folder_that_one_is_in(whole: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.chdir(whole)
-    try:
-        assert quest("show", ".") == 0
-        assert (whole / "takes.png").is_file()
-    finally:
-        (whole / "takes.png").unlink(missing_ok=True)
-
-
-def test_show_a_take(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    out = tmp_path / "pictures" / "sheet.png"
+def test_show(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """A take, a store, and the folder that one is in."""
+    out, every = tmp_path / "pictures" / "sheet.png", tmp_path / "every.png"
     assert quest("show", whole / "panels.zarr", "--out", out, "--columns", 4) == 0
-    every = tmp_path / "every.png"
     assert quest("show", whole / "panels.zarr", "--out", every, "--every", 5) == 0
     assert Image.open(out).width > 900
     assert Image.open(every).height == Image.open(out).height
     assert str(out) in capsys.readouterr().out
-
-
-def test_show_a_store(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     assert quest("show", whole) == 0
     two = Image.open(tmp_path / "takes.png")
-    assert quest("show", whole, "--rows", 1) == 0
-    assert Image.open(tmp_path / "takes.png").height < two.height
+    monkeypatch.chdir(whole)
+    try:
+        assert quest("show", ".", "--rows", 1) == 0
+        assert Image.open(whole / "takes.png").height < two.height
+    finally:
+        (whole / "takes.png").unlink(missing_ok=True)
 
 
-@pytest.mark.skipif(not is_installed("rerun"), reason="the viz extra is not installed")
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path):
     wide = np.zeros((1, 20_000, 3), np.uint8)
     with pytest.raises(ConfigError, match=r"20000 x 1 px are too many for \.webp"):
@@ -106,6 +87,7 @@ def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path):
     assert list(tmp_path.iterdir()) == [tmp_path / "sheet.png"]
 
 
+@pytest.mark.skipif(not is_installed("rerun"), reason="the viz extra is not installed")
 def test_show_in_rerun(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     rrd = tmp_path / "take.rrd"
     assert quest("show", whole / "single.zarr", "--rrd", rrd) == 0
@@ -115,18 +97,15 @@ def test_show_in_rerun(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
 
 
 def test_stats(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    path = tmp_path / "numbers" / "stats.json"
-    assert quest("stats", whole, "--json", path) == 0
-    out = capsys.readouterr().out
-    assert all(word in out for word in ("2 of 2 objects", "Panels (2)", "handle (2)", "visible", "GB"))
-    found = json.loads(path.read_text())
-    assert (found["takes"], found["frames"], found["labels"]["rim"]) == (2, 44, 1)
-
-
-def test_stats_of_nothing_is_json(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     assert quest("stats", tmp_path / "empty", "--json", tmp_path / "stats.json") == 0
     assert json.loads((tmp_path / "stats.json").read_text())["visible_share"] is None
+    path = tmp_path / "numbers" / "stats.json"
+    assert quest("stats", whole, "--json", path) == 0
+    out = capsys.readouterr().out
+    assert all(word in out for word in ("2 of 2 objects", "[i]Panels (1)", "handle (2)", "visible", "GB"))
+    found = json.loads(path.read_text())
+    assert (found["takes"], found["frames"], found["labels"]["rim"]) == (2, 44, 1)
 
 
 def test_verify(whole: Path, broken: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -160,11 +139,6 @@ def test_verify_writes_finite_json(broken: Path, tmp_path: Path, monkeypatch: py
     assert quest("verify", broken / "whole.zarr", "--json", path) == 0
     found = json.loads(path.read_text(), parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
     assert found["worst"]["reprojection"]["worst"] is None
-
-
-def test_finite():
-    found = finite({"a": [1.0, math.inf, {"b": math.nan}], "c": (-math.inf, 2, "inf"), "d": None})
-    assert found == {"a": [1.0, None, {"b": None}], "c": [None, 2, "inf"], "d": None}
 
 
 def test_export(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -210,7 +184,7 @@ def test_export_to_mcap(whole: Path, tmp_path: Path):
         (["show", "takes/single.zarr", "--out", "sheet.txt"], "expected a picture, .png"),
         (["show", "takes", "--out", "sheets"], "expected a picture, .png"),
         (["show", "empty"], "no takes"),
-        (["stats", "takes/single.zarr"], "expected a store"),
+        (["stats", "takes/single.zarr"], "expected a store, and this is one take, single; name its store, "),
         (["verify", "empty"], "no takes"),
         (["export", "empty", "--out", "x"], "no takes"),
     ],
@@ -226,10 +200,3 @@ def test_mistakes(
     (whole.parent / "empty").mkdir(exist_ok=True)
     assert quest(*arguments) == 2
     assert said in capsys.readouterr().err
-
-
-def test_a_take_where_a_store_is_expected(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    take = next(whole.glob("*.zarr"))
-    assert program.main(["data", "stats", str(take)]) == 2
-    error = " ".join(capsys.readouterr().err.split())
-    assert f"expected a store, and this is one take, {take.stem}; name its store, {whole}" in error

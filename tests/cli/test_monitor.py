@@ -14,7 +14,7 @@ import pytest
 from quest.cli.main import main
 from quest.data.store import TakeStore
 from quest.model.weights import save_network
-from quest.monitor import calibration_file, write_calibrations
+from quest.monitor import calibration, write_calibrations
 from quest.track import Stream, TrackerConfig
 from quest.types import Camera
 from tests.synthetic import make_take
@@ -41,12 +41,12 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
         settings = TrackerConfig(threshold=threshold, prompt_threshold=threshold, size_px=64).to_json()
         save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test")
     found = {name: ["--weights", str(folder / f"{name}.safetensors")] for name in ("eager", "blind")}
-    for name, calibration in (
+    for name, made in (
         ("calm", make_calibration(alarming=False)),
         ("alarming", alarming),
         ("few", replace(alarming, maxima=np.arange(20.0))),
     ):
-        write_calibrations(folder / f"{name}.json", {"depth": calibration})
+        write_calibrations(folder / f"{name}.json", {"depth": made})
         found[name] = [*found["eager"], "--monitor", str(folder / f"{name}.json")]
     return found
 
@@ -54,7 +54,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
 @pytest.fixture(autouse=True)
 def nothing_ships(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """There is no calibration but those of these tests."""
-    monkeypatch.setattr(calibration_file, "resources", SimpleNamespace(files=lambda package: tmp_path))
+    monkeypatch.setattr(calibration, "resources", SimpleNamespace(files=lambda package: tmp_path))
 
 
 def objects(text: str) -> list[dict[str, Any]]:
@@ -80,14 +80,11 @@ def test_without_a_calibration(take: str, weights: dict[str, list[str]], tmp_pat
     assert left["alarm"] is None
 
 
-def test_too_few_streams_for_an_alarm(take: str, weights: dict[str, list[str]], capsys):
-    """Nothing may look as if it were watched."""
+def test_no_alarm(take: str, weights: dict[str, list[str]], capsys):
+    """Where the calibration cannot give any, nothing may look as if it were watched."""
     assert main(["monitor", take, *weights["few"], *POINTS]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert "no alarm at all at alpha 0.05: calibrated on 20 loss-free streams of" in out
-
-
-def test_no_alarm(take: str, weights: dict[str, list[str]], capsys):
     assert main(["monitor", take, *weights["calm"], *POINTS]) == 0
     out = capsys.readouterr().out
     assert "calibration" not in out
@@ -109,24 +106,14 @@ def test_an_open_alarm(take: str, weights: dict[str, list[str]], capsys):
     assert "2 left open" in captured.err
 
 
-def test_a_smaller_alpha_needs_more_evidence(take: str, weights: dict[str, list[str]], capsys):
-    first = []
-    for alpha in ("0.05", "1e-9"):
-        assert main(["monitor", take, *weights["alarming"], *POINTS, "--alpha", alpha, "--jsonl", "-"]) == 3
-        first.append(objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"]["frame"])
-    assert first[0] < first[1]
-
-
-def test_alpha_in_so_many_frames(take: str, weights: dict[str, list[str]], capsys):
-    """The calibration's blocks have 60 frames: 180 are in three of them, which share alpha alike."""
-    for frames, part in (([], 0.8 * 0.05), (["--alpha-frames", "180"], 0.05 / 3)):
-        assert main(["monitor", take, *weights["alarming"], *POINTS, *frames, "--jsonl", "-"]) == 3
-        assert objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"]["alpha"] == pytest.approx(part)
-
-
-def test_a_file_of_calibrations_that_is_not_there(take: str, weights: dict[str, list[str]], tmp_path: Path, capsys):
-    assert main(["monitor", take, *weights["eager"], "--monitor", str(tmp_path / "none.json")]) == 2
-    assert "quest calibrate" in capsys.readouterr().err
+def test_alpha(take: str, weights: dict[str, list[str]], capsys):
+    """A smaller one needs more evidence; blocks have 60 frames: 180 are in three of them, which share alpha alike."""
+    found = []
+    for words in ([], ["--alpha", "1e-9"], ["--alpha-frames", "180"]):
+        assert main(["monitor", take, *weights["alarming"], *POINTS, *words, "--jsonl", "-"]) == 3
+        found.append(objects(capsys.readouterr().out)[-1]["queries"][0]["alarm"])
+    assert found[0]["frame"] < found[1]["frame"]
+    assert [found[0]["alpha"], found[2]["alpha"]] == pytest.approx([0.8 * 0.05, 0.05 / 3])
 
 
 @pytest.mark.parametrize("how", [[], ["--online"]], ids=["first frame", "online"])
@@ -177,6 +164,7 @@ def test_interrupted(take: str, weights: dict[str, list[str]], monkeypatch, caps
     [
         (["--alpha", "0"], "--alpha"),
         (["--alpha-frames", "0"], "--alpha-frames"),
+        (["--monitor", "{folder}/none.json"], "quest calibrate"),
         (["--point", "7,3,3"], "0 to 6"),
         (["--point", "0,here"], "FRAME,X,Y"),
         (["--jsonl", "{folder}"], "cannot be written"),

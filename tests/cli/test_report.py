@@ -15,13 +15,10 @@ from quest.cli.main import main, parse
 from quest.cli.report import drift_of, measure_drift
 from quest.cli.track import Track
 from quest.data.store import TakeStore
-from quest.model.weights import save_network
 from quest.tracks import read_tracks
 from quest.types import Take, Tracks
 from quest.viz.report import RunRecord, read_run
 from tests.synthetic import make_take
-from tests.tiny import make_finder
-from tests.track.clips import EAGER
 from tests.viz.test_report import make_record, make_run, make_tracks
 
 pytest.importorskip("jinja2")
@@ -53,11 +50,10 @@ def of_recording(given: str) -> RunRecord:
 
 
 @pytest.mark.slow
-def test_track_then_report(take: Take, store: Path, tmp_path: Path, capsys):
-    weights, out = tmp_path / "tiny.safetensors", tmp_path / "a run"
-    save_network(weights, make_finder(), settings=EAGER.to_json(), about="a test")
+def test_track_then_report(take: Take, store: Path, weights: str, tmp_path: Path, capsys):
+    out = tmp_path / "a run"
     x, y = take.views[1].uv_px[0, 1].tolist()
-    words = [f"{store}/panels.zarr", "--view", "1", "--weights", str(weights), "--point", f"0,{x:.1f},{y:.1f},it's"]
+    words = [f"{store}/panels.zarr", "--view", "1", "--weights", weights, "--point", f"0,{x:.1f},{y:.1f},it's"]
     words += ["--out", str(out), "--no-overlay"]
     assert main(["track", *words]) == 0
     run = read_run(out)

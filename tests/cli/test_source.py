@@ -26,12 +26,10 @@ from quest.data.recording import write_recording
 from quest.data.store import TakeStore
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError
-from quest.model.weights import save_network
-from quest.track import Stream, TrackerConfig
+from quest.track import Stream
 from quest.tracks import read_tracks
 from quest.types import Clip
 from tests.synthetic import make_take
-from tests.tiny import make_finder
 
 FRAMES = 6
 
@@ -50,14 +48,6 @@ def sources(clip: Clip, tmp_path_factory: pytest.TempPathFactory) -> dict[str, s
     export_mcap(clip, root / "clip.mcap", rgb="raw")
     export_lerobot([Episode({"front": clip}, "look"), Episode({"front": clip}, "look again")], root / "lerobot")
     return {name: str(root / name) for name in ("folder", "clip.mcap", "lerobot")}
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    path = tmp_path_factory.mktemp("weights") / "plain.safetensors"
-    eager = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64).to_json()
-    save_network(path, make_finder(), settings=eager, about="a test")
-    return str(path)
 
 
 def track(source: str, weights: str, out: Path, *arguments: str) -> np.ndarray:
@@ -106,8 +96,13 @@ def test_monitor_reads_videos_of_unknown_length_frame_by_frame(
     write_video(tmp_path / "rgb.mkv", clip.rgb, frames_per_s=30)
     write_camera(CameraFile(clip.camera), tmp_path / "camera.json")
     monkeypatch.setattr(FrameSource, "clip", lambda source: pytest.fail("the whole clip was read"))
-    assert main(["monitor", str(tmp_path), "--weights", weights, "--point", "0,20,30"]) == 0
+    command = ["monitor", str(tmp_path), "--weights", weights, "--point", "0,20,30"]
+    assert main(command) == 0
     assert f": {FRAMES} frames in" in capsys.readouterr().out
+    assert main([*command, "--point", "99,5,5,far"]) == 2
+    error = " ".join(capsys.readouterr().err.split())
+    assert "far (from frame 99 on): expected a frame of" in error
+    assert f"ended at frame {FRAMES - 1}" in error
 
 
 def test_monitor_stops_where_the_recording_is_torn(
@@ -135,18 +130,6 @@ def test_points_beyond_the_end(sources: dict[str, str]):
     source = Source(sources["clip.mcap"], point=(f"{FRAMES},1,1",))
     with pytest.raises(ValueError, match=f"0 to {FRAMES - 1}, got {FRAMES}"):
         source.queries(source.open())
-
-
-def test_monitor_refuses_points_after_the_end_of_a_video_of_unknown_length(
-    clip: Clip, weights: str, tmp_path: Path, capsys
-):
-    write_video(tmp_path / "rgb.mkv", clip.rgb, frames_per_s=30)
-    write_camera(CameraFile(clip.camera), tmp_path / "camera.json")
-    points = ["--point", "0,20,30", "--point", "99,5,5,far"]
-    assert main(["monitor", str(tmp_path), "--weights", weights, *points]) == 2
-    error = capsys.readouterr().err
-    assert "far (from frame 99 on): expected a frame of" in error
-    assert f"ended at frame {FRAMES - 1}" in " ".join(error.split())
 
 
 def test_names_are_utf8(sources: dict[str, str]):

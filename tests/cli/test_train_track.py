@@ -11,13 +11,14 @@ from safetensors.torch import save_file
 
 from quest.cli.main import main
 from quest.cli.train import NetworkChanges
+from quest.data.recording import write_recording
 from quest.data.store import TakeStore
-from quest.model.weights import load_network, save_network
+from quest.model.weights import load_network
 from quest.paper.network import read_paper
 from quest.tracks import read_tracks
 from tests.paper.tiny import PAPER, make_paper
 from tests.synthetic import make_take
-from tests.tiny import FINDER, make_finder
+from tests.tiny import FINDER
 from tests.track.clips import EAGER
 
 pytest.importorskip("lightning_fabric")
@@ -45,14 +46,6 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def encoder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("encoder") / "encoder.safetensors"
     save_file(make_paper().encoder.state_dict(), path)
-    return path
-
-
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Untrained weights whose tracker takes whatever is found."""
-    path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
-    save_network(path, make_finder(), settings=EAGER.to_json(), about="a test")
     return path
 
 
@@ -86,9 +79,9 @@ def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path,
 
 
 @pytest.mark.slow
-def test_train_the_finder_track_evaluate(store: Path, weights: Path, tmp_path: Path, capsys):
+def test_train_the_finder_track_evaluate(store: Path, weights: str, tmp_path: Path, capsys):
     out = tmp_path / "run"
-    train = ["train", "--data", str(store), "--out", str(out), "--weights", str(weights), *FIND_STAGE, *QUICK]
+    train = ["train", "--data", str(store), "--out", str(out), "--weights", weights, *FIND_STAGE, *QUICK]
     assert main(train) == 0
     assert "step 2" in capsys.readouterr().err
     loaded = load_network(out / "weights.safetensors")
@@ -117,9 +110,32 @@ def test_train_the_finder_track_evaluate(store: Path, weights: Path, tmp_path: P
     assert json.loads(result.read_text())
 
 
+@pytest.mark.slow
+def test_views_of_a_take_and_another_recording(tmp_path: Path, weights: str, capsys):
+    take = make_take(frames=6, views=3, entities=1, size=(96, 96), seed=3)
+    store = TakeStore(tmp_path / "takes")
+    store.write(take)
+    write_recording(take.views[2].clip, tmp_path / "third", rgb="png")
+    x, y = take.views[0].uv_px[0, 0]
+    first, out = str(tmp_path / "takes" / f"{take.info.name}.zarr"), tmp_path / "out"
+    common = ["--weights", weights, "--device", "cpu", "--point", f"0,{x},{y},left"]
+    others = ["--also", "1", "--also", str(tmp_path / "third")]
+    assert main(["track", first, *others, *common, "--out", str(out), "--urdf", str(out / "joints.urdf")]) == 0
+    written = {path.name for path in out.iterdir()}
+    assert {"overlay.mp4", "overlay-1.mp4", "overlay-2.mp4", "joints.json", "joints.urdf"} <= written
+    tracks = read_tracks(out / "tracks.parquet")
+    assert tracks.names == ("left",)
+    assert np.linalg.norm(tracks.point_world[:2] - take.point_world[:2], axis=-1).max() < 0.01  # it rests at first
+    assert "overlay-2.mp4" in capsys.readouterr().out
+
+    recording = ["track", str(tmp_path / "third"), "--also", "1", *common, "--out", str(tmp_path / "none")]
+    assert main(recording) == 2
+    assert "a number is a view of a take" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("how", [[], ["--online"]], ids=["first frame", "online"])
-def test_discovery_without_a_video(store: Path, weights: Path, how: list[str], tmp_path: Path, capsys):
-    take, chosen = str(store / "panels-3.zarr") + "/", ["--weights", str(weights), "--no-overlay", "--view", "1"]
+def test_discovery_without_a_video(store: Path, weights: str, how: list[str], tmp_path: Path, capsys):
+    take, chosen = str(store / "panels-3.zarr") + "/", ["--weights", weights, "--no-overlay", "--view", "1"]
     assert main(["track", take, *chosen, "--out", str(tmp_path), *how]) == 0
     assert len(read_tracks(tmp_path / "tracks.parquet").names) >= 1
     assert not (tmp_path / "overlay.mp4").exists()
@@ -144,10 +160,10 @@ def test_discovery_without_a_video(store: Path, weights: Path, how: list[str], t
         (["--out", "/proc"], "not be written to"),
     ],
 )
-def test_track_with_bad_arguments(store: Path, weights: Path, tmp_path: Path, capsys, arguments: list[str], named: str):
+def test_track_with_bad_arguments(store: Path, weights: str, tmp_path: Path, capsys, arguments: list[str], named: str):
     if "/proc" in arguments and not Path("/proc/self").exists():
         pytest.skip("this system has no folder that nobody can write to")
-    chosen = [] if "--weights" in arguments else ["--weights", str(weights)]
+    chosen = [] if "--weights" in arguments else ["--weights", weights]
     code = main(["track", str(store / "panels-3.zarr"), "--out", str(tmp_path), *chosen, *arguments])
     error = capsys.readouterr().err
     assert code == 2
@@ -157,8 +173,8 @@ def test_track_with_bad_arguments(store: Path, weights: Path, tmp_path: Path, ca
 
 
 @pytest.mark.parametrize("clip", ["none.zarr", "none", "none.mp4"])
-def test_track_what_is_not_there(weights: Path, tmp_path: Path, capsys, clip: str):
-    assert main(["track", str(tmp_path / clip), "--weights", str(weights), "--out", str(tmp_path / "out")]) == 2
+def test_track_what_is_not_there(weights: str, tmp_path: Path, capsys, clip: str):
+    assert main(["track", str(tmp_path / clip), "--weights", weights, "--out", str(tmp_path / "out")]) == 2
     error = capsys.readouterr().err
     assert one_line(error)
     assert clip in error
@@ -180,15 +196,11 @@ def test_train_with_a_missing_encoder(store: Path, tmp_path: Path, capsys, stage
     assert "import-encoder" in capsys.readouterr().err
 
 
-def test_train_on_an_empty_store(weights: Path, tmp_path: Path, capsys):
+def test_train_on_an_empty_store(weights: str, tmp_path: Path, capsys):
     (tmp_path / "takes").mkdir()
-    train = ["train", "--data", str(tmp_path / "takes"), "--out", str(tmp_path / "run"), "--weights", str(weights)]
+    train = ["train", "--data", str(tmp_path / "takes"), "--out", str(tmp_path / "run"), "--weights", weights]
     assert main(train) == 2
     assert "takes" in capsys.readouterr().err
-
-
-def test_weights_list(capsys):
-    assert main(["weights", "list"]) == 0
 
 
 @pytest.mark.parametrize("command", ["import-encoder", "import-detail"])

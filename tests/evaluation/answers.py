@@ -6,7 +6,21 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from quest.evaluation import EntityRecord, Subject
+from quest.evaluation import EntityRecord, Run, Subject
+from quest.evaluation.bootstrap import Value
+
+RUN = Run("quest eval", "abc", "def", None, None, 50, 0, "machine", {"python": "3"}, "2026-01-01T00:00:00", 1.0)
+
+
+def known(value: Value | None) -> Value:
+    """A value that is there."""
+    assert value is not None
+    return value
+
+
+def mean(value: Value | None) -> float:
+    """The middle of a value that is there."""
+    return known(value).mean
 
 
 def make_answer(

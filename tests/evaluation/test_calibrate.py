@@ -79,10 +79,6 @@ def test_what_is_stored_is_what_thresholds_were_made_with(fitted: Fitted):
     assert (again.maxima >= fitted.calibration.maxima).all()
 
 
-def test_same_streams_same_monitor(streams: list[StreamRecord], fitted: Fitted):
-    assert fit_calibration(streams).calibration.to_json() == fitted.calibration.to_json()
-
-
 def test_shorter_blocks(streams: list[StreamRecord], fitted: Fitted):
     found = fit_calibration(streams, block_frames=20).calibration
     assert found.block_frames == 20
@@ -90,13 +86,12 @@ def test_shorter_blocks(streams: list[StreamRecord], fitted: Fitted):
 
 
 def test_what_does_not_suffice(streams: list[StreamRecord]):
-    with pytest.raises(ConfigError, match="validation objects"):
-        fit_calibration([*streams, replace(streams[0], part="test")])
-    with pytest.raises(ConfigError, match="none"):
-        fit_calibration([])
-    with pytest.raises(ConfigError, match="got both"):
-        fit_calibration([*streams, replace(streams[0], inputs="colours")])
-    with pytest.raises(ConfigError, match="record more takes"):
-        fit_calibration(streams[:3])
-    with pytest.raises(ConfigError, match="record more takes"):
-        fit_calibration(make_streams(60, losses=0.0))
+    for records, match in (
+        ([*streams, replace(streams[0], part="test")], "validation objects"),
+        ([], "none"),
+        ([*streams, replace(streams[0], inputs="colours")], "got both"),
+        (streams[:3], "record more takes"),
+        (make_streams(60, losses=0.0), "record more takes"),
+    ):
+        with pytest.raises(ConfigError, match=match):
+            fit_calibration(records)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ from quest.errors import ConfigError, InputError, ObjectError, TakeError
 from quest.evaluation import evaluate, read_records, read_results
 from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.results import records_path
-from quest.evaluation.selection import Shard, select_takes
-from quest.types import Clip, Query, Take, TakeInfo, Tracks
+from quest.evaluation.selection import Shard, select_in, select_takes
+from quest.types import Clip, Query, Take, Tracks
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take
 from tests.tiny import make_finder
@@ -28,7 +29,7 @@ from tests.tiny import make_finder
 
 def _take(seed: int, *, level: int = 1) -> Take:
     take = make_take(frames=20, views=2, entities=2, size=(48, 48), seed=seed, name=f"panels-{seed}-{level}")
-    return dataclasses.replace(take, info=dataclasses.replace(take.info, level=level))
+    return replace(take, info=replace(take.info, level=level))
 
 
 @pytest.fixture(scope="module")
@@ -44,68 +45,65 @@ def test_split_is_disjoint_and_large_enough() -> None:
     split = object_split()
     named = [o for part in split.partnet_mobility.values() for o in part]
     assert len(named) == len(set(named))
-    assert len(split.partnet_mobility["validation"]) >= 8
-    assert len(split.partnet_mobility["test"]) >= 8
+    assert min(len(split.partnet_mobility[part]) for part in ("validation", "test")) >= 8
     ranges = sorted(split.procedural_seeds.values())
     assert all(a[1] < b[0] for a, b in itertools.pairwise(ranges))
 
 
-def test_split_of(store: TakeStore) -> None:
-    info = store.infos()["panels-7-1"]
-
-    def of(source: str, object_id: str) -> TakeInfo:
-        return dataclasses.replace(info, source=source, object_id=object_id)  # type: ignore[arg-type]
-
-    assert split_of(info) == "train"
-    assert split_of(of("procedural", "base-cabinet-100003")) == "validation"
-    assert split_of(of("procedural", "laptop-119999")) == "test"
-    assert split_of(of("partnet-mobility", "44817")) == "validation"
-    for bad in (of("procedural", "laptop"), of("procedural", "laptop-5000000"), of("partnet-mobility", "99999")):
+@pytest.mark.parametrize(
+    ("source", "object_id", "part"),
+    [
+        ("procedural", "panels-7", "train"),
+        ("procedural", "base-cabinet-100003", "validation"),
+        ("procedural", "laptop-119999", "test"),
+        ("partnet-mobility", "44817", "validation"),
+        *(("procedural", name, "unlisted") for name in ("laptop", "laptop-5000000")),
+        ("partnet-mobility", "99999", "unlisted"),
+    ],
+)
+def test_split_of(source: Literal["procedural", "partnet-mobility"], object_id: str, part: str) -> None:
+    info = replace(make_take(frames=1, views=1, size=(8, 8)).info, source=source, object_id=object_id)
+    assert part_of(info) == part
+    if part == "unlisted":
         with pytest.raises(ObjectError):
-            split_of(bad)
-        assert part_of(bad) == "unlisted"
-
-
-def test_training_objects_need_to_be_named(store: TakeStore) -> None:
-    infos = store.infos()
-    assert select_takes(infos, split=("validation", "test", "unlisted")) == {
-        "panels-100000-1": "validation",
-        "panels-100000-2": "validation",
-        "panels-100001-1": "validation",
-        "panels-999999-1": "unlisted",
-    }
-    assert select_takes(infos, split=("train",)) == {"panels-7-1": "train"}
-    with pytest.raises(ConfigError, match="--split train"):
-        select_takes(infos, split=("validation",), objects=("panels-7",))
+            split_of(info)
+    else:
+        assert split_of(info) == part
 
 
 def test_selection(store: TakeStore) -> None:
-    infos = store.infos()
-    assert list(select_takes(infos, split=("validation",), levels=(2,))) == ["panels-100000-2"]
-    assert list(select_takes(infos, split=("validation",), objects=("panels-100001",))) == ["panels-100001-1"]
-    same = select_takes(infos, split=("validation",), same_objects=True)
-    assert list(same) == ["panels-100000-1", "panels-100000-2"]
-    with pytest.raises(ConfigError, match="panels-5: not in the store"):
-        select_takes(infos, split=("validation",), objects=("panels-5",))
-    with pytest.raises(ConfigError, match="no takes"):
-        select_takes({}, split=("validation",))
+    infos, validation = store.infos(), ["panels-100000-1", "panels-100000-2", "panels-100001-1"]
+    parts = dict.fromkeys(validation, "validation") | {"panels-999999-1": "unlisted"}
+    assert select_takes(infos, split=("validation", "test", "unlisted")) == parts
+    assert select_takes(infos, split=("train",)) == {"panels-7-1": "train"}
+    assert list(select_takes(infos, split=("validation",), levels=(2,))) == validation[1:2]
+    assert list(select_takes(infos, split=("validation",), objects=("panels-100001",))) == validation[2:]
+    assert list(select_takes(infos, split=("validation",), same_objects=True)) == validation[:2]
+    for of, objects, match in (
+        (infos, ("panels-7",), "--split train"),
+        (infos, ("panels-5",), "not in"),
+        ({}, (), "no"),
+    ):
+        with pytest.raises(ConfigError, match=match):
+            select_takes(of, split=("validation",), objects=objects)
+    assert select_in([store], split=("train",)) == [(store, {"panels-7-1": "train"})]
+    with pytest.raises(ConfigError, match="twice"):
+        select_in([store, store], split=("train",))
 
 
-def test_evaluate_refuses_what_no_tracker_can(store: TakeStore) -> None:
-    with pytest.raises(ConfigError, match="has the protocol semantic"):
-        evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], protocols=("semantic",))
-    with pytest.raises(ConfigError, match="different names"):
-        evaluate(store, {"panels-100001-1": "validation"}, [HoldStill(), HoldStill()])
-
-
-def test_a_protocol_named_twice_is_one(store: TakeStore) -> None:
-    found = evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], protocols=("point", "point"))
-    assert len({(r.take, r.view, r.entity) for r in found.records}) == len(found.records) > 0
-
-
-def test_progress_counts_every_frame(store: TakeStore) -> None:
+def test_what_an_evaluation_is_asked_for(store: TakeStore) -> None:
+    one: Mapping[str, SplitPart] = {"panels-100001-1": "validation"}
+    for trackers, protocol, match in (
+        ([HoldStill()], "semantic", "has the protocol semantic"),
+        ([HoldStill(), HoldStill()], "point", "different names"),
+    ):
+        with pytest.raises(ConfigError, match=match):
+            evaluate(store, one, trackers, protocols=(protocol,))  # type: ignore[arg-type]
     seen: list[int] = []
-    evaluate(store, {"panels-100001-1": "validation"}, [HoldStill()], progress=lambda _, frames: seen.append(frames))
+    twice = evaluate(
+        store, one, [HoldStill()], protocols=("point",) * 2, progress=lambda _, frames: seen.append(frames)
+    )
+    assert len({(r.take, r.view, r.entity) for r in twice.records}) == len(twice.records) > 0
     assert sum(seen) == 2 * 20
 
 
@@ -143,17 +141,22 @@ def test_command_writes_what_it_prints(
     assert len(read_records(records_path(out))) == sum(row.tracks for row in results.rows if row.reading == "all")
 
 
-def test_command_reports_training_objects_as_such(store: TakeStore, capsys: pytest.CaptureFixture) -> None:
-    assert Eval(takes=str(store.root), trackers=("hold-still",), split=("train",), resamples=5).run() == 0
-    assert "TRAINING OBJECTS" in capsys.readouterr().out
-
-
-def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytest.CaptureFixture) -> None:
-    command = Eval(takes=str(store.root), trackers=("hold-still",), split=("validation",), resamples=5)
-    assert command.run() == 0
-    assert "--same-objects" in capsys.readouterr().out
-    assert dataclasses.replace(command, same_objects=True).run() == 0
-    assert "--same-objects" not in capsys.readouterr().out
+def test_command_says_what_to_mind(store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    torn = TakeStore(tmp_path)
+    torn.write(_take(100000))
+    (tmp_path / "torn.zarr").mkdir()
+    whole, validation = str(store.root), ("validation",)
+    plain = Eval(takes=whole, trackers=("hold-still",), resamples=5)
+    for changes, said, unsaid in (
+        ({"split": ("train",)}, "TRAINING OBJECTS", "--same-objects"),
+        ({"split": validation}, "--same-objects", "TRAINING OBJECTS"),
+        ({"split": validation, "same_objects": True}, "validation objects", "--same-objects"),
+        ({"takes": str(tmp_path)}, "corrupt takes of the store were omitted: torn", "TRAINING OBJECTS"),
+    ):
+        assert replace(plain, **changes).run() == 0
+        out = capsys.readouterr().out
+        assert said in out
+        assert unsaid not in out
 
 
 @pytest.mark.parametrize(
@@ -169,17 +172,9 @@ def test_command_says_when_levels_do_not_compare(store: TakeStore, capsys: pytes
     ],
 )
 def test_command_errors(store: TakeStore, changes: dict, error: type[Exception], match: str) -> None:
-    command = dataclasses.replace(Eval(takes=str(store.root), trackers=("hold-still",)), **changes)
+    command = replace(Eval(takes=str(store.root), trackers=("hold-still",)), **changes)
     with pytest.raises(error, match=match):
         command.run()
-
-
-def test_torn_takes_are_left_out_and_named(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    store = TakeStore(tmp_path)
-    store.write(_take(100000))
-    (tmp_path / "torn.zarr").mkdir()
-    assert Eval(takes=str(tmp_path), trackers=("hold-still",), resamples=5).run() == 0
-    assert "corrupt takes of the store were omitted: torn" in capsys.readouterr().out
 
 
 class _Counting(HoldStill):
@@ -229,8 +224,8 @@ def test_finished_takes_of_other_code_or_data_do_not_count(store: TakeStore, tmp
     assert FinishedTakes(tmp_path, made_by="a").read(name, store.data_hash(name)) is not None
     assert FinishedTakes(tmp_path, made_by="b").read(name, store.data_hash(name)) is None
     assert FinishedTakes(tmp_path, made_by="a").read(name, "other") is None
-    (tmp_path / f"{name}.parquet").write_bytes(b"PAR1")
-    with pytest.raises(InputError, match="Parquet"):
+    (tmp_path / f"{name}.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match="delete the file"):
         FinishedTakes(tmp_path, made_by="a").read(name, store.data_hash(name))
 
 
@@ -248,6 +243,6 @@ def test_shards_share_an_evaluation(store: TakeStore, tmp_path: Path, capsys: py
     assert read_results(tmp_path / "shared.json").rows == read_results(tmp_path / "alone.json").rows
     assert sorted(p.suffix for p in tmp_path.iterdir()) == [".json", ".json", ".parquet", ".parquet"]
     with pytest.raises(ConfigError, match="--out"):
-        dataclasses.replace(command("0/2", "x.json"), out=None).run()
+        replace(command("0/2", "x.json"), out=None).run()
     with pytest.raises(ConfigError, match="finished takes"):
         evaluate(store, VALIDATION, [HoldStill()], shard=Shard(0, 2))

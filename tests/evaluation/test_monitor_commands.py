@@ -11,7 +11,6 @@ import pytest
 
 from quest.cli.calibrate import Calibrate
 from quest.cli.evaluate_monitor import EvalMonitor
-from quest.cli.main import parse
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.evaluation import stream_record
@@ -156,26 +155,3 @@ def test_the_rivals_need_the_streams_of_the_calibration(folder: Path):
         left.unlink()
     with pytest.raises(InputError, match="expected the streams that the monitor was calibrated on"):
         judged(folder)
-
-
-def test_arguments():
-    command = parse(
-        [
-            "eval-monitor",
-            "--takes",
-            "a",
-            "b",
-            "--records",
-            "r",
-            "--calibration",
-            "c",
-            "--shard",
-            "0/2",
-            "--alpha",
-            "0.05",
-        ]
-    )
-    assert isinstance(command, EvalMonitor)
-    assert (command.takes, command.alpha) == (("a", "b"), (0.05,))
-    command = parse(["calibrate", "--takes", "a", "b", "--records", "r", "--inputs", "colours"])
-    assert command == Calibrate(("a", "b"), Path("r"), inputs=("colours",))

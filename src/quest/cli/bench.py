@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from quest.cli.evaluate import TrackerName, ended_run, rival_hashes, table_console, weights_hash
+from quest.cli.evaluate import Lineup, TrackerName, table_console
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,9 @@ class BenchTapvid:
             InputError: there is no video, or one cannot be used.
             WeightsError: the weights cannot be loaded.
         """
-        import hashlib
-
-        from quest.baselines import line_up
         from quest.cli.console import Console
         from quest.cli.progress import counting
-        from quest.data.provenance import code_hash, combined_hash, file_hash, package_versions
+        from quest.data.provenance import combined_hash, file_hash
         from quest.errors import ConfigError, InputError
         from quest.evaluation.real.run import KeptAnswers, write_set
         from quest.evaluation.real.table import FULL_WIDTH, real_table
@@ -71,23 +68,18 @@ class BenchTapvid:
         if not files:
             raise InputError(f"{self.data}: expected .npz files of TAP-Vid or TAPVid-3D (docs/metrics.md), found none")
         data_hash = combined_hash((name, file_hash(path) or "") for name, path in files.items())
-        trackers = list(line_up(self.trackers, weights=self.weights, rivals=self.rivals))
+        lineup = Lineup.of(self.trackers, self.weights, self.rivals)
         setting, kept = Setting(self.queries, self.scaling, not self.full_size, self.alone), None
         if self.out is not None:
-            hashes = weights_hash(trackers, self.weights), rival_hashes(trackers), data_hash
-            asked = self.queries, self.full_size, self.alone
-            made_by = repr([code_hash(), package_versions(), self.weights, *hashes, *asked])
-            kept = KeptAnswers(self.out.with_suffix(".parts"), made_by=hashlib.sha256(made_by.encode()).hexdigest())
+            made_by = lineup.digest(data_hash, self.queries, self.full_size, self.alone)
+            kept = KeptAnswers(self.out.with_suffix(".parts"), made_by=made_by)
+        bootstrap = {"resamples": self.resamples, "seed": self.seed}
         with counting(console, "tracking", len(files), "videos") as done:
-            rows, single = evaluate_videos(
-                files, trackers, setting, resamples=self.resamples, seed=self.seed, kept=kept, progress=done
-            )
+            rows, single = evaluate_videos(files, lineup.trackers, setting, **bootstrap, kept=kept, progress=done)
         name, output = self.data.resolve().name, table_console(FULL_WIDTH)
         output.print(real_table({name: rows}, width=output.width, shown=COLUMNS, legend=LEGEND))
         if self.out is not None and kept is not None:
-            run = ended_run(
-                trackers, self.weights, start_s, data_hash=data_hash, resamples=self.resamples, seed=self.seed
-            )
+            run = lineup.ended(start_s, data_hash=data_hash, **bootstrap)
             write_set(self.out, name, rows, single, run)
             kept.remove()
             console.print(f"wrote {self.out}")

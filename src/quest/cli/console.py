@@ -1,11 +1,14 @@
-"""The terminal, to which nothing that came with an input gives orders."""
+"""The terminal, to which nothing that came with an input gives orders, and the words of a command for it."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, get_type_hints
 
 import rich.console
+import tyro
 from rich.segment import Segment
 
 _UNSHOWN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
@@ -26,3 +29,24 @@ class Console(rich.console.Console):
 def shown(text: str) -> str:
     """A text as it may be shown: control characters, which could command the terminal, are written out."""
     return _UNSHOWN.sub(lambda found: f"\\x{ord(found[0]):02x}", text)
+
+
+def words_of(settings: Any) -> Iterator[str]:
+    """The arguments that give a command's dataclass again: what has no default, and what is not as usual."""
+    hints = get_type_hints(type(settings), include_extras=True)
+    for field in fields(settings):
+        about = getattr(hints[field.name], "__metadata__", ())
+        named = [each.name for each in about if getattr(each, "name", None)]
+        value, flag = getattr(settings, field.name), "--" + (*named, field.name)[0].replace("_", "-")
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if tyro.conf.Positional in about:
+            yield str(value)
+        elif is_dataclass(value):
+            yield from words_of(value)
+        elif isinstance(value, bool):
+            yield from [] if value == default else [flag if value else flag.replace("--", "--no-", 1)]
+        elif value != default and isinstance(value, tuple) and tyro.conf.UseAppendAction not in about:
+            yield from [flag, *map(str, value)]
+        elif value != default:
+            for each in map(str, value if isinstance(value, tuple) else (value,)):
+                yield from [f"{flag}={each}"] if each.startswith("-") else [flag, each]

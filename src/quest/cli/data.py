@@ -332,14 +332,14 @@ class DataShow:
         every = self.every or -(-store.header(name).frames // MOST_FRAMES_SHOWN)
         take = store.read(name, frames=slice(None, None, every))
         if self.rrd is not None or self.rerun:
-            from quest.viz.rerun_log import open_viewer, save_rrd
+            from quest.viz.rerun_log import save_rrd
 
             if self.rrd is not None:
                 save_rrd(take, self.rrd, every=every)
                 megabytes = self.rrd.stat().st_size / 1e6
                 print(f"{self.rrd}: {megabytes:.1f} MB, take {name}; open it with: rerun {self.rrd}")
             if self.rerun:
-                open_viewer(take, every=every)
+                save_rrd(take, None, every=every)
         if self.out is not None or not (self.rrd or self.rerun):
             from quest.viz.contact_sheet import contact_sheet
 

@@ -7,7 +7,6 @@ import json
 import os
 import platform
 import shutil
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -181,14 +180,11 @@ def _test_render() -> Iterator[Finding]:
     start_s = time.monotonic()
     try:
         from quest.sim.generate import TakeSettings, generate_take
-        from quest.sim.objects import load_object
         from quest.sim.procedural import CATEGORIES, make_object
         from quest.sim.renderer import Renderer
 
-        with tempfile.TemporaryDirectory() as folder:
-            sim_object = load_object(make_object(CATEGORIES[0], 0, Path(folder) / "object"))
-            settings = TakeSettings(views=1, size=64, every=8)
-            take = generate_take(sim_object, 1, 0, renderer=Renderer(), settings=settings)
+        settings = TakeSettings(views=1, size=64, every=8)
+        take = generate_take(make_object(CATEGORIES[0], 0), 1, 0, renderer=Renderer(), settings=settings)
     except QuestError as error:
         yield Finding("render test", "optional", str(error))
         return

@@ -11,21 +11,16 @@ import tyro
 from tyro.extras import literal_type_from_choices
 
 from quest.baselines import TRACKERS
+from quest.cli.console import Console
+from quest.cli.progress import advancing
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from rich.progress import Progress
+    from collections.abc import Sequence
 
     from quest.baselines import ClipTracker
-    from quest.cli.console import Console
-    from quest.data.split import SplitPart
-    from quest.data.store import TakeStore
-    from quest.evaluation.finished import FinishedTakes
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
-    from quest.evaluation.selection import Shard
 
 if TYPE_CHECKING:
     TrackerName = str
@@ -104,9 +99,6 @@ class Eval:
         return self._run_takes(self.takes) if self.takes is not None else self._run_real()
 
     def _run_real(self) -> int:
-        import hashlib
-
-        from quest.data.provenance import code_hash, package_versions
         from quest.errors import ConfigError
         from quest.evaluation.real.run import KeptAnswers, RealRow, evaluate_set, write_set
         from quest.evaluation.real.sets import open_set
@@ -121,33 +113,19 @@ class Eval:
         names = [real.name for real in sets]
         if len(set(names)) < len(names):
             raise ConfigError(f"eval: expected sets of different names, got {', '.join(names)}; rename a folder")
-        trackers = self._load_trackers(self.trackers or _OF_REAL)
-        console, found = _stderr(), dict[str, list[RealRow]]()
-        with _bar(console) as progress:
-            task = progress.add_task("", total=sum(len(real.clips) + len(real.pictures) for real in sets))
-
-            def advance(doing: str, done: int) -> None:
-                progress.update(task, description=doing, advance=done)
-
+        lineup = Lineup.of(self.trackers or _OF_REAL, self.weights, self.rivals)
+        console, found = Console(stderr=True), dict[str, list[RealRow]]()
+        with advancing(console, sum(len(real.clips) + len(real.pictures) for real in sets)) as advance:
             for real in sets:
                 start_s, data_hash, kept = time.monotonic(), real.data_hash(), None
                 if self.out is not None:
-                    answers = [
-                        code_hash(),
-                        package_versions(),
-                        self.weights,
-                        weights_hash(trackers, self.weights),
-                        rival_hashes(trackers),
-                        data_hash,
-                    ]
-                    made_by = hashlib.sha256(repr([*answers, self.seed]).encode()).hexdigest()
+                    made_by = lineup.digest(data_hash, self.seed)
                     kept = KeptAnswers(self.out / f"{real.name}.parts", made_by=made_by)
-                rows, single = evaluate_set(
-                    real, trackers, resamples=self.resamples, seed=self.seed, kept=kept, progress=advance
-                )
+                bootstrap = {"resamples": self.resamples, "seed": self.seed}
+                rows, single = evaluate_set(real, lineup.trackers, **bootstrap, kept=kept, progress=advance)
                 found[real.name] = rows
                 if self.out is not None and kept is not None:
-                    run = self._run(trackers, data_hash, start_s)
+                    run = lineup.ended(start_s, data_hash=data_hash, **bootstrap)
                     write_set(self.out / f"{real.name}.json", real.name, rows, single, run)
                     kept.remove()
         output = table_console(FULL_WIDTH)
@@ -158,10 +136,11 @@ class Eval:
 
     def _run_takes(self, takes: str) -> int:
         from quest.cli.takes import open_store
-        from quest.data.provenance import combined_hash
         from quest.errors import ConfigError
+        from quest.evaluation.finished import FinishedTakes
         from quest.evaluation.results import write_results
-        from quest.evaluation.selection import Shard, select_takes
+        from quest.evaluation.runner import evaluate, has_protocol
+        from quest.evaluation.selection import Shard, hash_of, select_takes
         from quest.evaluation.tables import FULL_WIDTH, results_table
 
         if self.out is not None and self.out.suffix != ".json":
@@ -175,78 +154,36 @@ class Eval:
         chosen = select_takes(
             store.infos(), split=self.split, levels=self.level, objects=self.objects, same_objects=self.same_objects
         )
-        names = list(self.trackers or ("quest", "lk", "hold-still"))
-        names += ["hold-still"] * ("point" in self.protocol)
-        trackers = self._load_trackers(names)
-        console = _stderr()
-        finished = self._finished(trackers)
-        found = self._evaluate(store, chosen, trackers, finished, shard, console)
-        if found.missing:
-            console.print(f"left to other shards: {counted(found.missing, 'take')}; nothing is reported yet")
-            return 0
-        data_hash = combined_hash((name, store.data_hash(name)) for name in chosen)
-        results = self._results(found, broken, self._run(trackers, data_hash, start_s))
-        output = table_console(FULL_WIDTH)
-        output.print(results_table(results, width=output.width))
+        names = [*(self.trackers or ("quest", "lk", "hold-still")), *["hold-still"] * ("point" in self.protocol)]
+        lineup, finished = Lineup.of(names, self.weights, self.rivals), None
         if self.out is not None:
-            write_results(results, self.out, records=found.records)
-            console.print(f"wrote {self.out}", highlight=False)
-        if finished is not None:
-            finished.remove()
-        return 0
-
-    def _finished(self, trackers: list[ClipTracker]) -> FinishedTakes | None:
-        """Where takes are kept while the evaluation runs; nowhere without --out."""
-        import hashlib
-
-        from quest.data.provenance import code_hash, package_versions
-        from quest.evaluation.finished import FinishedTakes
-
-        if self.out is None:
-            return None
-        answers = [code_hash(), package_versions(), self.protocol, [t.name for t in trackers], self.seed]
-        answers.append(rival_hashes(trackers))
-        digest = hashlib.sha256(repr([*answers, self.weights, weights_hash(trackers, self.weights)]).encode())
-        return FinishedTakes(self.out.with_suffix(".parts"), made_by=digest.hexdigest())
-
-    def _load_trackers(self, names: Sequence[str]) -> list[ClipTracker]:
-        from quest.baselines import line_up
-
-        return list(line_up(names, weights=self.weights, rivals=self.rivals))
-
-    def _evaluate(
-        self,
-        store: TakeStore,
-        chosen: Mapping[str, SplitPart],
-        trackers: list[ClipTracker],
-        finished: FinishedTakes | None,
-        shard: Shard,
-        console: Console,
-    ) -> Evaluated:
-        from quest.evaluation.runner import evaluate, has_protocol
-
-        runs = sum(has_protocol(t, p) for t in trackers for p in self.protocol)
-        headers = store.headers()
+            made_by = lineup.digest(self.protocol, [t.name for t in lineup.trackers], self.seed)
+            finished = FinishedTakes(self.out.with_suffix(".parts"), made_by=made_by)
+        console, headers = Console(stderr=True), store.headers()
         own = [headers[name] for i, name in enumerate(chosen) if i in shard]
-        frames = sum(header.frames * len(header.cameras) for header in own) * runs
-        with _bar(console) as progress:
-            task = progress.add_task("frames", total=frames)
-
-            def advance(doing: str, done: int) -> None:
-                progress.update(task, description=doing, advance=done)
-
-            return evaluate(
+        runs = sum(has_protocol(t, p) for t in lineup.trackers for p in self.protocol)
+        with advancing(console, sum(header.frames * len(header.cameras) for header in own) * runs) as advance:
+            found = evaluate(
                 store,
                 chosen,
-                trackers,
+                lineup.trackers,
                 protocols=self.protocol,
                 finished=finished,
                 shard=shard,
                 progress=advance,
             )
-
-    def _run(self, trackers: Sequence[ClipTracker], data_hash: str, start_s: float) -> Run:
-        return ended_run(trackers, self.weights, start_s, data_hash=data_hash, resamples=self.resamples, seed=self.seed)
+        if found.missing:
+            console.print(f"left to other shards: {counted(found.missing, 'take')}; nothing is reported yet")
+            return 0
+        bootstrap = {"resamples": self.resamples, "seed": self.seed}
+        run = lineup.ended(start_s, data_hash=hash_of([(store, chosen)]), **bootstrap)
+        results, output = self._results(found, broken, run), table_console(FULL_WIDTH)
+        output.print(results_table(results, width=output.width))
+        if self.out is not None and finished is not None:
+            write_results(results, self.out, records=found.records)
+            console.print(f"wrote {self.out}", highlight=False)
+            finished.remove()
+        return 0
 
     def _results(self, found: Evaluated, broken: list[str], run: Run) -> Results:
         from quest.evaluation.results import Results
@@ -265,58 +202,52 @@ class Eval:
         return Results(run, rows, found.discoveries, found.unscored, tuple(notes))
 
 
-def weights_hash(trackers: Sequence[ClipTracker], weights: str) -> str | None:
-    """Hash of the weights that trackers were made of, where it is known."""
-    from quest.data.provenance import file_hash
+@dataclass(frozen=True)
+class Lineup:
+    """Trackers that are compared, and what their answers depend on."""
 
-    return next((h for t in trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(weights)
+    trackers: list[ClipTracker]
+    """By the names that were given, each once."""
+    weights: str
+    """Of those that need some."""
 
+    @classmethod
+    def of(cls, names: Sequence[str], weights: str, rivals: Path | None) -> Lineup:
+        """Load trackers by their names."""
+        from quest.baselines import line_up
 
-def rival_hashes(trackers: Sequence[ClipTracker]) -> list[str]:
-    """Hashes of the official weights of rivals."""
-    return [h for t in trackers if (h := getattr(t, "rival_hash", None))]
+        return cls(list(line_up(names, weights=weights, rivals=rivals)), weights)
 
+    @property
+    def weights_hash(self) -> str | None:
+        """Hash of the weights that trackers were made of, where it is known."""
+        from quest.data.provenance import file_hash
 
-def ended_run(
-    trackers: Sequence[ClipTracker], weights: str, start_s: float, *, data_hash: str, resamples: int, seed: int
-) -> Run:
-    """The run of this process, which began at a reading of the monotonic clock and ends now."""
-    from quest.evaluation.results import Run
+        return next((h for t in self.trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(
+            self.weights
+        )
 
-    of_weights = any(TRACKERS[tracker.name].of_weights for tracker in trackers)
-    return Run.ended(
-        start_s,
-        data_hash=data_hash,
-        weights=weights if of_weights else None,
-        weights_hash=weights_hash(trackers, weights) if of_weights else None,
-        resamples=resamples,
-        seed=seed,
-    )
+    def digest(self, *asked: object) -> str:
+        """What tells apart answers of other code, packages, weights, or to other questions."""
+        import hashlib
 
+        from quest.data.provenance import code_hash, package_versions
 
-def _stderr() -> Console:
-    from quest.cli.console import Console
+        rivals = [h for t in self.trackers if (h := getattr(t, "rival_hash", None))]
+        made_by = [code_hash(), package_versions(), self.weights, self.weights_hash, rivals, *asked]
+        return hashlib.sha256(repr(made_by).encode()).hexdigest()
 
-    return Console(stderr=True)
+    def ended(self, start_s: float, *, data_hash: str, resamples: int, seed: int) -> Run:
+        """The run of this process, which began at a reading of the monotonic clock and ends now."""
+        from quest.evaluation.results import Run
+
+        of_weights = any(TRACKERS[tracker.name].of_weights for tracker in self.trackers)
+        weights, own_hash = (self.weights, self.weights_hash) if of_weights else (None, None)
+        bootstrap = {"resamples": resamples, "seed": seed}
+        return Run.ended(start_s, data_hash=data_hash, weights=weights, weights_hash=own_hash, **bootstrap)
 
 
 def table_console(full_width: int) -> Console:
     """The terminal; a file or pipe has no width of its own and gets every column."""
-    from quest.cli.console import Console
-
     output = Console()
     return output if output.is_terminal else Console(width=full_width)
-
-
-def _bar(console: Console) -> Progress:
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    return Progress(TextColumn("{task.description}"), *columns, console=console, transient=True)

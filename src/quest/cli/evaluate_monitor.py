@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from quest.wording import counted
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from quest.data.split import SplitPart
-    from quest.data.store import TakeStore
     from quest.evaluation.detectors import Detector
-    from quest.evaluation.results import Run
     from quest.evaluation.stream_record import StreamRecord
     from quest.monitor import Calibration
-    from quest.track import Tracker
 
 
 @dataclass(frozen=True)
@@ -73,7 +68,8 @@ class EvalMonitor:
         from quest.cli.takes import open_store, say_corrupt
         from quest.errors import ConfigError
         from quest.evaluation.drift_report import TABLE_WIDTH, drift_rows, drift_table, write_drift
-        from quest.evaluation.selection import Shard, select_takes
+        from quest.evaluation.results import Run
+        from quest.evaluation.selection import Shard, hash_of, select_takes
         from quest.evaluation.stream_record import by_unit, read_records, record_streams, tracker_id
         from quest.monitor import Budget
         from quest.track import load
@@ -117,10 +113,13 @@ class EvalMonitor:
         if both:
             raise ConfigError(f"{', '.join(sorted(both)[:3])}: the monitor was calibrated on them; use others")
         detectors = self._detectors(calibration, known)
-        rows = drift_rows(detectors, streams, budgets=budgets, resamples=self.resamples, seed=self.seed)
+        bootstrap: dict[str, Any] = {"resamples": self.resamples, "seed": self.seed}
+        rows = drift_rows(detectors, streams, budgets=budgets, **bootstrap)
         Console(width=TABLE_WIDTH).print(drift_table(rows))
         if self.out is not None:
-            write_drift(rows, self._run(tracker, takes, start_s), calibration.about, self.out)
+            made_of = {"weights": self.weights, "weights_hash": tracker.weights_hash}
+            run = Run.ended(start_s, data_hash=hash_of(takes), **made_of, **bootstrap)
+            write_drift(rows, run, calibration.about, self.out)
             console.print(f"wrote {self.out}")
         return 0
 
@@ -136,22 +135,3 @@ class EvalMonitor:
                 f"of which give thresholds, got {len(others[0].maxima)}; keep others in another folder"
             )
         return our_monitor(calibration), *others
-
-    def _run(self, tracker: Tracker, takes: list[tuple[TakeStore, dict[str, SplitPart]]], start_s: float) -> Run:
-        from quest.data.provenance import code_commit, combined_hash, command_line, machine, package_versions
-        from quest.evaluation.results import Run
-
-        hashes = [(name, store.data_hash(name)) for store, chosen in takes for name in chosen]
-        return Run(
-            command=command_line(),
-            commit=code_commit(),
-            data_hash=combined_hash(hashes),
-            weights=self.weights,
-            weights_hash=tracker.weights_hash,
-            resamples=self.resamples,
-            seed=self.seed,
-            machine=machine(),
-            versions=package_versions(),
-            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
-            seconds=round(time.monotonic() - start_s, 1),
-        )

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import tyro
 from rich.markup import escape
 
-from quest.cli.console import Console
+from quest.cli.console import Console, words_of
 from quest.cli.progress import Report, counting
 from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CAMERA_MOTIONS, MIXED
@@ -153,16 +153,7 @@ class Generate:
 
     def command_line(self) -> str:
         """The command that makes these takes again, whichever way this one was called."""
-        words = ["quest", "generate"]
-        for field in dataclasses.fields(self):
-            value, flag = getattr(self, field.name), "--" + field.name.replace("_", "-")
-            if value == field.default:
-                continue
-            if isinstance(value, bool):
-                words.append(flag if value else flag.replace("--", "--no-", 1))
-            else:
-                words += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
-        return shlex.join(words)
+        return shlex.join(["quest", "generate", *words_of(self)])
 
     def _suites(self) -> tuple[Suite, ...]:
         """The suites that the arguments name, with the changes of the arguments; none for ordinary takes."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -96,10 +95,10 @@ class ObjectsShow:
                 f"objects show: expected --count >= 1 and --columns >= 0, got {self.count} and {self.columns}"
             )
         check_picture("objects show", self.out)
-        with ObjectShelf(self.objects_root) as shelf:
-            things = [thing for name in self.objects for thing in self._named(name, shelf)]
-            renderer = Renderer()
-            cards = [Card(t, portray(t, renderer, sides=self.sides, size_px=self.size)) for t in things]
+        shelf = ObjectShelf(self.objects_root)
+        things = [thing for name in self.objects for thing in self._named(name, shelf)]
+        renderer = Renderer()
+        cards = [Card(t, portray(t, renderer, sides=self.sides, size_px=self.size)) for t in things]
         columns = self.columns or max(1, round((len(cards) / (2 * self.sides) * 1.6) ** 0.5))
         sheet = object_sheet(cards, columns=columns)
         write_picture(sheet, self.out)
@@ -136,9 +135,6 @@ def _every_folder(root: Path | None) -> Iterator[SimObject | ObjectError]:
 
 
 def _every_category() -> Iterator[SimObject]:
-    from quest.sim.objects import load_object
     from quest.sim.procedural import CATEGORIES, make_object
 
-    with tempfile.TemporaryDirectory(prefix="quest-objects-") as folder:
-        for category in CATEGORIES:
-            yield load_object(make_object(category, 0, Path(folder) / f"{category}-0"))
+    return (make_object(category, 0) for category in CATEGORIES)

@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Protocol, runtime_checkable
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from quest.cli.console import Console
 
@@ -20,6 +27,20 @@ class Report(Protocol):
 
     def __call__(self, done: int, total: int | None = None, /) -> None:
         """Show it."""
+
+
+def bars(console: Console, *, transient: bool = False, disable: bool = False) -> Progress:
+    """Bars with what is being done, how much of it is, and the time."""
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    return Progress(TextColumn("{task.description}"), *columns, console=console, transient=transient, disable=disable)
+
+
+@contextmanager
+def advancing(console: Console, total: int) -> Iterator[Callable[[str, int], None]]:
+    """A bar that is told what is being done, and how many are done since it was told before."""
+    with bars(console, transient=True) as progress:
+        task = progress.add_task("", total=total)
+        yield lambda doing, done: progress.update(task, description=doing, advance=done)
 
 
 @contextmanager

@@ -6,21 +6,21 @@ import re
 import shlex
 import tempfile
 import time
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_type_hints
+from typing import TYPE_CHECKING
 
 import tyro
 from rich.markup import escape
 from rich.table import Table
 
-from quest.cli.console import Console
+from quest.cli.console import Console, words_of
 from quest.cli.progress import counting
 from quest.cli.source import Source
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
 
     from quest.track import Tracker
     from quest.types import Clip, Query, Tracks
@@ -50,14 +50,13 @@ class Track(Source):
         self.check_alpha()
         console = Console(highlight=False, soft_wrap=True)
         console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
-        from quest.cli.several_views import read_others, write_overlays
         from quest.viz.narrate import narrate
-        from quest.viz.rerun_tracks import check_viewer, open_tracks, save_tracks
+        from quest.viz.rerun_log import check_viewer, save_tracks
 
         if self.rrd is not None or self.rerun:
             check_viewer(on_screen=self.rerun)
         clip = self.read(console)
-        others = read_others(self, self.also, console)
+        others = self._read_others(console)
         queries = self.queries(clip)
         console.print(f"loading weights {escape(self.weights)}")
         tracker = self.tracker()
@@ -81,17 +80,44 @@ class Track(Source):
         if tracks.joints is not None:
             console.print(f"joints: {escape(str(out / 'joints.json'))}")
         if self.overlay:
-            with console.status("drawing"):
-                videos = list(write_overlays(drawn, out))
-            console.print("\n".join(f"video:  {escape(str(path))}" for path in videos))
+            self._write_overlays(drawn, out, console)
         if self.urdf is not None:
             self._write_urdf(tracks, self.urdf, console)
         if self.rrd is not None:
             save_tracks(clip, tracks, self.rrd)
             console.print(f"rerun:  {escape(str(self.rrd))}; open it with: rerun {escape(str(self.rrd))}")
         if self.rerun:
-            open_tracks(clip, tracks)
+            save_tracks(clip, tracks, None)
         return 0
+
+    def _read_others(self, console: Console) -> list[Clip]:
+        """The clips of ``--also``."""
+        from quest.data.recording import open_recording
+        from quest.errors import InputError
+
+        clips = []
+        for one in self.also:
+            of_take = one.isdigit()
+            if of_take and not self.clip.rstrip("/\\").endswith(".zarr"):
+                raise InputError(
+                    f"--also {one}: a number is a view of a take, and {self.clip} is none; give the path of a recording"
+                )
+            parts = replace(self.parts, view=int(one)) if of_take else None
+            other = open_recording(self.clip if of_take else one, parts=parts)
+            with counting(console, "reading", other.length) as report:
+                clips.append(other.clip(report=report))
+            self.say_flags(other, Console(stderr=True, highlight=False, soft_wrap=True))
+        return clips
+
+    def _write_overlays(self, drawn: list[tuple[Clip, Tracks]], out: Path, console: Console) -> None:
+        """One video for each view: ``overlay.mp4`` of the first, ``overlay-1.mp4`` of the next, and so on."""
+        from quest.viz.overlay import write_overlay
+
+        videos = [out / (f"overlay-{v}.mp4" if v else "overlay.mp4") for v in range(len(drawn))]
+        with console.status("drawing"):
+            for (clip, tracks), path in zip(drawn, videos, strict=True):
+                write_overlay(clip, tracks, path)
+        console.print("\n".join(f"video:  {escape(str(path))}" for path in videos))
 
     def _track(
         self, tracker: Tracker, clips: list[Clip], queries: list[Query] | None, report: Callable[[int], object]
@@ -118,7 +144,7 @@ class Track(Source):
     @property
     def command(self) -> str:
         """The command that does the same again, in a shell's words."""
-        return shlex.join(["quest", "track", *_words(self)])
+        return shlex.join(["quest", "track", *words_of(self)])
 
     def _record(self, out: Path, clip: Clip, queries: list[Query] | None, tracker: Tracker, took_s: float) -> None:
         """Write how the run was made, for `quest report` and for whoever finds the folder."""
@@ -166,28 +192,10 @@ class Track(Source):
         return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
 
 
-def _words(settings: Any) -> Iterator[str]:
-    """The arguments that give a command's dataclass again: what has no default as it is, then what is not as usual."""
-    hints = get_type_hints(type(settings), include_extras=True)
-    for field in fields(settings):
-        named = [about.name for about in getattr(hints[field.name], "__metadata__", ()) if getattr(about, "name", None)]
-        value, flag = getattr(settings, field.name), "--" + (*named, field.name)[0].replace("_", "-")
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        if default is MISSING:
-            yield str(value)
-        elif is_dataclass(value):
-            yield from _words(value)
-        elif isinstance(value, bool):
-            yield from [] if value == default else [flag if value else flag.replace("--", "--no-", 1)]
-        elif value != default:
-            for each in map(str, value if isinstance(value, tuple) else (value,)):
-                yield from [f"{flag}={each}"] if each.startswith("-") else [flag, each]
-
-
 def _summary(clip: Clip, tracks: Tracks) -> Table:
     import numpy as np
 
-    from quest.viz.report.summary import summarise
+    from quest.viz.narrate import summarise
 
     table = Table(
         title=escape(

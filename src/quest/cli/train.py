@@ -8,17 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    ProgressColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import Progress
 
 from quest.cli.console import Console
+from quest.cli.progress import bars
 from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.settings import TrainingConfig, WindowConfig
 
@@ -27,8 +20,7 @@ if TYPE_CHECKING:
 
     from quest.paper.network import PaperConfig
     from quest.train.batches import Sampler
-    from quest.train.loop import StepReport
-    from quest.train.stage import Objective
+    from quest.train.loop import Objective, StepReport
 
 
 @dataclass(frozen=True)
@@ -111,7 +103,7 @@ class Train:
         torch.manual_seed(self.training.seed)
         start = self._start_finder() if self.stage == "find" else self._start_paper()
         self.out.mkdir(parents=True, exist_ok=True)
-        with Progress(*_columns(), console=console, disable=not first) as progress:
+        with bars(console, disable=not first) as progress:
             # The first process prepares features; then the others find them.
             with fabric.rank_zero_first():
                 taught = self._taught(start, fabric.device, progress)
@@ -272,16 +264,6 @@ class _Taught:
     validation: Sampler
     about: str
     sources: frozenset[str]
-
-
-def _columns() -> tuple[ProgressColumn, ...]:
-    return (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
 
 
 def _training_bar(progress: Progress, steps: int) -> Callable[[StepReport], None]:

@@ -5,8 +5,9 @@ Reference: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +30,71 @@ class Value:
     """Upper end of the interval."""
     count: int
     """How many terms (frames, records or slots) it is over."""
+
+
+R = TypeVar("R")
+
+
+class Pool(Generic[R]):
+    """Records of one row of a table; every statistic of them has its interval over objects.
+
+    Args:
+        records: what is pooled.
+        object_of: the object of a record.
+        resamples: of the bootstrap.
+        seed: of the bootstrap; pools over the same objects are resampled alike.
+        objects: objects that count though they may have no record.
+    """
+
+    def __init__(
+        self,
+        records: Iterable[R],
+        object_of: Callable[[Any], str],
+        *,
+        resamples: int,
+        seed: int,
+        objects: Iterable[str] = (),
+    ) -> None:
+        self.records: Sequence[R] = list(records)
+        self._object_of = object_of
+        names = sorted({*map(object_of, self.records), *objects})
+        self._index = {name: i for i, name in enumerate(names)}
+        self._draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
+
+    @property
+    def objects(self) -> int:
+        """How many objects the records are of."""
+        return len({self._object_of(record) for record in self.records})
+
+    @property
+    def owner(self) -> Int[np.ndarray, " N"]:
+        """Index of each record's object."""
+        return np.array([self._index[self._object_of(record)] for record in self.records], dtype=int)
+
+    def of(self, records: Iterable[Any]) -> Pool[Any]:
+        """Other records of the same objects, such as some of these, with the same resamples."""
+        other = object.__new__(Pool)
+        other.__dict__ |= self.__dict__ | {"records": list(records)}
+        return other
+
+    def where(self, chosen: Callable[[R], object]) -> Pool[R]:
+        """Those of the records for which something is true."""
+        return self.of(filter(chosen, self.records))
+
+    def ratio(self, sums: Sums) -> Value | None:
+        """The pooled mean of sums per record; None where nothing was counted."""
+        return mean_value(sums, self.owner, self._draws)
+
+    def mean(self, total: Callable[[R], float], count: Callable[[R], float] = lambda record: 1.0) -> Value | None:
+        """The mean of a value of each record, or of the sum and number of several; None where nothing was counted."""
+        terms = np.array([(total(record), count(record)) for record in self.records], np.float64).reshape(-1, 2)
+        return self.ratio(Sums(terms[:, 0], terms[:, 1]))
+
+    def median(self, values: Callable[[R], Any]) -> Value | None:
+        """The median of a value or an array of values of each record, NaN left out; None without any."""
+        parts = [np.atleast_1d(np.asarray(values(record), dtype=np.float64)) for record in self.records]
+        owner = np.repeat(self.owner, [len(part) for part in parts])
+        return median_value(np.concatenate([np.zeros(0), *parts]), owner, self._draws)
 
 
 def draw_objects(objects: int, *, resamples: int, generator: np.random.Generator) -> Int[np.ndarray, "B O"]:
@@ -99,18 +165,18 @@ def interval_over(
     *,
     resamples: int = 1000,
     seed: int = 0,
-) -> tuple[float, float]:
-    """The 95 % interval of a statistic over units that are alike, such as the turns of a timing.
+) -> Value:
+    """A statistic of units that are alike, such as the turns of a timing, with its interval over them.
 
     Args:
         units: what is drawn from, along the first axis.
-        statistic: of one resample, or of many along axes before.
+        statistic: of one resample, or of many along axes ahead of those of ``units``.
         resamples: how often as many units are drawn.
         seed: of the draws.
     """
     draws = np.random.default_rng(seed).integers(len(units), size=(resamples, len(units)))
     low, high = np.quantile(statistic(units[draws]), _ENDS)
-    return float(low), float(high)
+    return Value(float(statistic(units)), float(low), float(high), len(units))
 
 
 def objects_with_terms(sums: Sums, object_of: Int[np.ndarray, " N"]) -> int:

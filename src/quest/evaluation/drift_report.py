@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -24,7 +24,7 @@ from quest.evaluation.drift import (
     quantile,
     ranked_auroc,
 )
-from quest.evaluation.report import write_report
+from quest.evaluation.report import shown, write_report
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
 from quest.monitor import Budget
@@ -265,21 +265,14 @@ def _finite(value: float | None) -> float | None:
 
 
 def write_drift(rows: Sequence[DriftRow], run: Run, about: str, path: Path) -> None:
-    """Write the result file, whole or not at all.
-
-    Args:
-        rows: the table.
-        run: what made it.
-        about: what the monitor was calibrated on.
-        path: a file ending in ``.json``.
-    """
-    raw = {"format": FORMAT, "run": asdict(run), "calibration": about, "rows": [asdict(row) for row in rows]}
-    write_report(raw, path)
+    """Write the result file, whole or not at all; ``about`` says what the monitor was calibrated on."""
+    write_report({"format": FORMAT, "run": run, "calibration": about, "rows": rows}, path)
 
 
 def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
     """Rows as tables, one per part of the split and source."""
     tables = []
+    headings = ("detector", "AUROC", "AUGRC", "ECE", "α %", "false alarms %", "of", "unclear", "missed %", "early %")
     for (part, source), group in groupby(rows, key=lambda row: (row.part, row.source)):
         own = list(group)
         first = own[0]
@@ -289,24 +282,10 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
             f"(and {first.brief} brief)"
         )
         table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
-        headings = (
-            "detector",
-            "AUROC",
-            "AUGRC",
-            "ECE",
-            "α %",
-            "false alarms %",
-            "of",
-            "unclear",
-            "missed %",
-            "early %",
-            "delay",
-            "p90",
-        )
-        for heading in headings:
+        for heading in (*headings, "delay", "p90"):
             table.add_column(heading, justify="left" if heading == "detector" else "right")
         for row in own:
-            scores = (row.detector, _show(row.auroc), _show(row.augrc), _show(row.ece))
+            scores = (row.detector, shown(row.auroc), shown(row.augrc), shown(row.ece))
             for i, alarm in enumerate(row.alarms):
                 table.add_row(*(scores if i == 0 else ("",) * 4), *_alarm_cells(alarm))
         tables.append(table)
@@ -320,28 +299,17 @@ def drift_table(rows: Sequence[DriftRow]) -> RenderableType:
 
 
 def _alarm_cells(alarm: AlarmRow) -> tuple[str, ...]:
-    share = "-"
-    if alarm.low is not None and alarm.high is not None:
-        share = f"{100 * alarm.false_alarms / alarm.trials:.1f} ({100 * alarm.low:.1f}–{100 * alarm.high:.1f})"
+    rate = alarm.false_alarms / max(alarm.trials, 1)
+    share = Value(rate, alarm.low, alarm.high, alarm.trials) if alarm.trials else None
     none = "-" if alarm.missed is None else ">"
+    frames = "" if alarm.alpha_frames is None else f" in {alarm.alpha_frames}"
     return (
-        f"{'~' if alarm.extrapolated else ''}{100 * alarm.alpha:g}"
-        + ("" if alarm.alpha_frames is None else f" in {alarm.alpha_frames}"),
-        share,
+        f"{'~' if alarm.extrapolated else ''}{100 * alarm.alpha:g}{frames}",
+        shown(share, factor=100, decimals=1),
         str(alarm.trials),
         f"{alarm.unclear_false_alarms}/{alarm.unclear_trials}",
-        _show(alarm.missed, factor=100, decimals=1),
-        _show(alarm.early, factor=100, decimals=1),
-        _show(alarm.delay_median, decimals=0, none=none),
-        _show(alarm.delay_p90, decimals=0, none=none),
+        shown(alarm.missed, factor=100, decimals=1),
+        shown(alarm.early, factor=100, decimals=1),
+        shown(alarm.delay_median, decimals=0, none=none),
+        shown(alarm.delay_p90, decimals=0, none=none),
     )
-
-
-def _show(value: Value | None, *, factor: float = 1.0, decimals: int = 3, none: str = "-") -> str:
-    if value is None:
-        return none
-    middle = f"{factor * value.mean:.{decimals}f}"
-    if value.low is None and value.high is None:
-        return middle
-    ends = "–".join("∞" if end is None else f"{factor * end:.{decimals}f}" for end in (value.low, value.high))
-    return f"{middle} ({ends})"

@@ -10,8 +10,9 @@ Each view of a take is one clip.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, SupportsIndex
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -21,7 +22,7 @@ from quest.baselines import ClipTracker
 from quest.errors import ConfigError
 from quest.evaluation.metrics import GATE, distance, distance_px, identity
 from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
-from quest.types import Query, Take, Tracks
+from quest.types import Query, Take, Tracks, View
 
 ProtocolName = Literal["point", "semantic"]
 
@@ -47,6 +48,12 @@ def first_visible(visible: Bool[np.ndarray, "T E"], tracked: Int[np.ndarray, " R
     start = visible[:START_FRAMES, tracked]
     seen = start.any(axis=0)
     return tracked[seen], start.argmax(axis=0)[seen]
+
+
+def true_queries(view: View, entities: Iterable[SupportsIndex], frames: Iterable[SupportsIndex]) -> list[Query]:
+    """Point queries at the true pixels of entities; of their names a tracker can read nothing."""
+    pairs = zip(frames, entities, strict=True)
+    return [Query.point(int(t), *map(float, view.uv_px[t, e]), name=f"query-{int(e)}") for t, e in pairs]
 
 
 def unscored_entities(take: Take) -> tuple[Unscored, ...]:
@@ -78,11 +85,7 @@ def evaluate_point(tracker: ClipTracker, take: Take, view: int, subject: Subject
     scored, first = first_visible(truth.visible, take.tracked)
     if not len(scored):
         return ViewOutcome(())
-    # Names are neutral: a tracker must not read the label out of them.
-    queries = [
-        Query.point(int(t), float(truth.uv_px[t, e, 0]), float(truth.uv_px[t, e, 1]), name=f"query-{k}")
-        for k, (e, t) in enumerate(zip(scored, first, strict=True))
-    ]
+    queries = true_queries(truth, scored, first)
     tracks = tracker.track(truth.clip, queries)
     _check(tracks, tracker=tracker.name, frames=len(take), queries=len(queries))
     answers = np.arange(len(scored))

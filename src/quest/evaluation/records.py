@@ -5,8 +5,8 @@ Every number in a table can be computed again from these; they are stored as Par
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +88,11 @@ class Discovery:
     entities: int | None = None
     """That could be discovered; None there too."""
 
+    @classmethod
+    def from_json(cls, raw: dict[str, Any]) -> Discovery:
+        """Out of plain values."""
+        return cls(**{**raw, "subject": Subject(**raw["subject"])})
+
 
 @dataclass(frozen=True)
 class Unscored:
@@ -103,26 +108,21 @@ class Unscored:
     """The entity's label."""
 
 
-_PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}
+PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}
+"""Fields of a record that have a value in every frame, and their types."""
 
 
-def write_records(records: Sequence[EntityRecord], path: Path, *, about: Mapping[str, str] | None = None) -> None:
-    """Write records as Parquet, one row each with lists over frames; atomic.
-
-    Args:
-        records: what to write.
-        path: the file.
-        about: written beside the rows, as the table's metadata.
-    """
-    flat = [f.name for f in fields(EntityRecord) if f.name != "subject" and f.name not in _PER_FRAME]
+def write_records(records: Sequence[EntityRecord], path: Path) -> None:
+    """Write records as Parquet, one row each with lists over frames; atomic."""
+    flat = [f.name for f in fields(EntityRecord) if f.name != "subject" and f.name not in PER_FRAME]
     columns: dict[str, list] = {f.name: [getattr(r.subject, f.name) for r in records] for f in fields(Subject)}
     columns |= {name: [getattr(r, name) for r in records] for name in flat}
     arrays = {name: pa.array(values) for name, values in columns.items()}
-    for name, dtype in _PER_FRAME.items():
+    for name, dtype in PER_FRAME.items():
         item = pa.from_numpy_dtype(dtype)
         arrays[name] = pa.array([getattr(r, name) for r in records], type=pa.list_(item))
     with whole_file(path) as partial:
-        pq.write_table(pa.table(arrays).replace_schema_metadata(about), partial, compression="zstd")
+        pq.write_table(pa.table(arrays), partial, compression="zstd")
 
 
 def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
@@ -131,35 +131,14 @@ def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
     Raises:
         InputError: the file is missing or is no such file.
     """
-    return read_described(path)[0]
-
-
-def read_described(path: str | Path) -> tuple[tuple[EntityRecord, ...], dict[str, str]]:
-    """Read what :func:`write_records` wrote, and what was written beside it.
-
-    Raises:
-        InputError: the file is missing or is no such file.
-    """
+    records = []
     try:
-        table = pq.read_table(path)
-        records = []
-        for row in table.to_pylist():
+        for row in pq.read_table(path).to_pylist():
             subject = Subject(**{f.name: row.pop(f.name) for f in fields(Subject)})
             per_frame: dict[str, Any] = {
-                name: np.array(row.pop(name), dtype=dtype) for name, dtype in _PER_FRAME.items()
+                name: np.array(row.pop(name), dtype=dtype) for name, dtype in PER_FRAME.items()
             }
             records.append(EntityRecord(subject=subject, **row, **per_frame))
-        about = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
         raise InputError(f"records {path}: expected a Parquet file written by `quest eval --out` ({error})") from error
-    return tuple(records), about
-
-
-def discovery_to_json(found: Discovery) -> dict:
-    """Plain values of a discovery record."""
-    return asdict(found)
-
-
-def discovery_from_json(raw: dict) -> Discovery:
-    """The discovery record of plain values."""
-    return Discovery(**{**raw, "subject": Subject(**raw["subject"])})
+    return tuple(records)

@@ -5,20 +5,23 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import torch
+from rich import box
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
 
 from quest.data.provenance import code_commit, file_hash, machine, package_versions
 from quest.errors import InputError
-from quest.evaluation.bootstrap import Value
 from quest.evaluation.records import EntityRecord, read_records
 from quest.evaluation.results import Run, read_results
-from quest.whole_file import whole_file
+from quest.evaluation.results import write_report as write_report
 
 RECORDS_SUFFIX = ".records.parquet"
 
@@ -85,27 +88,37 @@ def device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else device.type
 
 
-def write_report(report: dict[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all.
-
-    Args:
-        report: plain values and origins.
-        path: the file; its folder is made.
-    """
-    with whole_file(path) as partial:
-        partial.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def origins_json(origins: Sequence[Origin]) -> list[dict[str, Any]]:
-    """Plain values of origins."""
-    return [asdict(origin) for origin in origins]
+def shown(value: Any, *, decimals: int = 3, factor: float = 1.0, none: str = "-") -> str:
+    """A number, with its interval if it has one, or a word for a table in the terminal."""
+    if value is None or isinstance(value, bool | int | str):
+        return none if value is None else str(value)
+    if isinstance(value, float):
+        return f"{factor * value:.{decimals}f}"
+    middle, low, high = value.share if hasattr(value, "share") else value.mean, value.low, value.high
+    if low is None and high is None:
+        return f"{factor * middle:.{decimals}f}"
+    ends = ["∞" if end is None else f"{factor * end:.{decimals}f}" for end in (low, high)]
+    return f"{factor * middle:.{decimals}f} ({(' to ' if '-' in ends[0] else '–').join(ends)})"
 
 
-def shown(value: Value | None, *, decimals: int = 3, factor: float = 1.0) -> str:
-    """A number with its interval for a table in the terminal."""
-    if value is None:
-        return "-"
-    text = f"{factor * value.mean:.{decimals}f}"
-    if value.low is None or value.high is None:
-        return text
-    return f"{text} ({factor * value.low:.{decimals}f} to {factor * value.high:.{decimals}f})"
+def rows_table(title: str, rows: Sequence[Mapping[str, Any]]) -> RenderableType:
+    """The rows of a report as they are in its file; what all of them share stands in the title."""
+    flat = [
+        {
+            f"{key} {inner}".strip(): value
+            for key, item in row.items()
+            for inner, value in (item.items() if isinstance(item, Mapping) else [("", item)])
+            if not isinstance(value, list | tuple)
+        }
+        for row in rows
+    ]
+    columns = {key: [shown(row.get(key)) for row in flat] for key in dict.fromkeys(key for row in flat for key in row)}
+    shared = {key: cells[0] for key, cells in columns.items() if len(flat) > 1 and len(set(cells)) == 1}
+    about = ", ".join(f"{key.replace('_', ' ')} {cell}" for key, cell in shared.items() if cell != "-")
+    table = Table(box=box.SIMPLE_HEAD)
+    kept = {key: cells for key, cells in columns.items() if key not in shared}
+    for key in kept:
+        table.add_column(key.replace("_", " "), overflow="fold")
+    for cells in zip(*kept.values(), strict=True):
+        table.add_row(*cells)
+    return Group(Text(f"{title}: {about}" if about else title), table)

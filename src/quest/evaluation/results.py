@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import time
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,20 +13,14 @@ from typing import Any
 from quest.data.provenance import code_commit, command_line, file_hash, machine, package_versions
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
-from quest.evaluation.records import (
-    Discovery,
-    EntityRecord,
-    Unscored,
-    discovery_from_json,
-    discovery_to_json,
-    write_records,
-)
+from quest.evaluation.records import Discovery, EntityRecord, Unscored, write_records
 from quest.evaluation.summary import Metrics, Row
 from quest.untrusted import read_json, reading
 from quest.whole_file import whole_file
 
 FORMAT = 1
 """Version of the result file."""
+_OF_RECORDS = ("records", "records_hash")
 
 
 @dataclass(frozen=True)
@@ -98,6 +92,18 @@ def records_path(path: str | Path) -> Path:
     return path.with_name(f"{path.stem}.records.parquet")
 
 
+def write_report(report: Mapping[str, Any], path: Path) -> None:
+    """Write a report as JSON, whole or not at all.
+
+    Args:
+        report: plain values and dataclasses of such.
+        path: the file; its folder is made.
+    """
+    with whole_file(path) as partial:
+        text = json.dumps(report, indent=1, allow_nan=False, default=asdict)
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
 def write_results(results: Results, path: str | Path, *, records: tuple[EntityRecord, ...] = ()) -> None:
     """Write the result file, and the records beside it; each is written whole or not at all.
 
@@ -118,21 +124,8 @@ def write_results(results: Results, path: str | Path, *, records: tuple[EntityRe
         write_records(records, beside)
     else:
         beside.unlink(missing_ok=True)  # of an earlier run
-    raw = {
-        "format": FORMAT,
-        "records": beside.name if records else None,
-        "records_hash": file_hash(beside) if records else None,
-        "run": asdict(results.run),
-        "rows": [asdict(row) for row in results.rows],
-        "notes": list(results.notes),
-        "discoveries": [discovery_to_json(d) for d in results.discoveries],
-        "unscored": [asdict(u) for u in results.unscored],
-    }
-    text = json.dumps(raw, indent=1, allow_nan=False)
-    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
+    about = {"records": beside.name, "records_hash": file_hash(beside)} if records else dict.fromkeys(_OF_RECORDS)
+    write_report({"format": FORMAT} | about | vars(results), path)
 
 
 def read_results(path: str | Path) -> Results:
@@ -149,7 +142,7 @@ def read_results(path: str | Path) -> Results:
         return Results(
             run=Run(**raw["run"]),
             rows=tuple(_row(row) for row in raw["rows"]),
-            discoveries=tuple(discovery_from_json(d) for d in raw["discoveries"]),
+            discoveries=tuple(map(Discovery.from_json, raw["discoveries"])),
             unscored=tuple(Unscored(**u) for u in raw["unscored"]),
             notes=tuple(raw["notes"]),
         )

@@ -5,8 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import zipfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,13 @@ from jaxtyping import Bool, Float32, Float64, Int, Int8
 
 from quest.errors import ConfigError, InputError
 from quest.evaluation.metrics import INPUT_PX, distance_px
+from quest.evaluation.protocols import true_queries
 from quest.evaluation.selection import Chosen, Shard
 from quest.monitor import Inputs
 from quest.monitor.calibration import Unit
 from quest.track import Tracker
 from quest.track.settings import REVISION
-from quest.types import Query, Take
+from quest.types import Take
 from quest.whole_file import whole_file
 
 RIGHT, UNCLEAR, LOST = range(3)
@@ -194,10 +194,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs:
     entities = take.tracked[truth.visible[0, take.tracked]]
     if not len(entities):
         return None
-    # Names are neutral: a tracker must not read the label out of them.
-    queries = [
-        Query.point(0, float(x), float(y), name=f"query-{k}") for k, (x, y) in enumerate(truth.uv_px[0, entities])
-    ]
+    queries = true_queries(truth, entities, [0] * len(entities))
     stream = tracker.stream(truth.clip.camera, queries, alpha=None)
     t, k = len(take), len(entities)
     log_odds = np.full((t, k), np.nan, np.float32)
@@ -282,31 +279,31 @@ def record_streams(
     streams = []
     for store, chosen in takes:
         headers = store.headers()
-        streams += [(store, n, part, v) for n, part in chosen.items() for v in range(len(headers[n].cameras))]
+        for name, part in chosen.items():
+            paths = [folder / f"{name}-view{v}-{inputs}.npz" for v in range(len(headers[name].cameras))]
+            streams += [(store, name, part, view, path) for view, path in enumerate(paths)]
     take: Take | None = None
-    for i, (store, name, part, view) in enumerate(streams):
-        path, of = folder / f"{name}-view{view}-{inputs}.npz", _Origin(made_by, hashes[name])
-        if i not in shard or _origin(path) == of:
+    for i, (store, name, part, view, path) in enumerate(streams):
+        if i not in shard or _find(path, made_by, hashes[name]) is not None:
             continue
         progress(f"{name} view {view}, {inputs}", i, len(streams))
         take = take if take is not None and take.info.name == name else store.read(name)
-        write_record(
-            record_stream(tracker, take, view, part=part, inputs=inputs), path, made_by=made_by, take_hash=hashes[name]
-        )
+        record = record_stream(tracker, take, view, part=part, inputs=inputs)
+        write_record(record, path, made_by=made_by, take_hash=hashes[name])
     # Only now, since other shards went on meanwhile.
-    paths = [(folder / f"{name}-view{view}-{inputs}.npz", part, hashes[name]) for _, name, part, view in streams]
-    own = [(_read(path), part) for path, part, of in paths if _origin(path) == _Origin(made_by, of)]
-    records = tuple(replace(record, part=part) for record, part in own if record is not None)
-    return Recorded(records, len(streams) - len(own))
+    found = [(_find(path, made_by, hashes[name]), part) for _, name, part, _, path in streams]
+    known = [(own, part) for own, part in found if own is not None]
+    return Recorded(
+        tuple(replace(record, part=part) for own, part in known for record in own), len(streams) - len(known)
+    )
 
 
 def write_record(record: StreamRecord | None, path: Path, *, made_by: str, take_hash: str) -> None:
     """Write a record whole or not at all; None leaves a mark that the stream has nothing to follow."""
-    values: dict[str, Any] = {"format": np.array(FORMAT), "made_by": np.array(made_by)}
-    values["take_hash"] = np.array(take_hash)
-    values |= {} if record is None else {f.name: np.asarray(getattr(record, f.name)) for f in fields(StreamRecord)}
-    with whole_file(path) as partial, partial.open("wb") as file:
-        np.savez_compressed(file, **values)
+    values: dict[str, Any] = {"format": FORMAT, "made_by": made_by, "take_hash": take_hash}
+    values |= {} if record is None else vars(record)
+    with whole_file(path) as partial:
+        np.savez_compressed(partial, **values)
 
 
 def read_records(folder: str | Path, *, inputs: Inputs, made_by: str) -> tuple[StreamRecord, ...]:
@@ -321,8 +318,7 @@ def read_records(folder: str | Path, *, inputs: Inputs, made_by: str) -> tuple[S
         InputError: there are none, or one is damaged.
     """
     paths = sorted(Path(folder).glob(f"*-{inputs}.npz"))
-    own = [_read(path) for path in paths if (origin := _origin(path)) is not None and origin.made_by == made_by]
-    records = tuple(record for record in own if record is not None)
+    records = tuple(record for path in paths for record in _find(path, made_by) or ())
     if not records:
         raise InputError(
             f"records {folder}: expected streams of the tracker {made_by}, found none among {len(paths)} files of "
@@ -331,38 +327,19 @@ def read_records(folder: str | Path, *, inputs: Inputs, made_by: str) -> tuple[S
     return records
 
 
-@dataclass(frozen=True)
-class _Origin:
-    """What a record is of: a tracker and a take."""
-
-    made_by: str
-    take_hash: str
-
-
-def _origin(path: Path) -> _Origin | None:
-    """What a record is of; None where there is none, or one of a format before."""
+def _find(path: Path, made_by: str, take_hash: str | None = None) -> list[StreamRecord] | None:
+    """The record in a file, or none if the stream has nothing to follow; None without one of this tracker and take."""
     if not path.exists():
         return None
-    with _opened(path) as file:
-        if int(file["format"]) != FORMAT:
-            return None
-        return _Origin(str(file["made_by"]), str(file["take_hash"]))
-
-
-def _read(path: Path) -> StreamRecord | None:
-    """A record; None where the stream has nothing to follow."""
-    with _opened(path) as file:
-        if "take" not in file:
-            return None
-        raw: dict[str, Any] = {f.name: file[f.name] for f in fields(StreamRecord)}
-    plain = {name: value.item() if value.ndim == 0 else value for name, value in raw.items()}
-    return StreamRecord(**plain)
-
-
-@contextmanager
-def _opened(path: Path) -> Iterator[Mapping[str, np.ndarray]]:
     try:
         with np.load(path, allow_pickle=False) as file:
-            yield file
+            if int(file["format"]) != FORMAT or str(file["made_by"]) != made_by:
+                return None
+            if take_hash not in (None, str(file["take_hash"])):
+                return None
+            if "take" not in file:
+                return []
+            raw: dict[str, Any] = {f.name: file[f.name] for f in fields(StreamRecord)}
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
         raise InputError(f"record {path}: not a whole record ({error}); delete it and record again") from error
+    return [StreamRecord(**{name: value.item() if value.ndim == 0 else value for name, value in raw.items()})]

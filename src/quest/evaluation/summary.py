@@ -8,9 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Int
 
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value
+from quest.evaluation.bootstrap import Pool, Value
 from quest.evaluation.metrics import INPUT_PX, Sums, accuracy, distance_at, frame_mean, slope, switches
 from quest.evaluation.records import Discovery, EntityRecord
 from quest.evaluation.take_suite import STANDARD, TakeSuite
@@ -124,9 +123,7 @@ def _key(kept: EntityRecord | Discovery, reading: Reading) -> tuple:
 def _row(key: tuple, records: list[EntityRecord], found: list[Discovery], *, resamples: int, seed: int) -> Row:
     protocol, part, source, suite, level, reading, tracker = key
     # Views in which nothing could be scored still belong to the objects that the discovery was judged on.
-    objects = sorted({r.subject.object_id for r in records} | {d.subject.object_id for d in found})
-    draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
-    index = {name: i for i, name in enumerate(objects)}
+    pool = Pool(records, _object_of, resamples=resamples, seed=seed, objects=map(_object_of, found))
     return Row(
         tracker=tracker,
         protocol=protocol,
@@ -134,56 +131,43 @@ def _row(key: tuple, records: list[EntityRecord], found: list[Discovery], *, res
         source=source,
         level=level,
         reading=reading,
-        objects=len({r.subject.object_id for r in records}),
+        objects=pool.objects,
         takes=len({r.take for r in records}),
         entities=len({(r.take, r.entity) for r in records}),
         tracks=len(records),
         frames=sum(len(r.distance) - r.first_frame for r in records),
-        metrics=_metrics(records, found, index, draws, semantic=protocol == "semantic"),
+        metrics=_metrics(pool, found, semantic=protocol == "semantic"),
         suite=suite,
     )
 
 
-def _metrics(
-    records: list[EntityRecord],
-    found: list[Discovery],
-    index: dict[str, int],
-    draws: Int[np.ndarray, "B O"],
-    *,
-    semantic: bool,
-) -> Metrics:
-    object_of = np.array([index[r.subject.object_id] for r in records])
-    sums = record_sums(records)
-    values = {name: mean_value(s, object_of, draws) for name, s in sums.items()}
+def _object_of(kept: EntityRecord | Discovery) -> str:
+    return kept.subject.object_id
+
+
+def _metrics(pool: Pool[EntityRecord], found: list[Discovery], *, semantic: bool) -> Metrics:
+    values = {name: pool.ratio(sums) for name, sums in record_sums(pool.records).items()}
     for name, visible_only in (("median_px", False), ("median_px_vis", True)):
-        kept = [r.distance_px[_counted(r, visible_only=visible_only)].astype(np.float64) for r in records]
-        owner = np.repeat(object_of, [len(k) for k in kept])
-        values[name] = median_value(np.concatenate(kept), owner, draws)
-    if semantic:
-        values["recall"] = mean_value(recall_sums(records), object_of, draws)
-    if found:
-        owner = np.array([index[d.subject.object_id] for d in found])
-        values["precision"] = mean_value(precision_sums(found), owner, draws)
-    counted = [(d.placed, d.entities, index[d.subject.object_id]) for d in found if d.placed is not None]
-    if counted:
-        placed, entities, owner = np.array(counted).T
-        values["place_recall"] = mean_value(Sums(placed.astype(float), entities.astype(float)), owner, draws)
-    return Metrics(**values)
+        values[name] = pool.median(lambda r, vis=visible_only: r.distance_px[_counted(r, visible_only=vis)])
+    return Metrics(**values, **discovery_values(pool, found, semantic=semantic))
+
+
+def discovery_values(
+    pool: Pool[EntityRecord], found: Sequence[Discovery], *, semantic: bool
+) -> dict[str, Value | None]:
+    """Recall of the entities, precision of the discoveries, and recall if labels do not count."""
+    views = pool.of(found)
+    counted = views.where(lambda d: d.placed is not None)
+    return {
+        "recall": pool.mean(lambda r: r.found) if semantic else None,
+        "precision": views.mean(lambda d: d.matched, lambda d: d.slots),
+        "place_recall": counted.mean(lambda d: d.placed, lambda d: d.entities),
+    }
 
 
 def _counted(record: EntityRecord, *, visible_only: bool = False) -> np.ndarray:
     counted = np.arange(len(record.distance)) >= record.first_frame
     return counted & record.visible if visible_only else counted
-
-
-def recall_sums(records: Sequence[EntityRecord]) -> Sums:
-    """Which entities were discovered, one term per record."""
-    return Sums(np.array([float(r.found) for r in records]), np.ones(len(records)))
-
-
-def precision_sums(found: Sequence[Discovery]) -> Sums:
-    """Which discoveries are entities, one term per view."""
-    return Sums(np.array([float(d.matched) for d in found]), np.array([float(d.slots) for d in found]))
 
 
 def record_sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:

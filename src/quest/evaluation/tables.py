@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
@@ -13,7 +13,6 @@ from rich.text import Text
 
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.results import Results
-from quest.evaluation.summary import Row
 from quest.evaluation.take_suite import STANDARD
 
 
@@ -75,13 +74,16 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
     for (protocol, part, source, suite), group in groupby(
         results.rows, key=lambda r: (r.protocol, r.part, r.source, r.suite)
     ):
-        rows = list(group)
-        columns = [c for c in COLUMNS if any(getattr(row.metrics, c.field) is not None for row in rows)]
-        heads = [("L", "of", "tracker", "n"), *(_head(row) for row in rows)]
-        kept = fitting(columns, heads, lambda column, rows=rows: [_value(row, column) for row in rows], width)
-        dropped |= {c.heading for c in columns if c not in kept}
+        rows = [
+            ((str(r.level), r.reading, r.tracker, f"{r.objects}/{r.takes}/{r.tracks}"), vars(r.metrics)) for r in group
+        ]
         title = f"{protocol} · {source} · {PART_TITLES.get(part, f'{part} objects')}"
-        parts.append(_table(title if suite == STANDARD else f"{title} · suite {suite}", rows, kept))
+        title += "" if suite == STANDARD else f" · suite {suite}"
+        style = "bold red" if part == "train" else "bold"
+        shown = columns_table(title, ("L", "of", "tracker", "n"), rows, COLUMNS, width, style=style, once=2)
+        known = {c.heading for c in COLUMNS if any(values[c.field] for _, values in rows)}
+        dropped |= known - {str(column.header) for column in shown.columns}
+        parts.append(shown)
     run = results.run
     small = [LEGEND, *results.notes]
     if dropped:
@@ -93,55 +95,51 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
     return Group(*parts)
 
 
-def fitting(
+def columns_table(
+    title: str,
+    headings: tuple[str, ...],
+    rows: Sequence[tuple[tuple[str, ...], Mapping[str, Value | None]]],
     columns: Sequence[Column],
-    heads: Sequence[tuple[str, ...]],
-    values: Callable[[Column], Sequence[Value | None]],
     width: int,
-) -> list[Column]:
-    """Columns by rank as long as they fit; a number is never cut.
+    *,
+    style: str = "bold",
+    once: int = 0,
+) -> Table:
+    """Rows as a table, of which columns without any value are omitted, and by rank those that do not fit.
 
     Args:
-        columns: to choose from.
-        heads: the texts to the left of them, the headings first.
-        values: what a column shows.
+        title: above it.
+        headings: of the texts that begin a row.
+        rows: the texts that begin each row, and its values by field.
+        columns: to choose from; a number is never cut.
         width: of the terminal in characters.
+        style: of the title.
+        once: how many of the first headings stand once for rows that agree in them, with a rule below these.
     """
-    left = width - sum(max(map(len, texts)) + GAP for texts in zip(*heads, strict=True))
+    left = width - sum(max(map(len, texts)) + GAP for texts in zip(headings, *(head for head, _ in rows), strict=True))
     kept = []
-    for column in sorted(columns, key=lambda c: c.rank):
-        cells = [line for value in values(column) for line in cell(value, column).plain.split("\n")]
-        left -= max(len(text) for text in [column.heading, *cells]) + GAP
+    for column in sorted((c for c in columns if any(values.get(c.field) for _, values in rows)), key=lambda c: c.rank):
+        lines = [line for _, values in rows for line in cell(values.get(column.field), column).plain.split("\n")]
+        left -= max(map(len, [column.heading, *lines])) + GAP
         if left < 0:
             break
         kept.append(column)
-    return [c for c in columns if c in kept]
-
-
-def _table(title: str, rows: list[Row], columns: list[Column]) -> Table:
-    style = "bold red" if rows[0].part == "train" else "bold"
+    kept = [c for c in columns if c in kept]
     table = Table(
         title=title, title_justify="left", title_style=style, box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1)
     )
-    for heading in ("L", "of", "tracker", "n"):
+    for heading in headings:
         table.add_column(heading, no_wrap=True)
-    for column in columns:
+    for column in kept:
         table.add_column(column.heading, justify="right", no_wrap=True)
-    for _, group in groupby(rows, key=lambda r: (r.level, r.reading)):
-        for i, row in enumerate(group):
-            level, reading, tracker, count = _head(row)
-            lead = (level, reading) if i == 0 else ("", "")
-            table.add_row(*lead, tracker, count, *(cell(_value(row, column), column) for column in columns))
-        table.add_section()
+    before = None
+    for head, values in rows:
+        if once and before is not None and head[:once] != before:
+            table.add_section()
+        lead = ("",) * once if head[:once] == before else head[:once]
+        table.add_row(*lead, *head[once:], *(cell(values.get(column.field), column) for column in kept))
+        before = head[:once]
     return table
-
-
-def _head(row: Row) -> tuple[str, str, str, str]:
-    return str(row.level), row.reading, row.tracker, f"{row.objects}/{row.takes}/{row.tracks}"
-
-
-def _value(row: Row, column: Column) -> Value | None:
-    return getattr(row.metrics, column.field)
 
 
 def cell(value: Value | None, column: Column) -> Text:

@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import UInt8
 from scipy.special import logit
 
 from quest.baselines import TRACKERS, ClipTracker, Inputs
-from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
+from quest.evaluation.finished import KeptAnswers
 from quest.evaluation.real.measures import (
     Answers,
     Measures,
@@ -63,38 +61,6 @@ class RealRow:
     """Scored labels, or answers given."""
     measures: Measures
     """The numbers."""
-
-
-class KeptAnswers:
-    """A folder of answers, one file per clip or picture and row, so that what was stopped goes on.
-
-    Args:
-        folder: made by the first answer.
-        made_by: digest of what the answers depend on beside clip and tracker: code, weights, data.
-    """
-
-    def __init__(self, folder: Path, *, made_by: str) -> None:
-        self.folder = folder
-        self._made_by = made_by
-
-    def get(self, name: str, make: Callable[[], Mapping[str, np.ndarray]]) -> Mapping[str, np.ndarray]:
-        """Answers of a name, made where they are not known or were made by something else."""
-        path = self.folder / f"{name}.npz"
-        if path.is_file():
-            try:
-                with np.load(path, allow_pickle=False) as known:
-                    if str(known["made_by"]) == self._made_by:
-                        return {key: known[key] for key in known if key != "made_by"}
-            except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
-                raise InputError(f"kept answers {path}: damaged ({error}); delete the file and run again") from error
-        made = make()
-        with whole_file(path) as unfinished:
-            np.savez(unfinished, made_by=np.array(self._made_by), **made)  # type: ignore[arg-type]
-        return made
-
-    def remove(self) -> None:
-        """Delete the folder."""
-        shutil.rmtree(self.folder, ignore_errors=True)
 
 
 def evaluate_set(

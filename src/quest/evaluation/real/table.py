@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import groupby
 
-from rich import box
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from quest.evaluation.real.run import RealRow
-from quest.evaluation.tables import Column, cell, fitting
+from quest.evaluation.tables import Column, columns_table
 
 COLUMNS = (
     Column("median_px", "med px", 1, 1.0, 0),
@@ -65,28 +63,9 @@ def real_table(
         shown: columns, of which those that have numbers are shown.
         legend: below the tables.
     """
-    parts: list[RenderableType] = []
+    tables = []
     for name, rows in sets.items():
         for of, group in groupby(rows, key=lambda row: row.of):
-            parts.append(_table(f"{name} · {of}", list(group), shown, width))
-    return Group(*parts, Text(legend, style="dim"))
-
-
-def _table(title: str, rows: Sequence[RealRow], shown: Sequence[Column], width: int) -> Table:
-    heads = [("tracker", "shown", "n"), *(_head(row) for row in rows)]
-    columns = [c for c in shown if any(row.measures.get(c.field) is not None for row in rows)]
-    kept = fitting(columns, heads, lambda column: [row.measures.get(column.field) for row in rows], width)
-    table = Table(
-        title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1)
-    )
-    for heading in heads[0]:
-        table.add_column(heading, no_wrap=True)
-    for column in kept:
-        table.add_column(column.heading, justify="right", no_wrap=True)
-    for row in rows:
-        table.add_row(*_head(row), *(cell(row.measures.get(column.field), column) for column in kept))
-    return table
-
-
-def _head(row: RealRow) -> tuple[str, str, str]:
-    return row.tracker, row.inputs, f"{row.units}/{row.targets}/{row.terms}"
+            heads = [((r.tracker, r.inputs, f"{r.units}/{r.targets}/{r.terms}"), r.measures) for r in group]
+            tables.append(columns_table(f"{name} · {of}", ("tracker", "shown", "n"), heads, shown, width))
+    return Group(*tables, Text(legend, style="dim"))
