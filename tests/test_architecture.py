@@ -1,4 +1,7 @@
-"""The rooms of the package: who may import whom, and the rules that a linter does not know."""
+"""The rooms of the package: who may import whom, and the rules that a linter does not know.
+
+python -m tests.test_architecture      draws docs/images/architecture.svg from the imports
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import ast
 from collections.abc import Iterator
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -84,6 +88,58 @@ def may_import(importer: str, imported: str) -> bool:
         return True  # the package's own __init__ and __main__ are the public doors: they open onto every room
     low, high = RANKS.get(imported, 0), RANKS.get(importer, 0)
     return low < high or low == high == 0
+
+
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "architecture.svg"
+_STYLE = (
+    ".f{fill:#f4f6f9} .b{fill:#fff;stroke:#456;stroke-width:1.5} .t{font-weight:bold} .s{fill:#678;font-size:12px}"
+    ".a{fill:none;stroke:#89a;stroke-width:1.3;marker-end:url(#h)}"
+)
+_ARROW = (
+    '<defs><marker id="h" markerWidth="8" markerHeight="8" refX="7" refY="4" orient="auto">'
+    '<path d="M0,0 L8,4 L0,8 z" fill="#89a"/></marker></defs>'
+)
+
+
+def imported_rooms() -> dict[str, set[str]]:
+    """The rooms that the modules of each room import."""
+    found: dict[str, set[str]] = {importer: set() for importer in RANKS}
+    for path in FILES:
+        of_quest = (module.split(".") for _, module in imports(path) if module.startswith("quest."))
+        found.get(room_of_file(path), set()).update(parts[1] for parts in of_quest if parts[1] in RANKS)
+    return {importer: imported - {importer} for importer, imported in found.items()}
+
+
+def drawn() -> str:
+    """The rooms on their floors, with an arrow to each room that is imported and not by way of another one."""
+    imported, width, height = imported_rooms(), 960, 78
+    floors = [[*rooms] for _, rooms in groupby(sorted(RANKS, key=RANKS.__getitem__), RANKS.__getitem__)]
+    bands, arrows, boxes, at = [], [], [], {}
+    for i, rooms in enumerate(floors):
+        y = (len(floors) - 1 - i) * height
+        bands.append(f'<rect class="f" y="{y + 2}" width="{width}" height="{height - 4}"/>')
+        bands.append(f'<text class="s" x="14" y="{y + height // 2 + 4}">floor {i}</text>')
+        for j, each in enumerate(rooms):  # shifted, so that arrows pass beside the rooms of other floors
+            at[each] = 80 + (width - 80) * (2 * j + 1) // (2 * len(rooms)) + 70 * (i % 3 - 1), y + height // 2
+
+    def under(importer: str) -> set[str]:
+        return imported[importer].union(*map(under, imported[importer]))
+
+    for importer, (x, y) in at.items():
+        boxes.append(f'<rect class="b" x="{x - 55}" y="{y - 15}" width="110" height="30" rx="6"/>')
+        boxes.append(f'<text class="t" x="{x}" y="{y + 5}" text-anchor="middle">{importer}</text>')
+        for u, v in (at[other] for other in sorted(imported[importer] - set().union(*map(under, imported[importer])))):
+            across, down = (0, 15) if v > y else (55 if u > x else -55, 0)
+            arrows.append(f'<path class="a" d="M{x + across},{y + down} L{u - across},{v - down}"/>')
+    size = f'viewBox="0 0 {width} {height * len(floors)}" font-family="sans-serif" font-size="14"'
+    title = "<title>The rooms of the package on their floors, and which of them import which</title>"
+    ground = f'<rect width="{width}" height="{height * len(floors)}" fill="#fff"/>'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" {size}>{title}<style>{_STYLE}</style>{_ARROW}{ground}'
+    return "\n".join([head, *bands, *arrows, *boxes, "</svg>"]) + "\n"
+
+
+def test_the_picture_of_the_rooms_is_up_to_date():
+    assert PICTURE.read_text(encoding="utf-8") == drawn(), "run `python -m tests.test_architecture`"
 
 
 def test_every_room_has_a_rank():
@@ -260,3 +316,7 @@ def test_a_wrong_shape_fails_under_the_hook(pytestconfig):
     config.update("jaxtyping_disable", False)  # as it is in tests that expect no errors
     with pytest.raises(TypeCheckError):
         Camera.from_opencv(np.eye(4), width=4, height=4)
+
+
+if __name__ == "__main__":
+    PICTURE.write_text(drawn(), encoding="utf-8")

@@ -36,7 +36,7 @@ from tests.synthetic import make_take
 from tests.tiny import make_finder
 from tests.track.clips import make_clip, make_tracker
 
-EXAMPLES = int(os.environ.get("QUEST_FUZZ", "12"))
+EXAMPLES = int(os.environ.get("QUEST_FUZZ", "8"))
 """Damages tried of each kind of file."""
 LONGEST_S = 5.0
 MOST_KIB = 2**20

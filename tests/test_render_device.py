@@ -24,48 +24,37 @@ def find(root: Path, **environ: str):
     return find_vulkan_icd(environ=environ, root=root)
 
 
-def test_nothing_to_find(tmp_path):
+def test_nothing_to_find_says_what_to_install(tmp_path, monkeypatch):
     assert find(tmp_path) is None
-
-
-def test_nothing_to_find_says_what_to_install(monkeypatch):
     monkeypatch.setattr("quest.render_device.find_vulkan_icd", lambda: None)
     with pytest.raises(RendererError, match=r"make render-deps.*chromium libvulkan1.*VK_ICD_FILENAMES"):
         prepare_renderer()
 
 
-def test_swiftshader_of_chromium(tmp_path):
-    icd = place(tmp_path, SWIFTSHADER)
+NVIDIA = ("dev/nvidia0", "usr/lib/x86_64-linux-gnu/libGLX_nvidia.so.0", "etc/vulkan/icd.d/nvidia_icd.json")
+LAVAPIPE = "usr/share/vulkan/icd.d/lvp_icd.x86_64.json"
+
+
+@pytest.mark.parametrize(
+    ("names", "api_version", "found"),
+    [
+        ([SWIFTSHADER], "1.3.0", ("swiftshader", SWIFTSHADER, False)),
+        ([SWIFTSHADER, *NVIDIA], "1.3.0", ("nvidia", NVIDIA[2], True)),
+        ([SWIFTSHADER, *NVIDIA[1:]], "1.3.0", ("swiftshader", SWIFTSHADER, False)),
+        ([SWIFTSHADER, NVIDIA[0], NVIDIA[2]], "1.3.0", ("swiftshader", SWIFTSHADER, False)),
+        ([NVIDIA[0], "usr/lib64/libGLX_nvidia.so.0", "usr/share/vulkan/icd.d/nvidia_icd.json"], "1.3.0",
+         ("nvidia", "usr/share/vulkan/icd.d/nvidia_icd.json", True)),
+        ([LAVAPIPE], "1.4.318", ("lavapipe", LAVAPIPE, False)),
+        ([LAVAPIPE], "1.1.230", None),
+        ([LAVAPIPE], "new", None),
+    ],
+)  # fmt: skip
+def test_the_best_driver_is_found(tmp_path, names, api_version, found):
+    for name in names:
+        place(tmp_path, name, api_version=api_version)
     driver = find(tmp_path)
-    assert driver is not None
-    assert (driver.kind, driver.icd, driver.on_gpu) == ("swiftshader", str(icd), False)
-
-
-def test_nvidia_comes_first(tmp_path):
-    place(tmp_path, SWIFTSHADER)
-    place(tmp_path, "dev/nvidia0")
-    place(tmp_path, "usr/lib/x86_64-linux-gnu/libGLX_nvidia.so.0")
-    icd = place(tmp_path, "etc/vulkan/icd.d/nvidia_icd.json")
-    driver = find(tmp_path)
-    assert driver is not None
-    assert (driver.kind, driver.icd, driver.on_gpu) == ("nvidia", str(icd), True)
-
-
-@pytest.mark.parametrize("missing", ["dev/nvidia0", "usr/lib64/libGLX_nvidia.so.0"])
-def test_nvidia_needs_device_and_graphics_library(tmp_path, missing):
-    for name in ("dev/nvidia0", "usr/lib64/libGLX_nvidia.so.0", "usr/share/vulkan/icd.d/nvidia_icd.json", SWIFTSHADER):
-        if name != missing:
-            place(tmp_path, name)
-    driver = find(tmp_path)
-    assert driver is not None
-    assert driver.kind == "swiftshader"
-
-
-@pytest.mark.parametrize(("api_version", "accepted"), [("1.1.230", False), ("1.4.318", True), ("new", False)])
-def test_lavapipe_only_if_recent(tmp_path, api_version, accepted):
-    place(tmp_path, "usr/share/vulkan/icd.d/lvp_icd.x86_64.json", api_version=api_version)
-    driver = find(tmp_path)
-    assert (driver is not None and driver.kind == "lavapipe") is accepted
+    expected = found and (found[0], str(tmp_path / found[1]), found[2])
+    assert expected == (driver and (driver.kind, driver.icd, driver.on_gpu))
 
 
 @pytest.mark.parametrize("variable", ["VK_ICD_FILENAMES", "VK_DRIVER_FILES"])

@@ -60,18 +60,29 @@ def assert_same(found: Tracks, expected: Tracks) -> None:
             np.testing.assert_array_equal(getattr(found.joints, name), getattr(expected.joints, name))
 
 
-def test_tracks_come_back(tracks: Tracks, tmp_path: Path):
-    write_tracks(tracks, tmp_path / "out" / "tracks.parquet")
-    found = read_tracks(tmp_path / "out" / "tracks.parquet")
-    assert_same(found, tracks)
-    assert (found.state == State.HELD).sum() == (tracks.state == State.HELD).sum()
-    assert [path.name for path in (tmp_path / "out").iterdir()] == ["tracks.parquet"]
+def cut(tracks: Tracks, frames: int, queries: int) -> Tracks:
+    """The first frames and queries."""
+    small = tracks.select(list(range(queries)))
+    per_frame = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm", "stamp_s")
+    assert small.joints is not None
+    joints = replace(small.joints, q=small.joints.q[:frames])
+    return replace(small, **{name: getattr(small, name)[:frames] for name in per_frame}, joints=joints)
 
 
-def test_tracks_of_trackers_that_do_not_watch_themselves(tracks: Tracks, tmp_path: Path):
-    plain = replace(tracks, lost_p=None, alarm=None, joints=None)
-    write_tracks(plain, tmp_path / "tracks.parquet")
-    assert_same(read_tracks(tmp_path / "tracks.parquet"), plain)
+@pytest.mark.parametrize("size", [(5, 3), (5, 0), (0, 3), (1, 1)])
+@pytest.mark.parametrize("watched", [True, False])
+def test_tracks_come_back(tracks: Tracks, tmp_path: Path, size: tuple[int, int], watched: bool):
+    """Also of trackers that do not watch themselves; a file that is there is replaced whole."""
+    kept = cut(tracks, *size)
+    kept = kept if watched else replace(kept, lost_p=None, alarm=None, joints=None)
+    path = tmp_path / "out" / "tracks.parquet"
+    path.parent.mkdir()
+    path.write_text("old")
+    write_tracks(kept, path)
+    found = read_tracks(path)
+    assert_same(found, kept)
+    assert (found.state == State.HELD).sum() == (kept.state == State.HELD).sum()
+    assert [each.name for each in path.parent.iterdir()] == ["tracks.parquet"]
 
 
 def test_columns_that_other_programs_read(tracks: Tracks, tmp_path: Path):
@@ -130,46 +141,21 @@ def test_tables_of_pandas(tracks: Tracks, monkeypatch: pytest.MonkeyPatch):
     assert int(table["x_px"].isna().to_numpy().sum()) == 2
 
 
-@pytest.mark.parametrize(("frames", "queries"), [(5, 0), (0, 3), (1, 1)])
-def test_small_tracks(tracks: Tracks, tmp_path: Path, frames: int, queries: int):
-    small = tracks.select(list(range(queries)))
-    per_frame = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm")
-    cut = {name: getattr(small, name)[:frames] for name in per_frame}
-    assert small.joints is not None
-    joints = replace(small.joints, q=small.joints.q[:frames])
-    small = replace(small, **cut, stamp_s=small.stamp_s[:frames], joints=joints)
-    write_tracks(small, tmp_path / "tracks.parquet")
-    assert_same(read_tracks(tmp_path / "tracks.parquet"), small)
-
-
-def test_a_file_is_replaced_whole(tracks: Tracks, tmp_path: Path):
-    path = tmp_path / "tracks.parquet"
-    path.write_text("old")
-    write_tracks(tracks, path)
-    assert_same(read_tracks(path), tracks)
-
-
-def test_missing_torn_and_foreign_files(tracks: Tracks, tmp_path: Path):
-    path = tmp_path / "tracks.parquet"
-    with pytest.raises(InputError, match=r"tracks\.parquet: no such file"):
-        read_tracks(path)
-    write_tracks(tracks, path)
-    path.write_bytes(path.read_bytes()[:-20])
-    with pytest.raises(InputError, match="torn"):
-        read_tracks(path)
-    pq.write_table(pa.table({"a": [1]}), path)
-    with pytest.raises(InputError, match=r"not of tracks \(columns a\)"):
-        read_tracks(path)
-
-
-def test_other_version_and_lost_rows(tracks: Tracks, tmp_path: Path):
-    path = tmp_path / "tracks.parquet"
+def test_what_is_no_file_of_tracks(tracks: Tracks, tmp_path: Path):
+    path, other = tmp_path / "tracks.parquet", tmp_path / "other.parquet"
     write_tracks(tracks, path)
     table = pq.read_table(path)
-    pq.write_table(table.slice(0, 7), path)
-    with pytest.raises(InputError, match="7 rows for 5 frames of 3 queries"):
-        read_tracks(path)
     raw = table.schema.metadata[b"quest-tracks"].replace(b'"version": 3', b'"version": 99')
-    pq.write_table(table.replace_schema_metadata({b"quest-tracks": raw}), path)
-    with pytest.raises(InputError, match="format version 99, expected 3"):
-        read_tracks(path)
+    for wrong, match in (
+        (None, r"other\.parquet: no such file"),
+        (path.read_bytes()[:-20], "copy it again"),
+        (pa.table({"a": [1]}), r"not of tracks \(columns a\)"),
+        (table.slice(0, 7), "7 rows for 5 frames of 3 queries"),
+        (table.replace_schema_metadata({b"quest-tracks": raw}), "format version 99, expected 3"),
+    ):
+        if isinstance(wrong, bytes):
+            other.write_bytes(wrong)
+        elif wrong is not None:
+            pq.write_table(wrong, other)
+        with pytest.raises(InputError, match=match):
+            read_tracks(other)

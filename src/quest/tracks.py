@@ -152,26 +152,14 @@ class Joints:
         return f"Joints({', '.join(self.describe(k) for k in range(len(self)))})"
 
     def describe(self, k: int, t: int | None = None) -> str:
-        """A joint in a few words: see :func:`describe_joint`.
-
-        Args:
-            k: the query.
-            t: a frame, to say where on the joint the entity is in it.
-        """
+        """The joint of query ``k`` in a few words, and where on it the entity is in frame ``t`` if one is given."""
         q = None if t is None else float(self.q[t, k])
         return describe_joint(self.kind[k], float(self.q_min_seen[k]), float(self.q_max_seen[k]), q=q)
 
     def select(self, queries: np.ndarray) -> Joints:
         """The joints of some queries only."""
-        return Joints(
-            kind=tuple(self.kind[i] for i in queries),
-            axis=self.axis[queries],
-            origin=self.origin[queries],
-            q_min_seen=self.q_min_seen[queries],
-            q_max_seen=self.q_max_seen[queries],
-            q=self.q[:, queries],
-            covariance=self.covariance[queries],
-        )
+        each = {name: value[queries] for name, value in vars(self).items() if name not in ("kind", "q")}
+        return Joints(kind=tuple(self.kind[i] for i in queries), q=self.q[:, queries], **each)
 
 
 def describe_joint(kind: str, q_min_seen: float, q_max_seen: float, *, q: float | None = None) -> str:
@@ -235,11 +223,7 @@ class Tracks:
         return "\n".join(lines if k <= _SHOWN else [*lines, f"  and {k - _SHOWN} more"])
 
     def describe(self, k: int) -> str:
-        """A track in one line: its name, how often it was seen, its joint and its state at the end.
-
-        Args:
-            k: the query.
-        """
+        """The track of query ``k`` in one line: its name, how often it was seen, its joint and its state at the end."""
         found = np.isfinite(self.uv_px[:, k]).all(axis=-1)
         if not found.any():
             return f"{self.names[k]}: not found"
@@ -279,18 +263,14 @@ class Tracks:
     def select(self, queries: list[int] | np.ndarray) -> Tracks:
         """The same tracks of some queries only."""
         index = np.asarray(queries, dtype=int)
+        per_frame = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm")
+        known = {name: value for name in per_frame if (value := getattr(self, name)) is not None}
         return replace(
             self,
             names=tuple(self.names[i] for i in index),
             labels=tuple(self.labels[i] for i in index),
-            uv_px=self.uv_px[:, index],
-            point_world=self.point_world[:, index],
-            confidence=self.confidence[:, index],
-            visible=self.visible[:, index],
-            state=self.state[:, index],
-            lost_p=None if self.lost_p is None else self.lost_p[:, index],
-            alarm=None if self.alarm is None else self.alarm[:, index],
             joints=None if self.joints is None else self.joints.select(index),
+            **{name: value[:, index] for name, value in known.items()},
         )
 
 
@@ -469,12 +449,7 @@ def _joints_to_json(joints: Joints, *, digits: int | None = None) -> list[dict[s
 
 
 def _plain(values: np.ndarray | np.generic, digits: int | None = None) -> Any:
-    """Nested lists of numbers, null where they are NaN, as JSON has none; one null where all of several are.
-
-    Args:
-        values: of any shape.
-        digits: significant ones; all by default.
-    """
+    """Nested lists of numbers, null where they are NaN, as JSON has none; one null where all of several are."""
     if values.ndim == 0:
         number = float(values) if digits is None else float(f"{values:.{digits}g}")
         return number if np.isfinite(number) else None
