@@ -76,6 +76,15 @@ def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
     assert OPENINGS[likely.panels.opening_p[panel].argmax()] == "left"
 
 
+def test_a_bar_that_reaches_far_out_of_the_picture_has_its_label_from_inside() -> None:
+    maps = _perfect(targets(make_marks(), 256))
+    maps.longest[0, 8, 0], maps.knob[0, :, 1:] = 99.0, 9.0  # what is not at the edge says knob
+    maps.longest_extent[0, :, 8, 0] = torch.tensor([400.0, 8, 8, 8])
+    found = read_off(maps, scale=np.ones(2), size=(256, 256))
+    assert found.labels[0] == "handle"
+    assert found.uv_px[0, 0] == 0
+
+
 def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
     truth = {name: torch.from_numpy(value)[None] for name, value in maps.items()}
 

@@ -65,8 +65,8 @@ class Redetect:
             InputError: a query outside the clip.
         """
         flags = (NO_DEPTH,) if clip.depth_m is None else ()
+        start = self.detect(clip, 0)
         if queries is None:
-            start = self.detect(clip, 0)
             inside = start.uv_px.clip(0, (clip.camera.width, clip.camera.height))
             at = zip(inside.tolist(), start.label, strict=True)
             queries = [Query.point(0, x, y, name=f"{label} {k}", label=label) for k, ((x, y), label) in enumerate(at)]
@@ -77,7 +77,7 @@ class Redetect:
             rows.hold(t)
             born, alive = np.flatnonzero(first == t), np.flatnonzero(first < t)
             if len(born) or t % self.every == 0:
-                seen = self.detect(clip, t)
+                seen = self.detect(clip, t) if t > 0 else start
                 if t % self.every == 0:
                     self._link(rows, alive, seen, clip, t)
                 self._bind(rows, born, uv_first[born], seen, clip, t)

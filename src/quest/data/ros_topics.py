@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +35,7 @@ class Topic:
     """Of messages; None if the bag does not tell."""
 
 
-class Messages:
+class Messages(ABC):
     """The messages of a bag; how they are stored is a matter of what inherits this.
 
     Args:
@@ -47,13 +48,13 @@ class Messages:
         self.where = f"bag {path}"
         self._firsts: dict[str, Any] = {}
 
+    @abstractmethod
     def read(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """Topic, time of logging in nanoseconds and message, of some topics, in the order of logging.
 
         Raises:
             RecordingError: the bag is corrupt, or a message cannot be decoded.
         """
-        raise NotImplementedError
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, which is read once; None if it has none."""

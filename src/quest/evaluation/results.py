@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -99,9 +100,11 @@ def write_report(report: Mapping[str, Any], path: Path) -> None:
         report: plain values and dataclasses of such.
         path: the file; its folder is made.
     """
-    with whole_file(path) as partial:
-        text = json.dumps(report, indent=1, allow_nan=False, default=asdict)
-        partial.write_text(text + "\n", encoding="utf-8")
+    text = json.dumps(report, indent=1, allow_nan=False, default=asdict)
+    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
+        file.write(text + "\n")
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def write_results(results: Results, path: str | Path, *, records: tuple[EntityRecord, ...] = ()) -> None:

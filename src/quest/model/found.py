@@ -150,7 +150,8 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
     uv, box, place, logit = (np.concatenate(parts) for parts in zip(*levels, strict=True))
     order = np.argsort(-logit, kind="stable")
     uv, box, place, logit = uv[order], box[order], place[order], logit[order]
-    column, row = np.minimum((uv / FINE_PX).astype(int), np.array(maps.knob.shape[:0:-1]) - 1).T
+    # The inner half of a box may lie outside what the network saw.
+    column, row = np.clip((uv / FINE_PX).astype(int), 0, np.array(maps.knob.shape[:0:-1]) - 1).T
     knob, lift = (m[0].sigmoid().double().cpu().numpy()[row, column] for m in (maps.knob, maps.lift))
     label_p = np.zeros((len(logit), len(LABELS_FOUND)))
     for k, name in enumerate(PLACES):
