@@ -14,7 +14,8 @@ import pytest
 
 from quest.data.frame_source import FrameSource, source_of_clip
 from quest.errors import InputError
-from quest.live.session import Edit, Session, Shot
+from quest.filter.joints import Joint, JointKind
+from quest.live.session import Edit, Session, Shot, drawn_joints
 from quest.types import Clip, Query
 from tests.track.clips import make_clip, make_tracker
 
@@ -110,3 +111,28 @@ def test_a_paused_session_follows_nothing_until_it_goes_on(clip: Clip):
     assert session.stream.frame == 1
     session.stop()
     assert list(going_on) == []
+
+
+def test_joints_are_drawn_where_their_points_are(clip: Clip):
+    """A lid that turns about the vertical, seen from the front: the path goes through the point's pixel."""
+    watched = Watched(clip, {})
+    state, camera = watched.session.state, clip.camera
+    assert state is not None
+    assert all(header["joints"] == [None, None] for header in watched.headers[:1])
+    point = np.array([[0.1, 0.0, 1.0], [0.0, 0.0, 1.0]], np.float32)
+    turns = Joint(
+        JointKind.REVOLUTE, np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]), point[0].astype(float), 0.0, 1.0,
+        np.eye(4),
+    )  # fmt: skip
+    known = replace(
+        state, point_world=point, joint=(turns, None), q=np.array([0.0, np.nan], np.float32), cam_from_world=np.eye(4)
+    )
+    turned, nothing = drawn_joints(known, camera)
+    assert turned is not None
+    assert nothing is None
+    pixel = [camera.fx * 0.1 + camera.cx, camera.cy]
+    np.testing.assert_allclose(turned["path"][0], pixel, atol=0.1)
+    np.testing.assert_allclose(np.mean(turned["axis"], axis=0), [camera.cx, camera.cy], atol=2.0)
+    assert drawn_joints(replace(known, cam_from_world=None), camera) == [None, None]
+    behind = np.diag([1.0, 1.0, -1.0, 1.0])
+    assert drawn_joints(replace(known, cam_from_world=behind), camera) == [{}, None]

@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from quest.types import Joints, Tracks
-from quest.viz.joint_lines import joint_lines
+from quest.filter.joints import Joint, JointKind
+from quest.track.state import StreamState
+from quest.types import Joints, State, Tracks
+from quest.viz.joint_lines import joint_lines, state_lines
 
 FRAMES = 20
 
@@ -77,3 +79,28 @@ def test_what_does_not_move_or_is_not_known_has_no_lines():
     assert joint_lines(replace(tracks, joints=None)) == (None,)
     nowhere = np.full_like(tracks.point_world, np.nan)
     assert joint_lines(replace(tracks, point_world=nowhere)) == (None,)
+
+
+@pytest.mark.parametrize("kind", ["revolute", "prismatic"])
+def test_a_stream_draws_what_the_whole_track_draws(kind: str):
+    tracks = tracks_of(kind)
+    joints, t = tracks.joints, 7
+    assert joints is not None
+    rest = tracks.point_world[0, 0].astype(np.float64)
+    seen = float(joints.q_min_seen[0]), float(joints.q_max_seen[0])
+    known = Joint(JointKind(kind), joints.axis[0], joints.origin[0], rest, *seen, np.eye(4))
+    state = StreamState(
+        names=("lid",), labels=(None,), uv_px=tracks.uv_px[t], point_world=tracks.point_world[t],
+        confidence=tracks.confidence[t], visible=tracks.visible[t], state=(State.TRACKING,), stamp_s=0.0,
+        has_depth=True, query=(0,), joint=(known,), q=joints.q[t], lost_log_odds=np.zeros(1, np.float32),
+        lost_p=np.zeros(1, np.float32), alarm=(None,),
+    )  # fmt: skip
+    whole, now = joint_lines(tracks)[0], state_lines(state)[0]
+    assert whole is not None
+    assert now is not None
+    np.testing.assert_allclose(now.path, whole.path, atol=1e-5)
+    if whole.axis is not None and now.axis is not None:
+        np.testing.assert_allclose(now.axis, whole.axis, atol=1e-5)
+    for unknown in (replace(state, joint=(None,)), replace(state, q=np.full(1, np.nan, np.float32))):
+        assert state_lines(unknown) == (None,)
+    assert state_lines(replace(state, joint=(replace(known, kind=JointKind.STATIC),))) == (None,)

@@ -150,6 +150,17 @@ def test_tracks(take: Take, tracks: Tracks, tmp_path: Path):
     coordinate = recording.array(f"/joints/{name}", "Scalars:scalars")
     np.testing.assert_allclose(coordinate, np.degrees([np.nan, 0, 0.1]), atol=1e-5)
 
+    clip = take.views[0].clip
+    assert clip.depth_m is not None
+    cloud = np.array(recording.values("/world/points", "Points3D:positions")[1])
+    rotation, moved = clip.cam_from_world[1, :3, :3], clip.cam_from_world[1, :3, 3]
+    x, y, z = (cloud @ rotation.T + moved).T
+    v, u = np.nonzero(clip.depth_m[1] > 0)
+    np.testing.assert_allclose(z, clip.depth_m[1, v, u], rtol=1e-5)
+    camera = clip.camera
+    np.testing.assert_allclose(camera.fx * x / z + camera.cx, u + 0.5, atol=1e-3)
+    np.testing.assert_allclose(camera.fy * y / z + camera.cy, v + 0.5, atol=1e-3)
+
     flat = replace(tracks, point_world=np.full_like(tracks.point_world, np.nan), joints=None)
     save_tracks(replace(take.views[0].clip, depth_m=None), flat, tmp_path / "flat.rrd")
     found = Recording(tmp_path / "flat.rrd").timelines.keys()

@@ -16,17 +16,20 @@ from typing import Literal, TextIO
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import UInt8
 
 from quest.data.frame_source import FrameSource
 from quest.errors import InputError
 from quest.filter import step as filtering
 from quest.filter.step import FilterState
+from quest.geometry import project, transform
 from quest.track import Stream, StreamState, Tracker
 from quest.track.events import Event, Events
 from quest.track.state_lines import StateLines, state_line
 from quest.track.tracker import DEFAULT_ALPHA
-from quest.types import Frame, Query
+from quest.types import Camera, Frame, Query
+from quest.viz.joint_lines import state_lines
 from quest.viz.palette import query_colour
 
 _REMEMBERED = 16
@@ -64,7 +67,8 @@ class Shot:
     """What a page shows of a frame."""
 
     header: str
-    """JSON: the stream's answers as one of its lines (``docs/monitor.md``), events, queries that wait, colours."""
+    """JSON: the stream's answers as one of its lines (``docs/monitor.md``), and what is drawn beside them: colours,
+    lines of joints, events, queries that wait."""
     jpeg: bytes
 
 
@@ -168,6 +172,7 @@ class Session:
             "frame": number,
             "state": json.loads(state_line(state, frame=number)),
             "colours": [query_colour(n) for n in state.query],
+            "joints": drawn_joints(state, self.source.camera),
             "waiting": [{"query": w.number, "words": str(w.query)} for w in self.stream.memory.queries.waiting],
             "events": [asdict(event) for event in events],
             "notes": list(self.source.flags),
@@ -239,6 +244,27 @@ class Session:
             warp = warp if after is before else after.warp @ warp
         x, y = filtering.carry(states[0], states[-1], warp, uv_px)[0].clip((0, 0), size).tolist()
         return x, y
+
+
+def drawn_joints(state: StreamState, camera: Camera) -> list[dict[str, list[list[float]]] | None]:
+    """Where the joint of each query is in the picture, as lines of pixels; None without a joint or a camera pose.
+
+    ``path`` goes over the range that was seen, ``axis`` is that of turning; what is not all ahead of the camera is left
+    out.
+    """
+    found: list[dict[str, list[list[float]]] | None] = []
+    for lines in state_lines(state):
+        if lines is None or state.cam_from_world is None:
+            found.append(None)
+            continue
+        pose, drawn = torch.from_numpy(np.asarray(state.cam_from_world, np.float64)), {}
+        for name, line in (("path", lines.path), ("axis", lines.axis)):
+            if line is not None:
+                uv_px = project(transform(pose[None], torch.from_numpy(line)), camera).numpy()
+                if np.isfinite(uv_px).all():
+                    drawn[name] = np.round(uv_px, 1).tolist()
+        found.append(drawn)
+    return found
 
 
 def to_jpeg(rgb: UInt8[np.ndarray, "H W 3"]) -> bytes:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from quest.filter.joints import JointKind
+from quest.track.state import StreamState
 from quest.types import Tracks
 
 _PIECES = 48
@@ -40,10 +42,39 @@ def _lines_of(tracks: Tracks, k: int) -> JointLines | None:
     known = known & tracks.visible[:, k] if (known & tracks.visible[:, k]).any() else known
     if not known.any():
         return None
-    point, q = point[known], q[known]
     axis, origin = joints.axis[k].astype(np.float64), joints.origin[k].astype(np.float64)
-    along = np.linspace(float(joints.q_min_seen[k]), float(joints.q_max_seen[k]), _PIECES)
-    if joints.kind[k] == "prismatic":
+    seen = float(joints.q_min_seen[k]), float(joints.q_max_seen[k])
+    return _through(point[known], q[known], joints.kind[k], axis, origin, seen)
+
+
+def state_lines(state: StreamState) -> tuple[JointLines | None, ...]:
+    """The same of the joints that a stream knows in a frame, through each query's point there."""
+    return tuple(
+        None
+        if joint is None or joint.kind is JointKind.STATIC or not np.isfinite([*point, q]).all()
+        else _through(
+            point[None].astype(np.float64),
+            np.array([q], np.float64),
+            joint.kind.value,
+            joint.axis,
+            joint.origin,
+            (joint.lower, joint.upper),
+        )
+        for joint, point, q in zip(state.joint, state.point_world, state.q, strict=True)
+    )
+
+
+def _through(
+    point: Float[np.ndarray, "T 3"],
+    q: Float[np.ndarray, " T"],
+    kind: str,
+    axis: Float[np.ndarray, "3"],
+    origin: Float[np.ndarray, "3"],
+    seen: tuple[float, float],
+) -> JointLines:
+    """The lines of a joint through points that are where it is at ``q``."""
+    along = np.linspace(*seen, _PIECES)
+    if kind == "prismatic":
         return JointLines(np.median(point - q[:, None] * axis, axis=0) + along[:, None] * axis, None)
     height = (point - origin) @ axis
     flat = point - origin - height[:, None] * axis

@@ -3,8 +3,8 @@
 Below ``world`` are ``entities``, ``trails`` (of the last second) and ``joints``. A take has one ``view_N`` per camera,
 whose ``image`` holds ``rgb``, ``depth``, ``links`` and ``entities``, and below ``joints`` one curve per joint. Tracks
 have one ``camera`` with such an image, joints as they are known at the end (the axis of turning with the arc that was
-seen, or the line of sliding), and curves of the entities: ``confidence``, and below ``joints`` the coordinate in
-degrees or metres where it moves. Without depth nothing of tracks is in space.
+seen, or the line of sliding), what the camera sees as coloured ``points``, and curves of the entities: ``confidence``,
+and below ``joints`` the coordinate in degrees or metres where it moves. Without depth nothing of tracks is in space.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from quest.data.take_format import DEPTH_SCALE_M, encode_depth
 from quest.errors import ConfigError
 from quest.extras import require
+from quest.geometry import invert, lift, transform
 from quest.types import LABELS, Camera, Clip, Take, Tracks, View
 from quest.viz.joint_lines import joint_lines
 from quest.viz.palette import HELD, LINE, MUTED, RGB, query_colour
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
 TRAIL_S = 1.0
 _JPEG_QUALITY = 90
 _CAMERA = "world/camera"
+_CLOUD_POINTS = 8000
+"""Of a frame, in space."""
 
 
 def save_rrd(take: Take, path: str | Path | None, *, every: int = 1) -> None:
@@ -147,6 +151,21 @@ class _Log:
             depth = self.rerun.DepthImage(encode_depth(clip.depth_m[t]), meter=1 / DEPTH_SCALE_M)
             self.stream.log(f"{path}/image/depth", depth)
 
+    def cloud(self, path: str, clip: Clip, t: int) -> None:
+        """What is seen in a frame as coloured points, of every so many pixels."""
+        assert clip.depth_m is not None
+        height, width = clip.depth_m.shape[1:]
+        step = max(1, round((height * width / _CLOUD_POINTS) ** 0.5))
+        v, u = (grid.ravel() for grid in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+        z = clip.depth_m[t, v, u]
+        known = np.isfinite(z) & (z > 0)
+        v, u, z = v[known], u[known], torch.from_numpy(z[known].astype(np.float64))
+        pixel = torch.from_numpy(np.stack((u, v), axis=-1) + 0.5)
+        world_from_cam = invert(torch.from_numpy(clip.cam_from_world[t].astype(np.float64)))
+        points = transform(world_from_cam[None], lift(pixel, z, clip.camera))
+        radii = (0.5 * step / clip.camera.fx * z).numpy()
+        self.stream.log(path, self.rerun.Points3D(points.numpy(), colors=clip.rgb[t, v, u], radii=radii))
+
     def point(self, name: str, points: Float[np.ndarray, "T 3"], t: int, colour: RGB, trail_colour: RGB) -> None:
         """Where an entity is, and its trail."""
         begin = int(np.searchsorted(self.stamp_s, self.stamp_s[t] - TRAIL_S - 1e-6))
@@ -207,8 +226,22 @@ def _tracks_blueprint(clip: Clip) -> rrb.Blueprint:
         return rrb.Blueprint(rrb.Vertical(picture, curves, row_shares=[3, 1]), collapse_panels=True)
     coordinates = rrb.TimeSeriesView(origin="/joints", name="coordinates on joints")
     flat = rrb.Vertical(picture, rrb.Horizontal(curves, coordinates), row_shares=[3, 1])
-    world = rrb.Spatial3DView(origin="/world", name="world")
+    seen = ["/world/**", f"- {image}/depth"]
+    world = rrb.Spatial3DView(origin="/world", contents=seen, name="world", eye_controls=_eye(clip))
     return rrb.Blueprint(rrb.Horizontal(world, flat), collapse_panels=True)
+
+
+def _eye(clip: Clip) -> Any:
+    """Where a viewer begins: behind the first camera, to the right of it and above, looking where it looks."""
+    assert clip.depth_m is not None
+    pose = clip.cam_from_world[0].astype(np.float64)
+    known = clip.depth_m[0][clip.depth_m[0] > 0]
+    far = float(np.median(known)) if len(known) else 1.0
+    right, down, ahead = pose[:3, :3]
+    position = -pose[:3, :3].T @ pose[:3, 3]
+    eye = position + far * (0.35 * right - 0.3 * down - 0.25 * ahead)
+    target = position + far * ahead
+    return require("rerun.blueprint").EyeControls3D(position=eye, look_target=target, eye_up=-down)
 
 
 def _log_take(log: _Log, take: Take) -> None:
@@ -266,6 +299,8 @@ def _log_tracks(log: _Log, clip: Clip, tracks: Tracks) -> None:
     for t in range(len(clip)):
         log.at(t)
         log.frame(_CAMERA, clip, t)
+        if clip.depth_m is not None:
+            log.cloud("world/points", clip, t)
         for k in np.flatnonzero(bound[t]).tolist():
             name, colour = tracks.names[k], query_colour(k) if tracks.visible[t, k] else MUTED
             label = f"{name} ({tracks.state[t, k]})"

@@ -45,6 +45,7 @@ function drawAnswer(one, unit) {
   if (!one.uv_px || one.uv_px[0] === null) return;
   const [x, y] = one.uv_px, lost = one.state === "lost", r = 7 * unit;
   const colour = lost ? "#ff4842" : one.colour;
+  if (one.lines && !lost) drawJoint(one, unit);
   for (const [style, width] of [["#000c", 5], [colour, 2.5]]) {
     pen.strokeStyle = style; pen.lineWidth = width * unit;
     pen.setLineDash(one.state === "held" ? [4 * unit, 3 * unit] : []);
@@ -56,6 +57,19 @@ function drawAnswer(one, unit) {
   }
   pen.setLineDash([]);
   write(one.name || one.label || "point", x + 10 * unit, y - 8 * unit, colour, unit);
+}
+
+function drawJoint(one, unit) {
+  for (const [name, dash] of [["path", []], ["axis", [6 * unit, 4 * unit]]]) {
+    pen.setLineDash(dash);
+    for (const [style, width] of [["#0008", 4], [one.colour, 2]]) {
+      pen.strokeStyle = style; pen.lineWidth = width * unit;
+      pen.beginPath();
+      for (const [x, y] of one.lines[name] || []) pen.lineTo(x, y);
+      pen.stroke();
+    }
+  }
+  pen.setLineDash([]);
 }
 
 function drawFound(one, unit) {
@@ -296,7 +310,7 @@ function take(header, bitmap, first) {
   if (drag) { bitmap.close(); return; }  // what is pointed at stays until it is pointed out
   if (picture) picture.close();
   picture = bitmap; size = header.size; shown = header.frame + first; found = [];
-  answers = header.state.queries.map((one, i) => ({...one, colour: `rgb(${header.colours[i].join(" ")})`}));
+  answers = header.state.queries.map((one, i) => ({...one, colour: `rgb(${header.colours[i].join(" ")})`, lines: header.joints[i]}));
   $("status").textContent = [`frame ${shown}`, `${header.state.stamp_s.toFixed(2)} s`, header.rate ? `${header.rate.toFixed(1)} frames/s` : "",
     header.watched ? "" : "no alarms: no calibration", ...header.state.flags].filter(Boolean).join(" · ");
   const act = key => ({rename: name => send({do: "rename", query: key, name}), remove: () => send({do: "retire", query: key})});
