@@ -11,38 +11,21 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import tyro
 
+from quest.bench.tables import TABLES
+from quest.bench.writing import Table, cell, line, markdown, matches
 from quest.model.weights import DEFAULTS
+from quest.wording import counted
 
 ROOT = Path(__file__).parents[1]
 CARDS = ROOT / "src" / "quest" / "assets" / "weights"
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
-
-
-@dataclass(frozen=True)
-class Table:
-    """One table of a page."""
-
-    file: str
-    """The report, below the folder of results."""
-    title: str
-    columns: str
-    """Columns as ``heading = where``, divided by ``|``. Where in a row a value is: keys joined by dots; ``%`` first for
-    percent, ``!%`` for the percentage of the complement; ``/``, ``of`` or ``to`` between several values."""
-    rows: str = "rows"
-    """Key of the rows: a list, or a mapping whose keys become ``key``; empty if the report is the only row."""
-    each: str = ""
-    """Key of a list in a row of which every entry makes a line; its values come after ``each.``."""
-    only: Mapping[str, Any] = field(default_factory=dict)
-    """Values that a row must have."""
-    about: str = ""
-    """A sentence above the table."""
 
 
 @dataclass(frozen=True)
@@ -59,9 +42,6 @@ BEFORE_FILTER = {
     "13a04d4e3": "; `quest-filter` is the filter as it was then",
 }
 """Commits whose results are of the tracker before the filter, and what to add to that."""
-
-SHARED = ("part", "level", "suite", "in frames", "reading")
-"""Columns that are said once above a table where all its rows agree."""
 
 MOVED = {"protocol": "point", "reading": "moved"}
 FOUND = {"protocol": "semantic", "reading": "all"}
@@ -118,16 +98,6 @@ def alarms(file: str, title: str) -> Table:
     return Table(file, title, about + false + found, each="alarms")
 
 
-def ablation(file: str, title: str, distance: str = "ape", about: str = "") -> Table:
-    """Networks trained alike but for one part, for few steps."""
-    name = {"ape": "APE", "ape_2d": "APE_2d"}[distance]
-    metrics = f"{name} = metrics.{distance} | D@100 = metrics.d100 | Acc % = %metrics.acc | "
-    differences = f"Δ {name} = difference.{distance} | Δ Acc % = %difference.acc"
-    columns = f"objects = source | level = level | variant = variant | {metrics}{differences}"
-    about = f"{about}Δ is the difference from the first row of the same objects."
-    return Table(f"ablations/{file}.json", f"Ablations: {title}", columns, only=MOVED, about=about)
-
-
 def intents(file: str, title: str) -> Table:
     """Two rims of one laptop, one to open and one to lift."""
     counts = f"{OBJECTS}objects/takes/views = objects/takes/views | "
@@ -162,22 +132,6 @@ RESULTS = Page(
         tracking("test.json", "Simulated test objects", suite="standard"),
         discovery("found.json", "Discovery on test objects"),
         Table(
-            "reappearance.json",
-            "Occluded for 60 frames",
-            OBJECTS + "beside = beside | tracker = tracker | occlusions/judged = episodes/judged | right before % = "
-            "%held_before | APE while occluded = ape_hidden | right 5 frames after % = %held_again | "
-            "of those right before % = %held_again_if_before",
-            rows="occlusion",
-            about="The joint moves on while the entity is occluded, and stops.",
-        ),
-        Table(
-            "reappearance.json",
-            "Sixteen identical doors",
-            OBJECTS + "reading = reading | tracker = tracker | objects/tracks = objects/tracks | "
-            "switches per 1,000 frames = metrics.switches | Acc % = %metrics.acc",
-            rows="lockers",
-        ),
-        Table(
             "predicted_joints.json",
             "Joints from predicted tracks",
             OBJECTS + "joint = kind | when = moment | objects/answers = objects/answers | kind right % = %kind_right | "
@@ -200,18 +154,10 @@ RESULTS = Page(
             "The published network on new motions of the objects that taught",
             f"{OBJECTS}level = level | of = reading | tracker = tracker | {TRACKS}median px = metrics.median_px | "
             "APE = metrics.ape | D@100 = metrics.d100 | Acc % = %metrics.acc",
-            about="quest: weights `quest-paper`, with the remedies of the table below. One rig of three still cameras, "
+            about="quest: weights `quest-paper`, with all remedies. One rig of three still cameras, "
             "own materials. Published, on other objects: APE .081, D@100 .155, Acc 86.5 % at level 4.",
         ),
-        ablation(
-            "remedies",
-            "what helps the published network to learn",
-            about="New motions of the objects that taught, 2,500 steps of 8 windows, one seed. ",
-        ),
-        ablation("parts", "queries, 3D, smoothness"),
-        ablation("losses", "each loss left out"),
-        ablation("window", "windows of T frames", "ape_2d"),
-        ablation("slots", "K learned queries"),
+        *(table for recipe in TABLES.values() for table in recipe.pages),
         Table(
             "speed/tracking.json",
             "Time of a frame on two processor cores, alarms on",
@@ -419,30 +365,10 @@ def summary_line(place: str, count: str, measure: str, where: str, rows: Mapping
     return line(cells)
 
 
-def matches(row: Mapping[str, Any], values: Mapping[str, Any]) -> bool:
-    """Whether a row has all of these values."""
-    return all(row[key] == value for key, value in values.items())
-
-
 def as_section(table: Table, folder: Path) -> str:
     """One table with its heading and notes; empty where there is nothing to show."""
     report = read_report(folder / table.file)
-    rows = report.get(table.rows, []) if table.rows else [report] if report else []
-    if isinstance(rows, dict):
-        rows = [{"key": key, **row} for key, row in rows.items()]
-    rows = [row for row in rows if matches(row, table.only)]
-    if not rows:
-        return ""
-    entries = [row | {"each": entry} for row in rows for entry in (row[table.each] if table.each else [{}])]
-    wanted = dict(column.strip().split(" = ") for column in table.columns.split("|"))
-    columns = {heading: [cell(entry, where) for entry in entries] for heading, where in wanted.items()}
-    shared = {h: cells[0] for h, cells in columns.items() if h in SHARED and len(cells) > 1 and len(set(cells)) == 1}
-    columns = {heading: cells for heading, cells in columns.items() if heading not in shared and any(cells)}
-    lines = [line(columns), line("---" for _ in columns), *map(line, zip(*columns.values(), strict=True))]
-    title = f"{table.title}, {report['steps']} steps" if "steps" in report else table.title
-    common = "; ".join(f"{heading}: {value}" for heading, value in shared.items() if value)
-    parts = [f"## {title}", old_tracker(report), table.about, common, "\n".join(lines), "\n".join(notes(report))]
-    return "\n\n".join(part for part in parts if part)
+    return markdown(table, report, notes(report), before=old_tracker(report)) if report else ""
 
 
 def old_tracker(report: Mapping[str, Any]) -> str:
@@ -462,9 +388,12 @@ def notes(report: Mapping[str, Any]) -> list[str]:
         found.insert(0, "**Unfinished**: these are the takes so far.")
     if "machine" in report and "n_takes" in report:
         found.insert(0, f"{report['n_takes']} takes, {report['machine']}.")
-    if "steps" in report:
-        seeds = ", ".join(map(str, report["seeds"]))
-        found.append(f"Steps of {report['batch']} windows on frozen features; seeds {seeds}.")
+    if making := report.get("making"):
+        seeds, taught = ", ".join(map(str, making["seeds"])), counted(making["takes_per_object"], "take")
+        found.append(
+            f"Trainings: {making['steps']} steps of {making['batch']} windows on frozen features, {taught} per object "
+            f"and level, seeds {seeds}, base: {making['base']}."
+        )
     if "calibration" in report:
         found.append(f"Calibration: {report['calibration']}.")
     return found
@@ -478,55 +407,6 @@ def origins(report: Mapping[str, Any]) -> list[dict[str, Any]]:
 def read_report(path: Path) -> dict[str, Any]:
     """A report; empty where there is no such file."""
     return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-
-
-def cell(row: Mapping[str, Any], where: str) -> str:
-    """What a column says of a row."""
-    for between in (" of ", " to ", "/"):
-        if between in where:
-            return between.join(cell(row, part) for part in where.split(between))
-    value: Any = row
-    for key in where.lstrip("!%").split("."):
-        value = value.get(key) if isinstance(value, Mapping) else None
-    if where.startswith("!") and value is not None:
-        value = {"mean": 1 - value["mean"], "low": less(value["high"]), "high": less(value["low"])}
-    return shown(value, percent="%" in where[:2])
-
-
-def less(bound: float | None) -> float | None:
-    """The complement of a share."""
-    return None if bound is None else 1 - bound
-
-
-def shown(value: Any, *, percent: bool = False) -> str:
-    """A value as text: a number, or a number with its interval."""
-    if value is None:
-        return ""
-    if isinstance(value, bool):
-        return "yes" if value else ""
-    if isinstance(value, Mapping):
-        middle, low, high = value.get("share", value.get("mean")), value.get("low"), value.get("high")
-        if middle is None or low is None:
-            return shown(middle, percent=percent)
-        texts = [number(v, percent=percent, fixed=True) if v is not None else "∞" for v in (middle, low, high)]
-        return f"{texts[0]} ({texts[1]}{' to ' if texts[1].startswith('-') else '–'}{texts[2]})"
-    return number(value, percent=percent) if isinstance(value, float) else str(value)
-
-
-def number(value: float, *, percent: bool = False, fixed: bool = False) -> str:
-    """A number with as many digits as mean something."""
-    if percent:
-        return f"{100 * value:.{int(0 < abs(value) < 0.1)}f}"
-    if abs(value) >= 1000:
-        return f"{value:.0f}"
-    if fixed and abs(value) < 1:
-        return f"{value:.{4 if 0 < abs(value) < 0.0095 else 3}f}"
-    return f"{value:.3g}"
-
-
-def line(cells: Iterable[str]) -> str:
-    """One line of a Markdown table."""
-    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

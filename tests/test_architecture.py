@@ -29,7 +29,7 @@ RANKS = {
     "paper": 4,
     "baselines": 5,
     **dict.fromkeys(["evaluation", "viz"], 6),
-    "live": 7,
+    **dict.fromkeys(["bench", "live"], 7),
     "cli": 8,
 }
 """Rooms may import rooms of lower rank. Modules at the package's root, such as types and errors, have rank 0.

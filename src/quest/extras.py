@@ -24,6 +24,7 @@ EXTRA_OF = {
     "tensorboard": "train",
     "onnx": "train",
     "rerun": "viz",
+    "matplotlib": "viz",
     "plotly": "viz",
     "jinja2": "viz",
     "aiohttp": "live",

@@ -59,11 +59,11 @@ def test_a_report_becomes_a_table(tmp_path):
         {"part": "test", "kind": "door", "share": {"mean": 0.25, "low": 0.125, "high": 0.5}, "left_out": None},
         {"part": "test", "kind": "lid", "share": {"mean": 1.0, "low": None, "high": None}, "left_out": None},
     ]
-    (tmp_path / "a.json").write_text(json.dumps({"run": REPORT, "rows": rows, "steps": 20, "seeds": [0], "batch": 4}))
+    (tmp_path / "a.json").write_text(json.dumps({"run": REPORT, "rows": rows}))
     columns = "part = part | kind = kind | right % = %share | wrong % = !%share | empty = left_out"
     section = update.as_section(update.Table("a.json", "Doors", columns), tmp_path)
     assert section.splitlines()[:7] == [
-        "## Doors, 20 steps",
+        "## Doors",
         "",
         "part: test",
         "",

@@ -81,12 +81,23 @@ def test_a_window_is_decoded_as_it_was_trained(clip: Clip):
     embed = tracker.network.embed
 
     def watched(features: Tensor) -> list[Decoded]:
-        seen.append(features.shape[1])
+        seen.extend([features.shape[1]] * len(features))
         return embed(features)
 
     tracker.network.embed = watched  # type: ignore[method-assign]
     tracker.track(clip)
     assert seen == [1, 2, 3, 4, 4, 4]
+
+
+@pytest.mark.parametrize("at_a_time", [1, 2, 5])
+def test_how_many_frames_are_decoded_together_changes_nothing(
+    clip: Clip, at_a_time: int, monkeypatch: pytest.MonkeyPatch
+):
+    whole = make().track(clip)
+    monkeypatch.setattr("quest.paper.tracker._AT_A_TIME", at_a_time)
+    parts = make().track(clip)
+    np.testing.assert_allclose(parts.uv_px, whole.uv_px, atol=1e-3)
+    np.testing.assert_allclose(parts.point_world, whole.point_world, atol=1e-4)
 
 
 def test_only_confident_slots_are_reported(clip: Clip):

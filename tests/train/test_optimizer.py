@@ -70,7 +70,8 @@ def test_a_step_of_muon_is_that_of_torch(fast: bool, monkeypatch: pytest.MonkeyP
 def test_adamw_alone_is_that_of_torch() -> None:
     one, other = Small(), Small()
     one.learn(make_optimizer(one, one.trained(), replace(CONFIG, optimizer="adamw")), steps=3)
-    other.learn(torch.optim.AdamW(other.trained(), lr=CONFIG.learning_rate, weight_decay=CONFIG.weight_decay), steps=3)
+    same = {"lr": CONFIG.learning_rate, "weight_decay": CONFIG.weight_decay, "fused": True}
+    other.learn(torch.optim.AdamW(other.trained(), **same), steps=3)
     assert all(torch.equal(p, q) for p, q in zip(one.parameters(), other.parameters(), strict=True))
 
 

@@ -1,13 +1,96 @@
-"""``quest bench``: trackers on the benchmarks of others."""
+"""``quest bench``: the tables of the publication, and trackers on the benchmarks of others."""
 
 from __future__ import annotations
 
+import json
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import tyro
+
+from quest.bench.settings import Making
 from quest.cli.evaluate import Lineup, TrackerName, table_console
+from quest.errors import ConfigError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+ALL = "all"
+SMOKE: Mapping[str, Any] = {
+    "taught": ("procedural:chest-0,cabinet-0",),
+    "new": ("procedural:chest-110001",),
+    "takes_per_object": 1,
+    "levels": (1,),
+    "trackers": ("quest", "hold-still", "lk-grid"),
+    "seeds": (0,),
+    "steps": 4,
+    "batch": 2,
+    "noise": (0.0, 0.05),
+    "resamples": 50,
+}
+"""So small that every table is made in minutes, to see that all of it works."""
+
+
+@dataclass(frozen=True)
+class BenchTable:
+    """Make tables of the publication: JSON, Markdown, LaTeX and pictures.
+
+    What they rest on is made as far as it is missing, and kept in --work: simulated takes, trainings of the
+    published network and its variants, answers of all trackers. Run a command that was stopped again and it goes on.
+    """
+
+    tables: tyro.conf.Positional[tuple[str, ...]]
+    """Tables: comparison, levels, window, slots, losses, remedies, noise, drift, failures, intents, speed, or all."""
+    making: Annotated[Making, tyro.conf.arg(name="")] = field(default_factory=Making)
+    smoke: bool = False
+    """As small as it can be, to try everything in minutes; the figures mean nothing and the files say so."""
+    out: Path = Path("outputs/bench")
+    """Folder of the tables."""
+
+    def run(self) -> int:
+        """Make the tables.
+
+        Raises:
+            ConfigError: no such table, or a folder with runs of other settings.
+            MissingExtraError: an extra is missing: viz for pictures, sim to render takes.
+            ObjectError, RendererError: takes cannot be made here.
+        """
+        from quest.bench.tables import TABLES
+        from quest.bench.workbench import Workbench
+        from quest.bench.writing import draw, latex, markdown
+        from quest.cli.console import Console
+        from quest.data.provenance import command_line
+        from quest.evaluation.report import provenance
+        from quest.evaluation.results import write_report
+        from quest.whole_file import whole_file
+
+        if unknown := [name for name in self.tables if name not in (*TABLES, ALL)]:
+            raise ConfigError(f"bench: no table {unknown[0]!r}; expected some of {', '.join((*TABLES, ALL))}")
+        making = self.making
+        if self.smoke:
+            making = replace(making, **SMOKE, work=making.work / "smoke")
+        console, output = Console(stderr=True, highlight=False), table_console(170)
+        for name in TABLES if ALL in self.tables else dict.fromkeys(self.tables):
+            recipe = TABLES[name]
+            found = recipe.make(Workbench(making, console))
+            about = {"table": name, "smoke": self.smoke, "making": making.described()}
+            report = {**provenance(), "command": command_line(), **about, **found}
+            write_report(report, self.out / f"{name}.json")
+            plain = json.loads(json.dumps(report, default=asdict))
+            said = ["**A trial: these figures mean nothing.**"] * self.smoke
+            parts = list(filter(None, (markdown(table, plain, said) for table in recipe.pages)))
+            texts = {"md": "\n\n".join(parts) + "\n", "tex": "\n".join(latex(t, plain) for t in recipe.pages)}
+            for kind, text in texts.items():
+                with whole_file(self.out / f"{name}.{kind}") as partial:
+                    partial.write_text(text, encoding="utf-8")
+            if recipe.figure is not None:
+                rows = [row for row in plain["rows"] if row["reading"] == "moved"]
+                draw(recipe.figure, recipe.about, rows, [self.out / f"{name}.{kind}" for kind in ("svg", "png")])
+            output.print(texts["md"], soft_wrap=True, markup=False)
+            console.print(f"wrote {self.out / name}.json")
+        return 0
 
 
 @dataclass(frozen=True)
@@ -53,7 +136,7 @@ class BenchTapvid:
         from quest.cli.console import Console
         from quest.cli.progress import counting
         from quest.data.provenance import combined_hash, file_hash
-        from quest.errors import ConfigError, InputError
+        from quest.errors import InputError
         from quest.evaluation.real.run import KeptAnswers, write_set
         from quest.evaluation.real.table import FULL_WIDTH, real_table
         from quest.evaluation.tapvid.run import COLUMNS, LEGEND, Setting, evaluate_videos

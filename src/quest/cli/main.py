@@ -51,6 +51,8 @@ class Entry:
     """The command's dataclass in it."""
     summary: str
     """One line for the list."""
+    words: tuple[str, ...] = ()
+    """Arguments that come before those that are given."""
 
     def load(self) -> type[Command]:
         """The command's dataclass."""
@@ -66,6 +68,21 @@ class Group:
     commands: Mapping[str, Entry]
     """By their second word."""
 
+
+_TABLES = {
+    "all": "All of these tables; --smoke tries them in minutes.",
+    "comparison": "Every tracker at every level.",
+    "levels": "The published network without its queries, 3D or smoothness; chained flow.",
+    "window": "Windows of 2, 4 and 8 frames.",
+    "slots": "4, 8 and 16 learned queries.",
+    "losses": "Each loss left out.",
+    "remedies": "What helps the published network to learn.",
+    "noise": "Every tracker on noisy colours.",
+    "drift": "Distance over the course of a take.",
+    "failures": "Long occlusions, and banks of like doors.",
+    "intents": "What opens a laptop and what lifts it.",
+    "speed": "Time and memory of every tracker.",
+}
 
 COMMANDS: dict[str, Entry | Group] = {
     "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
@@ -110,8 +127,11 @@ COMMANDS: dict[str, Entry | Group] = {
     "train": Entry("train", "Train", "Train a network on takes."),
     "eval": Entry("evaluate", "Eval", "Score trackers."),
     "bench": Group(
-        "Score trackers on the benchmarks of others.",
-        {"tapvid": Entry("bench", "BenchTapvid", "TAP-Vid and TAPVid-3D, in two or three dimensions.")},
+        "Make the tables of the publication, and score trackers on the benchmarks of others.",
+        {
+            **{name: Entry("bench", "BenchTable", about, (name,)) for name, about in _TABLES.items()},
+            "tapvid": Entry("bench", "BenchTapvid", "TAP-Vid and TAPVid-3D, in two or three dimensions."),
+        },
     ),
     "calibrate": Entry("calibrate", "Calibrate", "Fit the monitor to takes."),
     "eval-monitor": Entry("evaluate_monitor", "EvalMonitor", "Score the monitor beside plainer rules."),
@@ -141,7 +161,7 @@ def parse(arguments: Sequence[str]) -> Command:
         words.append(rest.pop(0))
         if isinstance(chosen, Entry):
             config = (tyro.conf.HelptextFromCommentsOff,)
-            return tyro.cli(chosen.load(), prog=" ".join(words), args=rest, config=config)
+            return tyro.cli(chosen.load(), prog=" ".join(words), args=[*chosen.words, *rest], config=config)
         here, commands = chosen, chosen.commands
 
 

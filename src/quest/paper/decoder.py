@@ -47,13 +47,21 @@ class Look(nn.Module):
         """What the queries read, to be added to ``x``, and where the first head read it."""
         q, key, value = (w.unflatten(axis, (self.heads, -1)) for w, axis in
                          ((self.q(self.norm(x)), -1), (self.k.weight, 0), (self.v.weight, 0)))  # fmt: skip
-        asked = (torch.einsum("btkhc,hcd->btkhd", q, key) / math.sqrt(q.shape[-1])).flatten(2, 3)
-        # What is the same at all tokens, time, changes no attention.
-        score = asked @ tokens.project.weight @ tokens.features.mT + asked @ tokens.place.mT
-        attention = score.softmax(-1)
-        read = tokens.project(attention @ tokens.features) + attention @ tokens.place + tokens.time[:, None]
-        by_head = torch.einsum("btkhd,hcd->btkhc", read.unflatten(2, (-1, self.heads)), value).flatten(3)
-        return self.out(by_head + self.v.bias), attention[..., :: self.heads, :]
+        q = q / math.sqrt(q.shape[-1])
+        features, project, place = tokens.features, tokens.project, tokens.place
+        asked = torch.einsum("btkhc,hce->btkhe", q, key @ project.weight).flatten(2, 3)
+        # What is the same at all tokens, time and the bias of the projection, changes no attention.
+        of_place = torch.einsum("btkhc,hcn->btkhn", q, key @ place.mT).flatten(2, 3)
+        attention = (asked @ features.mT + of_place).softmax(-1)
+        read = (attention @ features).unflatten(2, (-1, self.heads))
+        at = attention.unflatten(2, (-1, self.heads))
+        same = torch.einsum("td,hcd->thc", tokens.time + project.bias, value)[:, None]
+        by_head = (
+            torch.einsum("btkhe,hce->btkhc", read, value @ project.weight)
+            + torch.einsum("btkhn,hcn->btkhc", at, value @ place.mT)
+            + same
+        )
+        return self.out(by_head.flatten(3) + self.v.bias), attention[..., :: self.heads, :]
 
 
 class Attention(nn.Module):

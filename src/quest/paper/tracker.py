@@ -7,9 +7,8 @@ in the frame in which it is taken: whether there is an entity by its confidence,
 from __future__ import annotations
 
 import hashlib
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,12 +37,15 @@ LOST_BELOW = 0.3
 """Confidence below which a query is lost."""
 PATIENCE = 8
 """Frames in which a label or slot looks for its entity."""
+_AT_A_TIME = 32
+"""Frames whose windows are decoded together."""
 
 
 class PaperTracker:
     """Follows entities through clips with the published network.
 
-    Discovery takes a slot whose confidence is above ``found_above``, a label one above ``prompt_above``.
+    Discovery takes a slot whose confidence is above ``found_above``, a label one above ``prompt_above``. A query keeps
+    its slot; one that is not ``persistent`` goes on with whatever slot is nearest to its last answer.
     """
 
     name = "quest"
@@ -56,12 +58,14 @@ class PaperTracker:
         weights_hash: str | None = None,
         found_above: float = FOUND_ABOVE,
         prompt_above: float = PROMPT_ABOVE,
+        persistent: bool = True,
     ) -> None:
         self.network = network.to(device).eval()
         self.device = device
         self.weights_hash = weights_hash
         self.found_above = found_above
         self.prompt_above = prompt_above
+        self.persistent = persistent
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
         """Track a whole clip; the answer for a frame does not depend on later ones.
@@ -80,46 +84,72 @@ class PaperTracker:
             chosen = [_Choice(f"{label} {k}", label, s, 0) for k, (s, label) in enumerate(found)]
         else:
             chosen = self._choose(slots, queries, Letterbox(clip.camera, self.network.config.encoder.image_size))
-        return _tracks(clip, slots, chosen)
+        return _tracks(clip, *((slots, chosen) if self.persistent else _nearest_anew(slots, chosen)))
 
     def _slots(self, clip: Clip) -> _Slots:
         """What all slots answer in every frame, each seen in a window of the newest T frames."""
-        config = self.network.config
+        config, parts = self.network.config, list[_Slots]()
         box = Letterbox(clip.camera, config.encoder.image_size)
-        lens = [[box.camera.fx, box.camera.fy, box.camera.cx, box.camera.cy]]
-        intrinsics, reference = torch.tensor(lens, dtype=torch.float32, device=self.device), None
-        ring: deque[Tensor] = deque(maxlen=config.window)
-        rows: list[list[np.ndarray]] = []
+        before = torch.zeros(0, config.encoder.grid**2, config.encoder.width, device=self.device)
+        reference: tuple[Tensor, Tensor, Tensor] | None = None
         with torch.inference_mode(), torch.autocast(self.device.type, torch.bfloat16, fast_bfloat16(self.device)):
-            for t in range(len(clip)):
-                frame = clip.frame(t)
-                depth_m = (
-                    np.zeros((box.size, box.size), np.float32) if frame.depth_m is None else box.depth(frame.depth_m)
-                )
-                depth = torch.from_numpy(np.ascontiguousarray(depth_m)).to(self.device)[None]
-                pose = torch.from_numpy(
-                    np.asarray(frame.cam_from_world, np.float64)
-                )  # on the CPU: not all have doubles
+            for start in range(0, len(clip), _AT_A_TIME):
+                some = range(start, min(start + _AT_A_TIME, len(clip)))
+                rgb, depth, pose = self._read(clip, some, box)
+                lens = [[box.camera.fx, box.camera.fy, box.camera.cx, box.camera.cy]]
+                intrinsics = torch.tensor(lens, dtype=torch.float32, device=self.device)
                 if reference is None:
-                    reference = pose, *reference_of(depth, intrinsics, cell_px=config.cell_px)
-                start, centre, scale = reference
-                image = torch.from_numpy(np.ascontiguousarray(box.rgb(frame.rgb))).to(self.device)[None]
-                moved = exact_product(start, invert(pose)).float().to(self.device)
-                features = self.network.encode(image)[:, None].float()
-                frames = FrameBatch(features, depth[None], intrinsics, moved[None, None], centre, scale)
-                ring.append(features)
-                last = self.network.embed(torch.cat(list(ring), dim=1))[-1]
-                answers = self.network.answer([Decoded(last.embedding[:, -1:], last.where[:, -1:])], frames)
-                metric = answers.point[0, 0].cpu().double() * scale.cpu() + centre.cpu()
-                parts = (
-                    box.to_source(answers.uv[0, 0].cpu().numpy() * box.size),
-                    transform(invert(start)[None], metric).numpy(),
-                    answers.logit[0, 0].sigmoid().cpu().numpy(),
-                    answers.label_logits[0, 0].softmax(-1).cpu().numpy(),
-                    np.array(bool((depth > 0).any())),
+                    reference = pose[0], *reference_of(depth[:1], intrinsics, cell_px=config.cell_px)
+                first, centre, scale = reference
+                moved = exact_product(first, invert(pose)).float().to(self.device)
+                known = torch.cat((before, self.network.encode(rgb).float()))
+                last = self._windows(known, len(before))
+                n = len(some)
+                frames = FrameBatch(
+                    known[len(before) :, None],
+                    depth[:, None],
+                    intrinsics.expand(n, -1),
+                    moved[:, None],
+                    centre.expand(n, -1),
+                    scale.expand(n),
                 )
-                rows.append([np.asarray(part) for part in parts])
-        return _Slots(*(np.stack(column) for column in zip(*rows, strict=True)))
+                answers = self.network.answer([last], frames)
+                metric = answers.point[:, 0].cpu().double() * scale.cpu() + centre.cpu()
+                parts.append(
+                    _Slots(
+                        box.to_source(answers.uv[:, 0].cpu().numpy() * box.size),
+                        transform(invert(first), metric).numpy(),
+                        answers.logit[:, 0].sigmoid().cpu().numpy(),
+                        answers.label_logits[:, 0].softmax(-1).cpu().numpy(),
+                        (depth > 0).flatten(1).any(dim=1).cpu().numpy(),
+                    )
+                )
+                before = known[max(0, len(known) - config.window + 1) :]
+        return _Slots(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(_Slots)))
+
+    def _read(self, clip: Clip, some: range, box: Letterbox) -> tuple[Tensor, Tensor, Tensor]:
+        """Letterboxed colours and depth of some frames, zero where there is none, and their poses."""
+        frames = [clip.frame(t) for t in some]
+        rgb = np.stack([box.rgb(frame.rgb) for frame in frames])
+        none = np.zeros((box.size, box.size), np.float32)
+        depth_m = np.stack([none if frame.depth_m is None else box.depth(frame.depth_m) for frame in frames])
+        pose = np.stack([np.asarray(frame.cam_from_world, np.float64) for frame in frames])
+        # Poses stay on the CPU: not all devices have doubles.
+        return torch.from_numpy(rgb).to(self.device), torch.from_numpy(depth_m).to(self.device), torch.from_numpy(pose)
+
+    def _windows(self, features: Float[Tensor, "S N E"], earlier: int) -> Decoded:
+        """The newest frame of the window that ends at every frame but the ``earlier`` ones.
+
+        A clip's first frames have shorter windows.
+        """
+        t = self.network.config.window
+        short = range(earlier, min(t - 1, len(features)))
+        groups = [features[None, : end + 1] for end in short]
+        if len(features) >= max(t, earlier + 1):
+            begin = max(0, earlier - t + 1)
+            groups.append(features[begin:].unfold(0, t, 1).permute(0, 3, 1, 2))
+        decoded = [self.network.embed(group)[-1] for group in groups]
+        return Decoded(*(torch.cat([getattr(d, name)[:, -1:] for d in decoded]) for name in ("embedding", "where")))
 
     def _choose(self, slots: _Slots, queries: Sequence[Query], box: Letterbox) -> list[_Choice]:
         """The slot that each query takes, and the frame from which on; labels take theirs before points do."""
@@ -237,6 +267,21 @@ def _slots_at(slots: _Slots, t: int, queries: Sequence[Query], taken: Sequence[i
     cost[..., list(taken)] += 2 * len(queries) * (1 + float(cost.abs().max()))
     slot, found = assign_slots(cost, wanted)
     return torch.where(found, slot, cost.argmin(dim=-1))[0].tolist()
+
+
+def _nearest_anew(slots: _Slots, chosen: Sequence[_Choice]) -> tuple[_Slots, list[_Choice]]:
+    """A slot for every choice that answers in each frame what is nearest to the choice's last answer."""
+    index = np.zeros((len(slots.confidence), len(chosen)), np.int64)
+    for k, choice in enumerate(chosen):
+        if choice.slot is not None:
+            index[: choice.frame + 1, k] = choice.slot
+            for t in range(choice.frame + 1, len(index)):
+                last = slots.uv_px[t - 1, index[t - 1, k]]
+                index[t, k] = np.linalg.norm(slots.uv_px[t] - last, axis=-1).argmin()
+    frames = np.arange(len(index))[:, None]
+    names = ("uv_px", "point_world", "confidence", "label_p")
+    taken = replace(slots, **{name: getattr(slots, name)[frames, index] for name in names})
+    return taken, [choice if choice.slot is None else replace(choice, slot=k) for k, choice in enumerate(chosen)]
 
 
 def _tracks(clip: Clip, slots: _Slots, chosen: Sequence[_Choice]) -> Tracks:

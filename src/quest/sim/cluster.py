@@ -76,7 +76,7 @@ def produce_on_cluster(
     if store.url.startswith("memory:"):
         raise ConfigError(f"store {store.url}: workers of a cluster cannot reach this process's memory; give another")
     ray = require("ray")
-    with _connected(ray, cluster):
+    with connected(ray, cluster):
         crew = _Crew(ray, list(specs), store, opener, cluster, report)
         try:
             crew.work()
@@ -85,7 +85,7 @@ def produce_on_cluster(
 
 
 @contextmanager
-def _connected(ray: ModuleType, cluster: ClusterSettings) -> Iterator[None]:
+def connected(ray: ModuleType, cluster: ClusterSettings) -> Iterator[None]:
     """Within a cluster: the one that this process is connected to already, or the named one."""
     if ray.is_initialized():
         yield

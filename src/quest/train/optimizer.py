@@ -39,7 +39,7 @@ def make_optimizer(
     groups: list[dict[str, Any]] = [{"params": [p for p in trained if id(p) not in chosen], SHARE: 1.0}]
     if refined:
         groups.append({"params": list(refined), SHARE: config.refined_rate})
-    adamw = torch.optim.AdamW(groups, lr=lr, weight_decay=decay)
+    adamw = torch.optim.AdamW(groups, lr=lr, weight_decay=decay, fused=True)
     if not inner:
         return adamw
     muon = Muon(inner, lr=lr, weight_decay=decay)

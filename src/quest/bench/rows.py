@@ -1,4 +1,4 @@
-"""Tables of variants: pooled metrics over seeds, and what a variant loses against its reference on the same answers.
+"""Rows of tables: pooled metrics over seeds, and how a line differs from its reference on the same answers.
 
 An answer is one (take, view, entity) of one seed. Intervals are over objects: an object is drawn with all its takes,
 views, entities and seeds. Differences pair every answer with the reference's of the same seed.
@@ -20,15 +20,15 @@ from quest.evaluation.records import Discovery, EntityRecord
 from quest.evaluation.summary import READINGS, discovery_values, record_sums
 from quest.evaluation.take_suite import TakeSuite
 
-PAIRED = ("ape", "ape_2d", "d100", "acc")
+PAIRED = ("ape", "ape_2d", "d50", "d100", "acc", "switches", "slope")
 """Metrics that are compared with the reference's."""
 
 
 @dataclass(frozen=True)
 class Answers:
-    """What one variant answered in one seed."""
+    """What one line of a table answered in one seed."""
 
-    variant: str
+    line: str
     """Its name in the table."""
     seed: int
     """Of its training."""
@@ -37,27 +37,27 @@ class Answers:
     discoveries: tuple[Discovery, ...] = ()
     """Per take and view of the semantic protocol."""
     reference: str | None = None
-    """The variant that it is compared with; None for the reference itself."""
+    """The line that it is compared with; None for the reference itself."""
 
 
 Key = tuple[str, str, str, str, int, str]
 Numbered = tuple[int, EntityRecord]
 
 
-def ablation_rows(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[dict[str, Any]]:
-    """Rows per protocol, part, source, suite, level, reading and variant, in the order of the variants.
+def rows_of(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[dict[str, Any]]:
+    """Rows per protocol, part, source, suite, level, reading and line, in the order of the lines.
 
     ``metrics`` are pooled over seeds, ``tracks`` count each (take, view, entity) once, ``seeds`` has every seed by
-    itself, and ``difference`` is variant - reference over the answers of the same seeds: None for the reference, and
+    itself, and ``difference`` is line - reference over the answers of the same seeds: None for the reference, and
     where it has no answers under this protocol.
 
     Args:
-        answers: of all variants and seeds.
+        answers: of all lines and seeds.
         resamples: of the bootstrap over objects.
         seed: of the bootstrap; every row draws from a generator of its own.
 
     Raises:
-        InputError: two answers are of one variant and seed, or a variant and its reference were asked about different
+        InputError: two answers are of one line and seed, or a line and its reference were asked about different
             entities or frames.
     """
     groups: dict[Key, dict[str, list[Numbered]]] = defaultdict(lambda: defaultdict(list))
@@ -65,24 +65,24 @@ def ablation_rows(answers: Sequence[Answers], *, resamples: int, seed: int) -> l
     references: dict[str, str | None] = {}
     known: set[tuple[str, int]] = set()
     for a in answers:
-        if (a.variant, a.seed) in known:
-            raise InputError(f"ablation: expected variant {a.variant!r}, seed {a.seed} once, got it twice")
-        known.add((a.variant, a.seed))
-        references[a.variant] = a.reference
+        if (a.line, a.seed) in known:
+            raise InputError(f"table: expected line {a.line!r}, seed {a.seed} once, got it twice")
+        known.add((a.line, a.seed))
+        references[a.line] = a.reference
         for record in a.records:
             for reading in READINGS:
                 if reading == "all" or record.moved:
-                    groups[_key(record, reading)][a.variant].append((a.seed, record))
+                    groups[_key(record, reading)][a.line].append((a.seed, record))
         for discovery in a.discoveries:
-            found[_key(discovery, "all")][a.variant].append(discovery)
+            found[_key(discovery, "all")][a.line].append(discovery)
     rows = []
     for key in sorted(groups):
-        for variant, reference in references.items():
-            own, other = groups[key].get(variant), groups[key].get(reference or "")
+        for line, reference in references.items():
+            own, other = groups[key].get(line), groups[key].get(reference or "")
             if own:
                 head = dict(zip(("protocol", "part", "source", "suite", "level", "reading"), key, strict=True))
-                row = _row(variant, own, other, found[key][variant], head["protocol"] == "semantic", resamples, seed)
-                rows.append({"variant": variant, "reference": reference} | head | row)
+                row = _row(line, own, other, found[key][line], head["protocol"] == "semantic", resamples, seed)
+                rows.append({"line": line, "reference": reference} | head | row)
     return rows
 
 
@@ -92,7 +92,7 @@ def _key(kept: EntityRecord | Discovery, reading: str) -> Key:
 
 
 def _row(
-    variant: str,
+    line: str,
     own: list[Numbered],
     other: list[Numbered] | None,
     found: list[Discovery],
@@ -109,17 +109,18 @@ def _row(
     for number in np.unique(of_seed).tolist():
         chosen = of_seed == number
         means = {name: Sums(s.total[chosen], s.count[chosen]).mean() for name, s in sums.items()}
-        seeds.append({"seed": number} | {name: means[name] for name in ("ape", "d100", "acc")})
+        seeds.append({"seed": number} | {name: means[name] for name in ("ape", "ape_2d", "d100", "acc")})
     found_values = discovery_values(pool, found, semantic=semantic)
     difference = None
     if other and set(of_seed.tolist()) & {s for s, _ in other}:
-        kept, gap = _paired(variant, own, other)
+        kept, gap = _paired(line, own, other)
         difference = {name: pool.of(kept).ratio(gap[name]) for name in PAIRED}
     return {
         "objects": pool.objects,
         "takes": len({r.take for r in pool.records}),
         "tracks": len({(r.take, r.view, r.entity) for r in pool.records}),
         "metrics": {name: pool.ratio(s) for name, s in sums.items()}
+        | {"median_px": pool.median(lambda r: r.distance_px[r.first_frame :])}
         | {name: found_values[name] for name in ("precision", "recall")},
         "difference": difference,
         "seeds": seeds,
@@ -131,19 +132,19 @@ def _sums(records: Sequence[EntityRecord]) -> dict[str, Sums]:
     return {name: sums[name] for name in PAIRED}
 
 
-def _paired(variant: str, own: list[Numbered], other: list[Numbered]) -> tuple[list[EntityRecord], dict[str, Sums]]:
-    """The variant's records whose seed the reference has, and its differences from the reference."""
+def _paired(line: str, own: list[Numbered], other: list[Numbered]) -> tuple[list[EntityRecord], dict[str, Sums]]:
+    """The line's records whose seed the reference has, and its differences from the reference."""
     seeds = {s for s, _ in own} & {s for s, _ in other}
     mine = {(s, r.take, r.view, r.entity): r for s, r in own if s in seeds}
     theirs = {(s, r.take, r.view, r.entity): r for s, r in other if s in seeds}
     alone = min(mine.keys() ^ theirs.keys(), default=None)
     if alone is not None:
         raise InputError(
-            f"ablation: expected answers of {variant!r} and of its reference to the same entities, got only one of "
+            f"table: expected answers of {line!r} and of its reference to the same entities, got only one of "
             f"them in seed {alone[0]}, take {alone[1]!r}, view {alone[2]}, entity {alone[3]}; evaluate both again"
         )
     a, b = _sums(list(mine.values())), _sums([theirs[key] for key in mine])
     for name in PAIRED:
         if not np.array_equal(a[name].count, b[name].count):
-            raise InputError(f"ablation: {variant!r} and its reference were asked about different frames")
+            raise InputError(f"table: {line!r} and its reference were asked about different frames")
     return list(mine.values()), {name: Sums(a[name].total - b[name].total, a[name].count) for name in PAIRED}

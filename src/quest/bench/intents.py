@@ -1,7 +1,4 @@
-"""Measure whether what opens a thing and what lifts it are told apart and followed, both asked for by the same label.
-
-    quest generate --out TAKES --objects procedural:laptop-112000,...
-    python benchmarks/intents.py --takes TAKES --split test --out benchmarks/results/intents/intents.json
+"""Whether what opens a thing and what lifts it are told apart and followed, both asked for by the same label.
 
 Judged are views in which exactly one entity of a label opens and exactly one lifts, such as the rims of a laptop.
 """
@@ -15,17 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from jaxtyping import Float, Int
 
-import quest
 from quest.data.cut import cut_clip
-from quest.data.split import SplitPart
-from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import GATE, distance, identity
 from quest.evaluation.protocols import ClipTracker, first_visible
-from quest.evaluation.study import Study
 from quest.geometry import invert, transform
 from quest.types import INTENTS, Query, Take, View
 
@@ -161,27 +153,3 @@ def intent_rows(answers: Sequence[IntentAnswer], *, resamples: int = 1000, seed:
         counts = {"objects": pool.objects, "takes": len({a.take for a in chosen}), "views": len(chosen)}
         rows.append({"part": part, "source": source} | counts | {n: pool.mean(attrgetter(n)) for n in MEASURED})
     return rows
-
-
-@dataclass(frozen=True)
-class Intents(Study):
-    """Shares of views in which both intents give distinct, stable tracks."""
-
-    apart_px: float = 0.0
-    """Begin each stream with the first frame in which both are seen this far apart; 0 begins with the take."""
-
-    def run(self) -> int:
-        """Track, print, write."""
-        tracker = quest.load(self.weights)
-
-        def judge(store: TakeStore, name: str, part: SplitPart) -> list[IntentAnswer]:
-            take = store.read(name)
-            views = range(len(take.views))
-            return [a for v in views for a in judge_intents(tracker, take, v, part=part, apart_px=self.apart_px)]
-
-        about = {"weights_hash": tracker.weights_hash, "apart_px": self.apart_px}
-        return self.measure(judge, intent_rows, about, lambda answers: {"answers": answers})
-
-
-if __name__ == "__main__":
-    raise SystemExit(tyro.cli(Intents).run())

@@ -1,7 +1,4 @@
-"""What becomes of hidden entities (suite occlusion), and how often identities switch among likes (suite lockers).
-
-    quest eval --takes SUITES --trackers quest lk hold-still --out RUN.json
-    python benchmarks/reappearance.py RUN.records.parquet --out benchmarks/results/reappearance.json
+"""What becomes of entities while they are occluded and after (suite occlusion).
 
 An episode is the first run of at least 20 frames in which a moved entity is hidden, after it was seen moving. It is
 judged five frames after its entity is seen again. Protocol point. Records do not hold the truth, but the distance of
@@ -15,20 +12,15 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
-from rich.console import Console
 
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Pool, Value
 from quest.evaluation.drift import clopper_pearson
 from quest.evaluation.records import EntityRecord
-from quest.evaluation.report import gather, provenance, rows_table, write_report
 from quest.evaluation.stream_record import runs
-from quest.evaluation.summary import summarise
 from quest.evaluation.take_suite import TakeSuite
 
 STILL = "hold-still"
@@ -176,48 +168,3 @@ def share_of(pool: Pool[Episode], flag: Callable[[Episode], bool]) -> Share | No
     if value is None:
         return None
     return Share(hits, value.count, value.mean, *clopper_pearson(hits, value.count), value)
-
-
-@dataclass(frozen=True)
-class Reappearance:
-    """Identities after occlusion and among look-alikes, with intervals."""
-
-    records: tyro.conf.Positional[tuple[Path, ...]]
-    """Files of records (.records.parquet)."""
-    resamples: int = 1000
-    """Of the bootstrap over objects."""
-    seed: int = 0
-    """Of the bootstrap."""
-    out: Path | None = None
-    """Result file."""
-
-    def run(self) -> int:
-        """Judge, print, write."""
-        records, origins = gather(self.records)
-        hidden = reappearances(records, resamples=self.resamples, seed=self.seed)
-        lockers = summarise(
-            [r for r in records if TakeSuite.of(r.take).name == "lockers" and r.subject.protocol == "point"],
-            resamples=self.resamples,
-            seed=self.seed,
-        )
-        console = Console(highlight=False)
-        plain = [vars(row) | {"metrics": vars(row.metrics)} for row in lockers]
-        for title, rows in (("suite occlusion", hidden), ("suite lockers", plain)):
-            console.print(rows_table(title, rows))
-        if self.out is not None:
-            report = provenance() | {
-                "least_hidden": LEAST_HIDDEN,
-                "after_frames": AFTER_FRAMES,
-                "moving": MOVING,
-                "resamples": self.resamples,
-                "seed": self.seed,
-                "origins": origins,
-                "occlusion": hidden,
-                "lockers": lockers,
-            }
-            write_report(report, self.out)
-        return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(tyro.cli(Reappearance).run())

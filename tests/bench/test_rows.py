@@ -1,4 +1,4 @@
-"""Tables of variants over seeds, and the rows of the ablation benchmark."""
+"""Rows over seeds, their differences, and the encoder whose answers are kept."""
 
 from __future__ import annotations
 
@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks import ablation_variants as variants
-from benchmarks.ablation_rows import Answers, ablation_rows
-from benchmarks.cached_encoder import serve_cached
-from quest.baselines import TRACKERS
-from quest.errors import ConfigError, InputError
+from quest.bench.encoded import serve_cached
+from quest.bench.rows import Answers, rows_of
+from quest.errors import InputError
 from quest.evaluation.records import Discovery, EntityRecord
-from quest.paper.objective import LOSSES
 from tests.evaluation.answers import make_answer
 from tests.paper.tiny import make_paper
 
@@ -40,7 +37,7 @@ def answers(rng: np.random.Generator, *, first_frame: int = 2, **about) -> tuple
 
 
 def row(rows: list[dict[str, Any]], variant: str, reading: str = "all", protocol: str = "point") -> dict[str, Any]:
-    return next(r for r in rows if (r["variant"], r["reading"], r["protocol"]) == (variant, reading, protocol))
+    return next(r for r in rows if (r["line"], r["reading"], r["protocol"]) == (variant, reading, protocol))
 
 
 def test_means_and_differences_equal_a_plain_loop() -> None:
@@ -48,7 +45,7 @@ def test_means_and_differences_equal_a_plain_loop() -> None:
     full, less = ({s: answers(rng) for s in (0, 1)} for _ in range(2))
     runs = [Answers("full", s, r) for s, r in full.items()]
     runs += [Answers("less", s, r, reference="full") for s, r in less.items()]
-    rows = ablation_rows(runs, **SETTINGS)
+    rows = rows_of(runs, **SETTINGS)
     for reading in ("all", "moved"):
         both = []
         for variant, records in (("full", full), ("less", less)):
@@ -71,7 +68,7 @@ def test_means_and_differences_equal_a_plain_loop() -> None:
 
 def test_an_equal_answer_differs_by_nothing_with_certainty() -> None:
     records = answers(np.random.default_rng(0))
-    rows = ablation_rows([Answers("full", 0, records), Answers("same", 0, records, reference="full")], **SETTINGS)
+    rows = rows_of([Answers("full", 0, records), Answers("same", 0, records, reference="full")], **SETTINGS)
     gap = row(rows, "same")["difference"]["ape"]
     assert (gap.mean, gap.low, gap.high) == (0.0, 0.0, 0.0)
 
@@ -81,10 +78,10 @@ def test_only_common_seeds_are_paired() -> None:
     full, less = answers(rng), answers(rng)
     one = [Answers("full", 0, full), Answers("less", 0, less, reference="full")]
     more = [*one, Answers("full", 7, answers(rng))]
-    a, b = (row(ablation_rows(runs, **SETTINGS), "less")["difference"] for runs in (one, more))
+    a, b = (row(rows_of(runs, **SETTINGS), "less")["difference"] for runs in (one, more))
     assert a == b
     apart = [Answers("full", 0, full), Answers("less", 1, less, reference="full")]
-    assert row(ablation_rows(apart, **SETTINGS), "less")["difference"] is None
+    assert row(rows_of(apart, **SETTINGS), "less")["difference"] is None
 
 
 def test_a_protocol_that_the_reference_lacks_has_no_difference() -> None:
@@ -92,7 +89,7 @@ def test_a_protocol_that_the_reference_lacks_has_no_difference() -> None:
     semantic = answers(rng, protocol="semantic", first_frame=0)
     found = tuple(Discovery(r.subject, r.take, 0, slots=4, matched=1) for r in semantic)
     runs = [Answers("full", 0, answers(rng)), Answers("less", 0, semantic, found, reference="full")]
-    less = row(ablation_rows(runs, **SETTINGS), "less", protocol="semantic")
+    less = row(rows_of(runs, **SETTINGS), "less", protocol="semantic")
     assert less["difference"] is None
     assert (less["metrics"]["precision"].mean, less["metrics"]["recall"].mean) == (0.25, 1.0)
 
@@ -101,37 +98,11 @@ def test_what_does_not_belong_together_is_refused() -> None:
     rng = np.random.default_rng(0)
     full = Answers("full", 0, answers(rng))
     with pytest.raises(InputError, match="twice"):
-        ablation_rows([full, full], **SETTINGS)
+        rows_of([full, full], **SETTINGS)
     with pytest.raises(InputError, match="same entities"):
-        ablation_rows([full, Answers("less", 0, answers(rng)[:-1], reference="full")], **SETTINGS)
+        rows_of([full, Answers("less", 0, answers(rng)[:-1], reference="full")], **SETTINGS)
     with pytest.raises(InputError, match="different frames"):
-        ablation_rows([full, Answers("less", 0, answers(rng, first_frame=3), reference="full")], **SETTINGS)
-
-
-def test_the_benchmark_has_every_row_that_is_asked_for() -> None:
-    tables = {table: variants.lines_of(table) for table in variants.TABLES}
-    for lines in tables.values():
-        labels = [line.label for line in lines]
-        assert len(set(labels)) == len(labels)
-        assert all(line.reference is None or line.reference in labels for line in lines)
-        assert all(line.tracker in TRACKERS for line in lines)
-    by_name: dict[str, object] = {}
-    for lines in tables.values():
-        for line in lines:
-            assert by_name.setdefault(line.variant.name, line.variant) == line.variant
-    assert [line.variant.network.window for line in tables["window"]] == [2, 4, 8]
-    assert [line.variant.network.slots for line in tables["slots"]] == [4, 8, 16]
-    assert [line.reference for line in tables["window"]] == ["T = 4", None, "T = 4"]
-    some = variants.chosen_lines(variants.TABLES, ("no-aff",))
-    assert {t: [line.label for line in lines] for t, lines in some.items()} == {"losses": ["all losses", "no aff"]}
-    with pytest.raises(ConfigError, match="no-such"):
-        variants.chosen_lines(variants.TABLES, ("no-such",))
-    assert [name for line in tables["losses"] for name in line.variant.losses] == [
-        name for name, loss in LOSSES.items() if loss.weight > 0
-    ]
-    flat = next(line.variant for line in tables["parts"] if line.label == "no 3D")
-    assert flat.windows.depth_drop_share == 1.0
-    assert flat.losses == dict.fromkeys(("vel", "acc", "geo"), 0.0)
+        rows_of([full, Answers("less", 0, answers(rng, first_frame=3), reference="full")], **SETTINGS)
 
 
 def test_cached_encoder_reads_what_was_encoded(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.reappearance import STILL, episodes, reappearances
+from quest.bench.occlusion import STILL, episodes, reappearances
 from quest.errors import InputError
 from quest.evaluation import EntityRecord
 from tests.evaluation.answers import make_answer

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.intents import IntentAnswer, intent_pairs, intent_rows, judge_intents
+from quest.bench.intents import IntentAnswer, intent_pairs, intent_rows, judge_intents
 from quest.types import Clip, Query, Take, Tracks
 from tests.synthetic import make_take
 from tests.track.clips import make_tracker

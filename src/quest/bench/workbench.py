@@ -1,0 +1,346 @@
+"""What tables are made of: takes, trained networks and answers, each made once in a folder and found there again.
+
+    work / takes / NAME                      a take store
+    work / features, work / encoded          what the frozen encoder says of frames, in training and in evaluation
+    work / runs / VARIANT / seed-N           checkpoints and weights of a training
+    work / answers / TAKES / ASKED / seed-N  answers to one take each
+
+Everything goes on where it stopped, and what is there is not made again unless what it depends on has changed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from rich.console import Console
+
+from quest.baselines import ClipTracker, line_up
+from quest.bench.encoded import serve_cached
+from quest.bench.rows import Answers
+from quest.bench.settings import Making
+from quest.bench.trackers import ChainedFlow, NoisyColours
+from quest.bench.variants import Variant
+from quest.data.provenance import code_commit, code_hash, combined_hash, file_hash, package_versions
+from quest.data.split import SplitPart
+from quest.data.store import TakeStore
+from quest.errors import ConfigError
+from quest.evaluation.finished import FinishedTakes
+from quest.evaluation.results import write_report
+from quest.evaluation.runner import evaluate
+from quest.evaluation.selection import Shard, select_takes
+from quest.model.weights import find_weights
+from quest.paper.network import PaperNetwork, read_paper
+from quest.paper.objective import PaperStageOne
+from quest.paper.tracker import PaperTracker
+from quest.sim.cluster import ClusterSettings, connected, produce_on_cluster
+from quest.sim.plan import TakeSpec, parse_object, plan_takes, procedural_objects
+from quest.sim.production import Notice, StudioSettings, TakeSkipped, missing_takes, produce
+from quest.sim.settings import TakeSettings
+from quest.sim.suites import Suite, find_suites
+from quest.track.tracker import pick_device
+from quest.train.checkpoint import load_checkpoint
+from quest.train.dataset import open_dataset
+from quest.train.loop import StepReport, fit
+from quest.train.settings import TrainingConfig
+
+TakesName = Literal["teach", "choose", "motions", "views", "objects", "hidden", "lockers", "laptops"]
+
+_LAPTOPS, _BANKS = 110_000, 110_100
+"""First seeds of test objects."""
+_PARTS: tuple[SplitPart, ...] = ("train", "validation", "test", "unlisted")
+_PARTS_ON_CLUSTER = 8
+"""Of the answers of everybody to a set of takes, done side by side."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Who answers, as one row of a table calls it."""
+
+    label: str
+    """In the table."""
+    tracker: str = ""
+    """One of :data:`quest.baselines.TRACKERS`; empty for a published network, or for the chained true flow."""
+    variant: Variant | None = None
+    """The published network that answers."""
+    persistent: bool = True
+    """Whether a query keeps its slot."""
+    flow_noise: float | None = None
+    """Noise of the true flow that is chained, half diagonals."""
+    noise: float = 0.0
+    """Of colours, as a share of their range."""
+    reference: str | None = None
+    """Label of the row that it is compared with; None for the reference."""
+
+    @property
+    def is_seeded(self) -> bool:
+        """Whether it answers otherwise for every seed of a training."""
+        return self.variant is not None or self.flow_noise is not None
+
+    @property
+    def key(self) -> str:
+        """Of its folder."""
+        who = self.tracker or (self.variant.name if self.variant else f"flow-{self.flow_noise:g}")
+        return f"{who}{'' if self.persistent else '-anew'}{f'-noise-{self.noise:g}' if self.noise else ''}"
+
+
+@dataclass(frozen=True)
+class Workbench:
+    """Makes what is missing."""
+
+    making: Making
+    """How."""
+    console: Console
+    """Says what goes on."""
+
+    def rows(self, asked: Sequence[Asked], takes: TakesName, levels: Sequence[int] = ()) -> list[Answers]:
+        """The answers of everybody to takes, of every seed where something was trained."""
+        levels, store = tuple(levels or self.making.levels), self.takes(takes)
+        known = sorted({info.level for info in store.infos().values()})
+        levels = tuple(level for level in levels if level in known)
+        variants = {a.variant.name: a.variant for a in asked if a.variant}
+        if variants:
+            for name in ("teach", "choose"):
+                self.takes(name)
+            self._each(_train, [(self.making, v, seed) for v in variants.values() for seed in self.making.seeds])
+        jobs = [(a, seed) for a in asked for seed in (self.making.seeds if a.is_seeded else (0,))]
+        parts = 1 if self.making.ray is None else _PARTS_ON_CLUSTER
+        shards = [Shard(i, parts) for i in range(parts)]
+        self._each(_answer, [(self.making, a, takes, levels, seed, shard) for a, seed in jobs for shard in shards])
+        return [_answer(self.making, a, takes, levels, seed, Shard()) for a, seed in jobs]
+
+    def takes(self, name: TakesName) -> TakeStore:
+        """A store that has all takes of a name, but for those that an object has too few joints for.
+
+        Raises:
+            ConfigError: to learn from, it has others as well.
+        """
+        store, specs = _store(self.making, name), planned(self.making, name)
+        missing, others = missing_takes(specs, store), {*store.names()} - {spec.name for spec in specs}
+        if others and name in ("teach", "choose"):
+            raise ConfigError(f"{store.url}: {min(others)} was made for other settings; use another --work")
+        if not missing:
+            return store
+        self.console.print(f"takes {name}: {len(missing)} of {len(specs)} are to be rendered")
+        studio = StudioSettings(self.making.objects_root, f"quest bench (takes {name})")
+
+        def told(event: object) -> None:
+            if isinstance(event, Notice | TakeSkipped):
+                text = event.text if isinstance(event, Notice) else f"skipped {event.spec.name}: {event.reason}"
+                self.console.print(f"  {text}", highlight=False, markup=False)
+
+        if self.making.ray is None:
+            produce(missing, store, studio, report=told)
+        else:
+            produce_on_cluster(missing, store, studio, ClusterSettings(self.making.ray), report=told)
+        return store
+
+    def _each(self, job: Callable[..., Any], arguments: Iterable[tuple]) -> None:
+        """Do a job with each of some arguments, here one after the other, or on a cluster side by side."""
+        if self.making.ray is None:
+            for each in arguments:
+                self._say(job, each)
+                job(*each)
+            return
+        import ray
+
+        with connected(ray, ClusterSettings(self.making.ray)):
+            remote = ray.remote(job)
+            for each in arguments:
+                self._say(job, each)
+            ray.get([remote.remote(*each) for each in arguments])
+
+    def _say(self, job: Callable[..., Any], arguments: tuple) -> None:
+        told = [a for a in arguments[1:] if a != Shard()]
+        words = " ".join(str(getattr(a, "key", getattr(a, "name", a))) for a in told)
+        self.console.print(f"{job.__name__.strip('_')} {words}", highlight=False)
+
+
+def planned(making: Making, name: TakesName) -> list[TakeSpec]:
+    """The takes of a name.
+
+    - ``teach``, ``choose`` (every fourth frame), ``motions``: as published, one rig of cameras for each object, in its
+      own materials; each with motions of its own;
+    - ``views``: the same objects from other cameras, in other light;
+    - ``objects``: test objects, filmed as published;
+    - ``hidden``, ``lockers``: occluded for 60 frames, alone and beside look-alikes; banks of like doors;
+    - ``laptops``: both rims of a closed laptop.
+    """
+    taught, new = ([pair for text in texts for pair in parse_object(text)] for texts in (making.taught, making.new))
+    (rig,) = find_suites("published")
+
+    def plan(
+        objects: Sequence[tuple[str, str]],
+        *suites: Suite,
+        levels: tuple[int, ...] = making.levels,
+        each: int = 1,
+        first_seed: int = 0,
+        settings: TakeSettings = TakeSettings(),
+    ) -> list[TakeSpec]:
+        return plan_takes(
+            objects, levels=levels, takes_per_object=each, first_seed=first_seed, settings=settings, suites=suites
+        )
+
+    def filmed(**changes: Any) -> Suite:
+        return replace(rig, settings=replace(rig.settings, **changes))
+
+    match name:
+        case "teach":
+            return plan(taught, filmed(every=4), each=making.takes_per_object)
+        case "choose":
+            return plan(taught, filmed(every=4), levels=(1,), first_seed=1000)
+        case "motions":
+            return plan(taught, filmed(views=making.views), first_seed=2000)
+        case "views":
+            return plan(taught, first_seed=3000, settings=TakeSettings(views=making.views, randomize_materials=False))
+        case "objects":
+            return plan(new, filmed(views=making.views), first_seed=2000)
+        case "hidden":
+            (hiding,) = find_suites("occlusion")
+            return plan(new, *(hiding.hidden_for(60, look_alike=alike) for alike in (False, True)), levels=(1,))
+        case "lockers":
+            return plan(procedural_objects(len(new), _BANKS, "locker_bank"), *find_suites("lockers"), levels=(4,))
+        case "laptops":
+            return plan(procedural_objects(2 * len(new), _LAPTOPS, "laptop"), levels=(1,))
+
+
+def _store(making: Making, name: TakesName) -> TakeStore:
+    return TakeStore(making.work / "takes" / name)
+
+
+def _train(making: Making, variant: Variant, seed: int) -> Path:
+    """The weights of one training, which goes on where it stopped: the last ones, whatever their score."""
+    folder = making.work / "runs" / variant.name / f"seed-{seed}"
+    weights = folder / "weights.safetensors"
+    stores = [_store(making, name) for name in ("teach", "choose")]
+    _check(folder, _settings(making, variant, seed, stores))
+    if weights.exists():
+        return weights
+    torch.manual_seed(seed)
+    network = PaperNetwork(variant.network)
+    take_encoder(network)
+    dataset = open_dataset(
+        network,
+        stores=[stores[0].url],
+        validation_stores=[stores[1].url],
+        cache=making.work / "features",
+        windows=replace(variant.windows, batch=making.batch),
+        device=pick_device("auto"),
+        report=lambda done, total, frames: None,
+    )
+    config = TrainingConfig(
+        steps=making.steps,
+        optimizer="adamw",
+        learning_rate=making.learning_rate,
+        warmup_steps=max(1, min(100, making.steps // 10)),
+        validate_every=making.steps,  # once, so that the best are the last weights
+        validation_batches=2,
+        seed=seed,
+    )
+    objective, out = PaperStageOne(network, variant.losses, order=variant.order), folder / "stage-1"
+    out.mkdir(parents=True, exist_ok=True)
+    best = fit(objective, dataset.training, dataset.validation, config, out=out, report=_silent)
+    load_checkpoint(best, network.cpu(), None)
+    network.save(weights, about=f"variant {variant.name}, seed {seed}, {making.steps} steps of {making.batch} windows")
+    return weights
+
+
+def take_encoder(network: PaperNetwork) -> None:
+    """Give a network the frozen encoder of the shipped one."""
+    network.encoder.load_state_dict(read_paper(find_weights("quest-paper")).network.encoder.state_dict())
+
+
+def _silent(report: StepReport) -> None:
+    """Trainings say nothing; their folder has the curves."""
+
+
+def _settings(making: Making, variant: Variant, seed: int, stores: Sequence[TakeStore]) -> dict[str, Any]:
+    own = {name: getattr(making, name) for name in ("steps", "batch", "learning_rate")}
+    hashes = ((f"{i}/{name}", store.data_hash(name)) for i, store in enumerate(stores) for name in store.names())
+    return own | {
+        "variant": variant.name,
+        "seed": seed,
+        "network": json.loads(variant.network.to_json()),
+        "losses": dict(variant.losses),
+        "order": variant.order,
+        "windows": asdict(variant.windows),
+        "takes": combined_hash(hashes),
+    }
+
+
+def _check(folder: Path, settings: dict[str, Any]) -> None:
+    """Refuse to mix trainings of other settings; note the commit that began one."""
+    file = folder / "settings.json"
+    if not file.exists():
+        write_report(settings | {"commit": code_commit()}, file)
+        return
+    known = json.loads(file.read_text(encoding="utf-8"))
+    for name, value in settings.items():
+        if known.get(name) != value:
+            raise ConfigError(
+                f"{folder}: this training was begun with {name} {known.get(name)}, now it is {value}; use another "
+                "--work, or remove this one"
+            )
+
+
+def _answer(
+    making: Making, asked: Asked, takes: TakesName, levels: tuple[int, ...], seed: int, shard: Shard
+) -> Answers:
+    """Everybody's answers to takes, as far as they are in a shard."""
+    store, tracker, made_by = _store(making, takes), _Late(making, asked, seed), [code_hash(), package_versions()]
+    if asked.variant is not None:
+        made_by.append(file_hash(_train(making, asked.variant, seed)))
+    elif asked.tracker:
+        made_by += [making.weights, file_hash(find_weights(making.weights)), str(making.rivals)]
+    digest = hashlib.sha256(repr([*made_by, asked.key, seed]).encode()).hexdigest()
+    finished = FinishedTakes(making.work / "answers" / takes / asked.key / f"seed-{seed}", made_by=digest)
+    wanted = {spec.name for spec in planned(making, takes)}
+    infos = {name: info for name, info in store.infos().items() if name in wanted}
+    chosen = select_takes(infos, split=_PARTS, levels=levels)
+    found = evaluate(store, chosen, [tracker], finished=finished, shard=shard)
+    records = tuple(replace(r, subject=replace(r.subject, tracker=asked.label)) for r in found.records)
+    return Answers(asked.label, seed, records, reference=asked.reference)
+
+
+class _Late:
+    """A tracker that is made when it is first asked: where all answers are kept, none is."""
+
+    protocols = ("point",)
+
+    def __init__(self, making: Making, asked: Asked, seed: int) -> None:
+        self.name = asked.key
+        self._making, self._asked, self._seed = making, asked, seed
+        self._made: ClipTracker | None = None
+
+    def track(self, clip: Any, queries: Any = None) -> Any:
+        """As of the tracker."""
+        return self._tracker().track(clip, queries)
+
+    def told(self, take: Any, view: int) -> ClipTracker:
+        """The tracker, which knows the truth if it is there to."""
+        tracker = self._tracker()
+        return tracker.told(take, view) if isinstance(tracker, ChainedFlow) else tracker
+
+    def _tracker(self) -> ClipTracker:
+        if self._made is None:
+            self._made = build(self._making, self._asked, self._seed)
+        return self._made
+
+
+def build(making: Making, asked: Asked, seed: int) -> ClipTracker:
+    """Who answers."""
+    if asked.flow_noise is not None:
+        return ChainedFlow(asked.flow_noise, seed)
+    if asked.variant is None:
+        (tracker,) = line_up([asked.tracker], weights=making.weights, rivals=making.rivals)
+    else:
+        network = read_paper(_train(making, asked.variant, seed)).network
+        if not asked.noise:
+            serve_cached(network, making.work / "encoded")
+        tracker = PaperTracker(network, device=pick_device("auto"), persistent=asked.persistent)
+    return NoisyColours(tracker, asked.noise, seed) if asked.noise else tracker
