@@ -29,7 +29,8 @@ from quest.types import Clip, Query, Tracks
 from tests.paper.tiny import PAPER
 from tests.synthetic import make_take
 
-TAKES = {"teach": 0, "choose": 1, "motions": 2, "views": 3, "objects": 120_000, "hidden": 120_001, "lockers": 120_002}
+TAKES = {"teach": 0, "choose": 1, "motions": 2, "views": 3, "objects": 110_000, "hidden": 110_001, "lockers": 110_002}
+TAKES["laptops"] = 110_003
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +92,18 @@ def test_a_table_is_made_and_found_again(work: Path, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.usefixtures("small")
+def test_cases_and_curves(work: Path, tmp_path: Path):
+    assert bench(work, tmp_path, "drift", "failures", "intents") == 0
+    shares = {row["share"] for row in json.loads((tmp_path / "drift.json").read_text())["rows"]}
+    assert shares == {*SHARES}
+    assert (tmp_path / "drift.png").is_file()
+    failures = json.loads((tmp_path / "failures.json").read_text())
+    assert {row["line"] for row in failures["lockers"]} == {"quest", "hold-still", "lk-grid"}
+    assert failures["occlusion"] == []  # nothing is hidden there
+    assert json.loads((tmp_path / "intents.json").read_text())["answers"] == []  # nor to be opened
+
+
+@pytest.mark.usefixtures("small")
 def test_a_run_of_other_settings_is_not_taken_for_this_one(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
@@ -135,7 +148,7 @@ def test_every_table_has_a_command():
 
 
 def test_takes_are_those_of_the_protocols():
-    making = Making(levels=(1, 4))
+    making = Making(levels=(1, 4), teach_levels=(1, 4))
     teach, motions, views, new = (planned(making, name) for name in ("teach", "motions", "views", "objects"))
     assert len(teach) == 13 * 2 * 4
     assert {spec.object_id for spec in teach} == {spec.object_id for spec in motions} == {s.object_id for s in views}

@@ -9,6 +9,8 @@ from typing import Any, Literal
 from quest.baselines import TRACKERS
 from quest.errors import ConfigError
 
+SetName = Literal["motions", "views", "objects"]
+"""What networks are judged by: new motions of the objects that taught, new views of them, or new objects."""
 Base = Literal["remedies", "published"]
 """What is varied: the network with all remedies of how sets are learned, or exactly as published."""
 
@@ -38,10 +40,14 @@ class Making:
     """Objects that never taught."""
     takes_per_object: int = 4
     """Takes of every object and level that teach."""
+    sets: tuple[SetName, ...] = ("motions", "views", "objects")
+    """Takes that the comparison judges by; other tables are of new motions."""
     views: int = 1
     """Of the three cameras, how many are judged by."""
     levels: tuple[int, ...] = (1, 2, 3, 4)
-    """How many joints move one after the other."""
+    """How many joints move one after the other in takes that judge."""
+    teach_levels: tuple[int, ...] = (1, 2, 3, 4)
+    """The same in takes that teach."""
     weights: str = "quest-s16"
     """Of our tracker and of plain trackers that need some."""
     rivals: Path | None = None
@@ -66,11 +72,11 @@ class Making:
     """Share the work on a Ray cluster: its address, auto, or local for one on this machine."""
 
     def __post_init__(self) -> None:
-        if min(self.takes_per_object, self.views, self.steps, self.batch, self.resamples, *self.levels) < 1:
-            raise ConfigError(
-                f"bench: expected takes, views, levels, steps, batch and resamples of 1 or more, got {self}"
-            )
-        if not (self.seeds and self.levels and self.taught) or min(self.seeds) < 0 or min(self.noise, default=0) < 0:
+        counts = (self.takes_per_object, self.views, self.steps, self.batch, self.resamples)
+        if min(*counts, *self.levels, *self.teach_levels) < 1:
+            raise ConfigError(f"bench: expected counts, levels, steps and resamples of 1 or more, got {self}")
+        lists = (self.seeds, self.levels, self.teach_levels, self.taught)
+        if not all(lists) or min(self.seeds) < 0 or min(self.noise, default=0) < 0:
             raise ConfigError(f"bench: expected seeds and noise of 0 or more, levels and objects, got {self}")
         if unknown := [name for name in self.trackers if name not in TRACKERS]:
             raise ConfigError(f"tracker {unknown[0]!r}: expected one of {', '.join(TRACKERS)}")

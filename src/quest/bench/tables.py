@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from quest.bench.intents import intent_rows, judge_intents
-from quest.bench.occlusion import reappearances
+from quest.bench.intents import IntentAnswer, intent_rows, judge_intents
+from quest.bench.occlusion import STILL, reappearances
 from quest.bench.rows import Answers, rows_of
+from quest.bench.settings import SetName
 from quest.bench.speed import speed_rows
 from quest.bench.variants import BASES, REMEDIES, Variant, trained_losses, without_3d
 from quest.bench.workbench import Asked, TakesName, Workbench, build
 from quest.bench.writing import Figure, Table
 from quest.data.split import part_of
 from quest.evaluation.bootstrap import Pool
-from quest.evaluation.metrics import Sums
-from quest.evaluation.protocols import ClipTracker
+from quest.evaluation.metrics import Sums, distance_at
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.summary import READINGS
 
@@ -26,7 +28,7 @@ Rows = list[dict[str, Any]]
 Report = Mapping[str, Rows]
 """Rows by the key that they have in the file."""
 
-SETS: Mapping[str, TakesName] = {"new motions": "motions", "new views": "views", "new objects": "objects"}
+SETS: Mapping[str, SetName] = {"new motions": "motions", "new views": "views", "new objects": "objects"}
 """What a network that learned from some objects is judged by; only the first is what the publication seems to do."""
 
 _WHO = "takes = takes_of | objects = source | level = level | of = reading | "
@@ -123,7 +125,8 @@ def _compared(bench: Workbench, *, noise: float = 0.0) -> list[Asked]:
 
 def comparison(bench: Workbench) -> Report:
     """Every tracker at every level."""
-    return {"rows": _rows(bench, _compared(bench), SETS)}
+    sets: dict[str, TakesName] = {called: takes for called, takes in SETS.items() if takes in bench.making.sets}
+    return {"rows": _rows(bench, _compared(bench), sets)}
 
 
 def levels(bench: Workbench) -> Report:
@@ -217,10 +220,10 @@ def drift_rows(answers: Sequence[Answers], *, resamples: int) -> Rows:
 
 
 def _at(records: Sequence[EntityRecord], share: float) -> Sums:
-    frames = [int(np.floor(share * (len(r.distance) - 1) + 0.5)) for r in records]
-    counted = np.array([t >= r.first_frame for t, r in zip(frames, records, strict=True)], float)
-    value = np.array([r.distance[t] for t, r in zip(frames, records, strict=True)], float)
-    return Sums(value * counted, counted)
+    """Sums of D@p, of takes of any length."""
+    counted = [np.arange(len(r.distance))[None] >= r.first_frame for r in records]
+    each = [distance_at(r.distance[None].astype(float), share, c) for r, c in zip(records, counted, strict=True)]
+    return Sums(np.concatenate([s.total for s in each]), np.concatenate([s.count for s in each]))
 
 
 # Cases
@@ -228,7 +231,8 @@ def _at(records: Sequence[EntityRecord], share: float) -> Sums:
 
 def failures(bench: Workbench) -> Report:
     """Entities that are occluded for 60 frames, and banks of like doors."""
-    asked = [replace(a, reference=None) for a in _compared(bench) if a.variant is None]
+    # Without the tracker that holds still nobody knows how far an entity moved.
+    asked = [Asked(name, tracker=name) for name in dict.fromkeys((*bench.making.trackers, STILL))]
     hidden = [r for one in bench.rows(asked, "hidden", [1]) for r in one.records]
     lockers = bench.rows(asked, "lockers", [4])
     return {
@@ -239,27 +243,21 @@ def failures(bench: Workbench) -> Report:
 
 def intents(bench: Workbench) -> Report:
     """What opens a laptop and what lifts it, both asked for by the same label."""
-    store, tracker = bench.takes("laptops"), _Asking(bench)
-    answers = []
-    for name, info in sorted(store.infos().items()):
+    store, asked = bench.takes("laptops"), Asked("quest", tracker="quest")
+    kept, tracker = bench.kept(asked, "laptops", 0), cache(lambda: build(bench.making, asked, 0))
+
+    def judged(name: str, part: str) -> Mapping[str, np.ndarray]:
+        bench.console.print(f"intents {name}", highlight=False)
         take = store.read(name)
-        for view in range(len(take.views)):
-            bench.console.print(f"intents {name} view {view}", highlight=False)
-            answers += judge_intents(tracker.get(), take, view, part=part_of(info))
+        views = range(len(take.views))
+        found = [vars(a) for v in views for a in judge_intents(tracker(), take, v, part=part)]
+        return {"answers": np.array(json.dumps(found))}
+
+    answers: list[IntentAnswer] = []
+    for name, info in sorted(store.infos().items()):
+        known = kept.get(name, lambda name=name, info=info: judged(name, part_of(info)))
+        answers += [IntentAnswer(**a) for a in json.loads(str(known["answers"]))]
     return {"rows": intent_rows(answers, resamples=bench.making.resamples, seed=0), "answers": list(map(vars, answers))}
-
-
-class _Asking:
-    """Our tracker, made when it is first asked."""
-
-    def __init__(self, bench: Workbench) -> None:
-        self._bench = bench
-        self._made: ClipTracker | None = None
-
-    def get(self) -> ClipTracker:
-        if self._made is None:
-            self._made = build(self._bench.making, Asked("quest", tracker="quest"), 0)
-        return self._made
 
 
 def speed(bench: Workbench) -> Report:

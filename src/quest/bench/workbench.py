@@ -30,10 +30,11 @@ from quest.data.provenance import code_commit, code_hash, combined_hash, file_ha
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.finished import FinishedTakes
+from quest.evaluation.finished import FinishedTakes, KeptAnswers
 from quest.evaluation.results import write_report
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import Shard, select_takes
+from quest.extras import require
 from quest.model.weights import find_weights
 from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne
@@ -140,6 +141,10 @@ class Workbench:
             produce_on_cluster(missing, store, studio, ClusterSettings(self.making.ray), report=told)
         return store
 
+    def kept(self, asked: Asked, takes: TakesName, seed: int) -> KeptAnswers:
+        """Where anything is kept that somebody answered to takes."""
+        return KeptAnswers(**_place(self.making, asked, takes, seed))
+
     def _each(self, job: Callable[..., Any], arguments: Iterable[tuple]) -> None:
         """Do a job with each of some arguments, here one after the other, or on a cluster side by side."""
         if self.making.ray is None:
@@ -147,8 +152,7 @@ class Workbench:
                 self._say(job, each)
                 job(*each)
             return
-        import ray
-
+        ray = require("ray")
         with connected(ray, ClusterSettings(self.making.ray)):
             remote = ray.remote(job)
             for each in arguments:
@@ -191,7 +195,7 @@ def planned(making: Making, name: TakesName) -> list[TakeSpec]:
 
     match name:
         case "teach":
-            return plan(taught, filmed(every=4), each=making.takes_per_object)
+            return plan(taught, filmed(every=4), levels=making.teach_levels, each=making.takes_per_object)
         case "choose":
             return plan(taught, filmed(every=4), levels=(1,), first_seed=1000)
         case "motions":
@@ -292,19 +296,25 @@ def _answer(
     making: Making, asked: Asked, takes: TakesName, levels: tuple[int, ...], seed: int, shard: Shard
 ) -> Answers:
     """Everybody's answers to takes, as far as they are in a shard."""
-    store, tracker, made_by = _store(making, takes), _Late(making, asked, seed), [code_hash(), package_versions()]
-    if asked.variant is not None:
-        made_by.append(file_hash(_train(making, asked.variant, seed)))
-    elif asked.tracker:
-        made_by += [making.weights, file_hash(find_weights(making.weights)), str(making.rivals)]
-    digest = hashlib.sha256(repr([*made_by, asked.key, seed]).encode()).hexdigest()
-    finished = FinishedTakes(making.work / "answers" / takes / asked.key / f"seed-{seed}", made_by=digest)
+    store, tracker = _store(making, takes), _Late(making, asked, seed)
+    finished = FinishedTakes(**_place(making, asked, takes, seed))
     wanted = {spec.name for spec in planned(making, takes)}
     infos = {name: info for name, info in store.infos().items() if name in wanted}
     chosen = select_takes(infos, split=_PARTS, levels=levels)
     found = evaluate(store, chosen, [tracker], finished=finished, shard=shard)
     records = tuple(replace(r, subject=replace(r.subject, tracker=asked.label)) for r in found.records)
     return Answers(asked.label, seed, records, reference=asked.reference)
+
+
+def _place(making: Making, asked: Asked, takes: TakesName, seed: int) -> dict[str, Any]:
+    """The folder of somebody's answers to takes, and a digest of what they depend on beside the takes."""
+    made_by: list[object] = [code_hash(), package_versions()]
+    if asked.variant is not None:
+        made_by.append(file_hash(_train(making, asked.variant, seed)))
+    elif asked.tracker:
+        made_by += [making.weights, file_hash(find_weights(making.weights)), str(making.rivals)]
+    digest = hashlib.sha256(repr([*made_by, asked.key, seed]).encode()).hexdigest()
+    return {"folder": making.work / "answers" / takes / asked.key / f"seed-{seed}", "made_by": digest}
 
 
 class _Late:

@@ -23,6 +23,7 @@ SMOKE: Mapping[str, Any] = {
     "new": ("procedural:chest-110001",),
     "takes_per_object": 1,
     "levels": (1,),
+    "teach_levels": (1,),
     "trackers": ("quest", "hold-still", "lk-grid"),
     "seeds": (0,),
     "steps": 4,
