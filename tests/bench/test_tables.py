@@ -92,6 +92,16 @@ def test_a_table_is_made_and_found_again(work: Path, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.usefixtures("small")
+def test_some_rows_alone(work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    words = ["bench", "levels", "--smoke", "--work", str(work), "--out", str(tmp_path), "--lines"]
+    assert program.main([*words, "hold still"]) == 0
+    rows = json.loads((tmp_path / "levels.json").read_text())["rows"]
+    assert {row["line"] for row in rows} == {"full", "hold still"}
+    assert program.main([*words, "nothing"]) == program.EXIT_ERROR
+    assert "expected some of full, no queries" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.usefixtures("small")
 def test_cases_and_curves(work: Path, tmp_path: Path):
     assert bench(work, tmp_path, "drift", "failures", "intents") == 0
     shares = {row["share"] for row in json.loads((tmp_path / "drift.json").read_text())["rows"]}

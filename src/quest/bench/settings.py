@@ -54,6 +54,8 @@ class Making:
     """Folder of code and weights of the rivals named -official."""
     trackers: tuple[str, ...] = ("quest", "hold-still", "lk-grid", "lk-reinit", "dis", "xfeat", "dino")
     """Beside the published network."""
+    lines: tuple[str, ...] = ()
+    """Rows to make, by their names, and those that they are compared with; all by default."""
     base: Base = "remedies"
     """The published network with the remedies of how sets are learned, or exactly as published."""
     seeds: tuple[int, ...] = (0, 1, 2)

@@ -19,6 +19,7 @@ from quest.bench.variants import BASES, REMEDIES, Variant, trained_losses, witho
 from quest.bench.workbench import Asked, TakesName, Workbench, build
 from quest.bench.writing import Figure, Table
 from quest.data.split import part_of
+from quest.errors import ConfigError
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums, distance_at
 from quest.evaluation.records import EntityRecord
@@ -104,7 +105,16 @@ def _published(line: str, level: int) -> dict[str, float] | None:
 def _rows(
     bench: Workbench, asked: Sequence[Asked], sets: Mapping[str, TakesName], *, levels: Sequence[int] = ()
 ) -> Rows:
-    """Rows of all lines in all sets, with what was published of new motions."""
+    """Rows of all lines in all sets, with what was published of new motions.
+
+    Raises:
+        ConfigError: no line has a name that was asked for.
+    """
+    if wanted := bench.making.lines:
+        if unknown := sorted({*wanted} - {a.label for a in asked}):
+            raise ConfigError(f"--lines {unknown[0]}: expected some of {', '.join(a.label for a in asked)}")
+        compared = {a.reference for a in asked if a.label in wanted}
+        asked = [a for a in asked if a.label in (*wanted, *compared)]
     found: Rows = []
     for called, takes in sets.items():
         rows = rows_of(bench.rows(asked, takes, levels), resamples=bench.making.resamples, seed=0)
