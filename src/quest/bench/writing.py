@@ -148,6 +148,7 @@ def _panel(ax: Axes, across: str, where: str, rows: Sequence[Mapping[str, Any]])
         said = [(at, value) for at, value in said if value is not None]
         if said:
             ax.plot(*zip(*said, strict=True), "o", markerfacecolor="none", color=colour)
+    ax.set_xticks(sorted({row[across] for row in rows}))
     ax.grid(alpha=0.3)
 
 
