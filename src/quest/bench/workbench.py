@@ -149,20 +149,20 @@ class Workbench:
         """Do a job with each of some arguments, here one after the other, or on a cluster side by side."""
         if self.making.ray is None:
             for each in arguments:
-                self._say(job, each)
+                self.console.print(_words(job, each), highlight=False)
                 job(*each)
             return
-        ray = require("ray")
+        ray, jobs = require("ray"), list(arguments)
         with connected(ray, ClusterSettings(self.making.ray)):
             remote = ray.remote(job)
-            for each in arguments:
-                self._say(job, each)
-            ray.get([remote.remote(*each) for each in arguments])
+            for words in dict.fromkeys(_words(job, each) for each in jobs):
+                self.console.print(words, highlight=False)
+            ray.get([remote.remote(*each) for each in jobs])
 
-    def _say(self, job: Callable[..., Any], arguments: tuple) -> None:
-        told = [a for a in arguments[1:] if a != Shard()]
-        words = " ".join(str(getattr(a, "key", getattr(a, "name", a))) for a in told)
-        self.console.print(f"{job.__name__.strip('_')} {words}", highlight=False)
+
+def _words(job: Callable[..., Any], arguments: tuple) -> str:
+    told = [a for a in arguments[1:] if not isinstance(a, Shard)]
+    return " ".join([job.__name__.strip("_"), *(str(getattr(a, "key", getattr(a, "name", a))) for a in told)])
 
 
 def planned(making: Making, name: TakesName) -> list[TakeSpec]:
