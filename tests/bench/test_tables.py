@@ -214,7 +214,8 @@ def test_drift_is_read_at_shares_of_a_take():
     take = make_take(frames=11, views=1, entities=2)
     subject = Subject("flow", "point", "train", "procedural", 1, "panels-0")
     records = evaluate_point(HoldStill(), take, 0, subject).records
-    rows = drift_rows([workbench.Answers("hold", 0, records)], resamples=10)
+    rows = drift_rows([workbench.Answers("hold", seed, records) for seed in (0, 1)], resamples=10)
+    assert {row["tracks"] for row in rows if row["reading"] == "all"} == {2}
     own = {row["share"]: row["metrics"]["distance"].mean for row in rows if row["reading"] == "all"}
     assert list(own) == list(SHARES)
     for share, value in own.items():

@@ -219,12 +219,13 @@ def drift_rows(answers: Sequence[Answers], *, resamples: int) -> Rows:
     for (source, reading, level), lines in sorted(groups.items()):
         for line, records in lines.items():
             pool = Pool(records, lambda r: r.subject.object_id, resamples=resamples, seed=0)
+            tracks = len({(r.take, r.view, r.entity) for r in records})
             for share in SHARES:
                 value = pool.ratio(_at(records, share))
                 if value is not None:
                     rows.append(
                         {"line": line, "source": source, "reading": reading, "level": level, "share": share}
-                        | {"objects": pool.objects, "tracks": len(records), "metrics": {"distance": value}}
+                        | {"objects": pool.objects, "tracks": tracks, "metrics": {"distance": value}}
                     )
     return rows
 
