@@ -248,3 +248,14 @@ def test_where_nothing_is_there_takes_are_rendered(tmp_path: Path, monkeypatch: 
     Workbench(making, Console(quiet=True)).takes("motions")
     assert made == ["chest-0-L1-published-s002000"]
     assert Asked("x", tracker="lk", noise=0.05).key == "lk-noise-0.05"
+
+
+@pytest.mark.usefixtures("small")
+def test_time_and_memory_are_of_one_tracker_alone(tmp_path: Path):
+    """Hold-still needs next to no time, and less memory than a process that has everything loaded."""
+    from quest.bench.speed import QUERIES, speed_rows
+
+    (row,) = speed_rows(Making(work=tmp_path), [Asked("hold-still", tracker="hold-still")])
+    assert (row["line"], row["queries"], row["frames"]) == ("hold-still", QUERIES, 85)
+    assert 0 < row["ms"].mean < 50
+    assert row["memory_mib"] is None or 50 < row["memory_mib"] < 1500

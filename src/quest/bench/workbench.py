@@ -342,15 +342,15 @@ class _Late:
         return self._made
 
 
-def build(making: Making, asked: Asked, seed: int) -> ClipTracker:
-    """Who answers."""
+def build(making: Making, asked: Asked, seed: int, *, cached: bool = True) -> ClipTracker:
+    """Who answers; a published network reads what the encoder has said of frames before if it may."""
     if asked.flow_noise is not None:
         return ChainedFlow(asked.flow_noise, seed)
     if asked.variant is None:
         (tracker,) = line_up([asked.tracker], weights=making.weights, rivals=making.rivals)
     else:
         network = read_paper(_train(making, asked.variant, seed)).network
-        if not asked.noise:
+        if cached and not asked.noise:
             serve_cached(network, making.work / "encoded")
         tracker = PaperTracker(network, device=pick_device("auto"), persistent=asked.persistent)
     return NoisyColours(tracker, asked.noise, seed) if asked.noise else tracker
