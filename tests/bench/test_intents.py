@@ -89,23 +89,8 @@ def test_a_track_beside_its_entity_may_stay_on_its_link(take: Take):
     assert (answer.open_bound, answer.open_kept, answer.lift_kept) == (1.0, 0.0, 0.0)
 
 
-def test_a_stream_may_begin_where_both_are_apart(take: Take):
-    view = take.views[0]
-    uv_px = view.uv_px.copy()
-    uv_px[:, :2] = 50.0
-    uv_px[5:, 1, 0] += 30.0
-    visible = np.ones_like(view.visible)
-    visible[5, 0] = False
-    apart = replace(take, views=(replace(view, uv_px=uv_px, visible=visible),))
-    tracker: Any = Perfect(apart)
-    (answer,) = judge_intents(tracker, apart, 0, part="validation", apart_px=20.0)
-    assert answer.begin == 6
-    assert answer.both
-    assert judge_intents(tracker, apart, 0, part="validation", apart_px=40.0) == []
-
-
 def test_rows_are_over_objects():
-    good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0, 0.01, 0.02, 1.0, 0.95, 0.0, 0.1, 1.0, 1.0)
+    good = IntentAnswer("t", 0, "laptop-1", "test", "procedural", "rim", 0.01, 0.02, 1.0, 0.95, 0.0, 0.1, 1.0, 1.0)
     bad = replace(good, take="u", object_id="laptop-2", lift_acc=0.5, lift_ape=0.4)
     (row,) = intent_rows([good, replace(good, view=1), bad], resamples=200)
     assert (row["objects"], row["takes"], row["views"]) == (2, 2, 3)

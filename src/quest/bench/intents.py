@@ -14,12 +14,11 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 
-from quest.data.cut import cut_clip
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import GATE, distance, identity
 from quest.evaluation.protocols import ClipTracker, first_visible
 from quest.geometry import invert, transform
-from quest.types import INTENTS, Query, Take, View
+from quest.types import INTENTS, Query, Take
 
 STABLE = 0.95
 """A track is stable if it is nearest to its own entity, and within the gate, in so many of the frames."""
@@ -36,8 +35,6 @@ class IntentAnswer:
     source: str
     label: str
     """That both entities have."""
-    begin: int
-    """Frame of the take in which the stream began."""
     open_ape: float
     """Mean 3D distance to the entity to open by, normalised units; a frame without an answer counts 1."""
     lift_ape: float
@@ -88,56 +85,41 @@ def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
     return found
 
 
-def judge_intents(
-    tracker: ClipTracker, take: Take, view: int, *, part: str, apart_px: float = 0.0
-) -> list[IntentAnswer]:
-    """Ask for what opens and for what lifts in one stream, and judge both tracks.
-
-    The stream begins with the first frame in which both are seen ``apart_px`` pixels apart; where there is none, the
-    view is left out.
-    """
+def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
+    """Ask for what opens and for what lifts in one stream, and judge both tracks from its first frame."""
     answers = []
     info, clip = take.info, take.views[view].clip
     for label, opens, lifts in intent_pairs(take, view):
         pair = np.array([opens, lifts])
-        begin = _first_apart(take.views[view], pair, apart_px)
-        if begin is None:
-            continue
         queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
-        point = tracker.track(cut_clip(clip, slice(begin, None)), queries).point_world
-        gap, right = _score(take, point, pair, begin)
+        point = tracker.track(clip, queries).point_world
+        gap, right = _score(take, point, pair)
         measured: dict[str, float] = {}
         for i, intent in enumerate(INTENTS):
-            first, kept = _kept(take, point[:, i], int(pair[i]), begin)
+            first, kept = _kept(take, point[:, i], int(pair[i]))
             values = {"ape": gap[:, i].mean(), "acc": right[:, i].mean(), "bound": gap[first, i], "kept": kept}
             measured |= {f"{intent}_{what}": float(value) for what, value in values.items()}
-        answers.append(IntentAnswer(info.name, view, info.object_id, part, info.source, label, begin, **measured))
+        answers.append(IntentAnswer(info.name, view, info.object_id, part, info.source, label, **measured))
     return answers
 
 
-def _first_apart(view: View, pair: Int[np.ndarray, " 2"], apart_px: float) -> int | None:
-    gap_px = np.linalg.norm(np.diff(view.uv_px[:, pair], axis=1)[:, 0], axis=-1)
-    frames = np.flatnonzero((gap_px >= apart_px) & view.visible[:, pair].all(axis=1)) if apart_px > 0 else np.zeros(1)
-    return int(frames[0]) if len(frames) else None
-
-
 def _score(
-    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"], begin: int
+    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    half, true = take.info.half_diagonal_m, take.point_world[begin:]
+    half, true = take.info.half_diagonal_m, take.point_world
     gap = distance(point_world, true[:, entities], half_diagonal_m=half)
     rank = np.searchsorted(take.tracked, entities)
     nearest = identity(point_world, true[:, take.tracked], rank, half_diagonal_m=half)
     return gap, nearest == rank
 
 
-def _kept(take: Take, point_world: Float[np.ndarray, "T 3"], entity: int, begin: int) -> tuple[int, float]:
+def _kept(take: Take, point_world: Float[np.ndarray, "T 3"], entity: int) -> tuple[int, float]:
     """Frame of the first answer (0 if there is none), and the share of frames on that spot of the entity's link."""
     known = np.flatnonzero(np.isfinite(point_world).all(axis=-1))
     if not len(known):
         return 0, 0.0
     first = int(known[0])
-    world_from_link = torch.from_numpy(take.link_pose[begin:, take.info.entities[entity].link]).double()
+    world_from_link = torch.from_numpy(take.link_pose[:, take.info.entities[entity].link]).double()
     spot = transform(invert(world_from_link[first]), torch.from_numpy(point_world[first]).double())
     carried = transform(world_from_link, spot).numpy()
     gap = distance(point_world.astype(np.float64), carried, half_diagonal_m=take.info.half_diagonal_m)

@@ -16,8 +16,8 @@ import numpy as np
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums
-from quest.evaluation.records import Discovery, EntityRecord
-from quest.evaluation.summary import READINGS, discovery_values, record_sums
+from quest.evaluation.records import EntityRecord
+from quest.evaluation.summary import READINGS, record_sums
 from quest.evaluation.take_suite import TakeSuite
 
 PAIRED = ("ape", "ape_2d", "d50", "d100", "acc", "switches", "slope")
@@ -34,22 +34,20 @@ class Answers:
     """Of its training."""
     records: tuple[EntityRecord, ...]
     """Per take, view and entity."""
-    discoveries: tuple[Discovery, ...] = ()
-    """Per take and view of the semantic protocol."""
     reference: str | None = None
     """The line that it is compared with; None for the reference itself."""
 
 
-Key = tuple[str, str, str, str, int, str]
+Key = tuple[str, str, str, int, str]
 Numbered = tuple[int, EntityRecord]
 
 
 def rows_of(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[dict[str, Any]]:
-    """Rows per protocol, part, source, suite, level, reading and line, in the order of the lines.
+    """Rows per part, source, suite, level, reading and line, in the order of the lines.
 
     ``metrics`` are pooled over seeds, ``tracks`` count each (take, view, entity) once, ``seeds`` has every seed by
     itself, and ``difference`` is line - reference over the answers of the same seeds: None for the reference, and
-    where it has no answers under this protocol.
+    where they have no seed in common.
 
     Args:
         answers: of all lines and seeds.
@@ -61,7 +59,6 @@ def rows_of(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[di
             entities or frames.
     """
     groups: dict[Key, dict[str, list[Numbered]]] = defaultdict(lambda: defaultdict(list))
-    found: dict[Key, dict[str, list[Discovery]]] = defaultdict(lambda: defaultdict(list))
     references: dict[str, str | None] = {}
     known: set[tuple[str, int]] = set()
     for a in answers:
@@ -73,44 +70,29 @@ def rows_of(answers: Sequence[Answers], *, resamples: int, seed: int) -> list[di
             for reading in READINGS:
                 if reading == "all" or record.moved:
                     groups[_key(record, reading)][a.line].append((a.seed, record))
-        for discovery in a.discoveries:
-            found[_key(discovery, "all")][a.line].append(discovery)
     rows = []
     for key in sorted(groups):
         for line, reference in references.items():
             own, other = groups[key].get(line), groups[key].get(reference or "")
             if own:
-                head = dict(zip(("protocol", "part", "source", "suite", "level", "reading"), key, strict=True))
-                row = _row(line, own, other, found[key][line], head["protocol"] == "semantic", resamples, seed)
-                rows.append({"line": line, "reference": reference} | head | row)
+                head = dict(zip(("part", "source", "suite", "level", "reading"), key, strict=True))
+                rows.append({"line": line, "reference": reference} | head | _row(line, own, other, resamples, seed))
     return rows
 
 
-def _key(kept: EntityRecord | Discovery, reading: str) -> Key:
-    s = kept.subject
-    return s.protocol, s.part, s.source, TakeSuite.of(kept.take).title, s.level, reading
+def _key(record: EntityRecord, reading: str) -> Key:
+    s = record.subject
+    return s.part, s.source, TakeSuite.of(record.take).title, s.level, reading
 
 
-def _row(
-    line: str,
-    own: list[Numbered],
-    other: list[Numbered] | None,
-    found: list[Discovery],
-    semantic: bool,
-    resamples: int,
-    seed: int,
-) -> dict[str, Any]:
-    def object_of(kept: EntityRecord | Discovery) -> str:
-        return kept.subject.object_id
-
-    pool = Pool([r for _, r in own], object_of, resamples=resamples, seed=seed, objects=map(object_of, found))
+def _row(line: str, own: list[Numbered], other: list[Numbered] | None, resamples: int, seed: int) -> dict[str, Any]:
+    pool = Pool([r for _, r in own], lambda r: r.subject.object_id, resamples=resamples, seed=seed)
     sums, of_seed = _sums(pool.records), np.array([s for s, _ in own])
     seeds = []
     for number in np.unique(of_seed).tolist():
         chosen = of_seed == number
         means = {name: Sums(s.total[chosen], s.count[chosen]).mean() for name, s in sums.items()}
         seeds.append({"seed": number} | {name: means[name] for name in ("ape", "ape_2d", "d100", "acc")})
-    found_values = discovery_values(pool, found, semantic=semantic)
     difference = None
     if other and set(of_seed.tolist()) & {s for s, _ in other}:
         kept, gap = _paired(line, own, other)
@@ -120,8 +102,7 @@ def _row(
         "takes": len({r.take for r in pool.records}),
         "tracks": len({(r.take, r.view, r.entity) for r in pool.records}),
         "metrics": {name: pool.ratio(s) for name, s in sums.items()}
-        | {"median_px": pool.median(lambda r: r.distance_px[r.first_frame :])}
-        | {name: found_values[name] for name in ("precision", "recall")},
+        | {"median_px": pool.median(lambda r: r.distance_px[r.first_frame :])},
         "difference": difference,
         "seeds": seeds,
     }

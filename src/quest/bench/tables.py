@@ -117,7 +117,7 @@ def _rows(
         asked = [a for a in asked if a.label in (*wanted, *compared)]
     found: Rows = []
     for called, takes in sets.items():
-        rows = rows_of(bench.rows(asked, takes, levels), resamples=bench.making.resamples, seed=0)
+        rows = rows_of(bench.answers(asked, takes, levels), resamples=bench.making.resamples, seed=0)
         for row in rows:
             said = _published(row["line"], row["level"]) if takes == "motions" else None
             found.append({"takes_of": called} | row | {"published": said})
@@ -194,7 +194,7 @@ def noise(bench: Workbench) -> Report:
 
 def drift(bench: Workbench) -> Report:
     """Distance over the course of a take, at the highest level."""
-    answers = bench.rows(_compared(bench), "motions", [max(bench.making.levels)])
+    answers = bench.answers(_compared(bench), "motions", [max(bench.making.levels)])
     return {"rows": drift_rows(answers, resamples=bench.making.resamples)}
 
 
@@ -244,8 +244,8 @@ def failures(bench: Workbench) -> Report:
     """Entities that are occluded for 60 frames, and banks of like doors."""
     # Without the tracker that holds still nobody knows how far an entity moved.
     asked = [Asked(name, tracker=name) for name in dict.fromkeys((*bench.making.trackers, STILL))]
-    hidden = [r for one in bench.rows(asked, "hidden", [1]) for r in one.records]
-    lockers = bench.rows(asked, "lockers", [4])
+    hidden = [r for one in bench.answers(asked, "hidden", [1]) for r in one.records]
+    lockers = bench.answers(asked, "lockers", [4])
     return {
         "occlusion": reappearances(hidden, resamples=bench.making.resamples, seed=0),
         "lockers": rows_of(lockers, resamples=bench.making.resamples, seed=0),
@@ -289,8 +289,9 @@ TABLES: Mapping[str, Recipe] = {
                 "comparison",
                 "Comparison",
                 f"{_WHO}tracker = line | {_COUNTS}{_SHOWN['ape']}{_MORE}{_ACC}",
-                about="The published network learned from other motions of the objects of the first two sets; no "
-                "other tracker has seen any of them. Published figures are of other objects.",
+                about="The published network learned from other motions of the objects of the first two sets; the "
+                "others learned from no object how to follow points, but for the noises of our filter. Published "
+                "figures are of other objects.",
                 **_MOVED,
             ),
         ),

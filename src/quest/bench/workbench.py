@@ -99,7 +99,7 @@ class Workbench:
     console: Console
     """Says what goes on."""
 
-    def rows(self, asked: Sequence[Asked], takes: TakesName, levels: Sequence[int] = ()) -> list[Answers]:
+    def answers(self, asked: Sequence[Asked], takes: TakesName, levels: Sequence[int] = ()) -> list[Answers]:
         """The answers of everybody to takes, of every seed where something was trained."""
         levels, store = tuple(levels or self.making.levels), self.takes(takes)
         known = sorted({info.level for info in store.infos().values()})
