@@ -116,7 +116,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / run).mkdir(parents=True)
         save_network(folder / run / "weights.safetensors", make_finder(), settings="{}", about="tiny")
     shutil.copy(folder / "sample" / "rgb.mp4", folder / "my.mp4")
-    quest.load().track(clip, [quest.Query.semantic("handle")]).save(folder / "outputs" / "demo")
+    tracks = quest.load().track(clip, [quest.Query.semantic("handle")])
+    for run in ("outputs/demo", "outputs/alarm"):
+        tracks.save(folder / run)
     write_queries([quest.Query.point(1, 100, 80, name="picked")], folder / "queries.json")
     return folder
 
