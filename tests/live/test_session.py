@@ -77,19 +77,25 @@ def test_what_is_refused_changes_nothing(clip: Clip):
     assert [header["state"] for header in watched.headers] == [header["state"] for header in plain.headers]
 
 
-def test_a_pixel_of_an_older_picture_is_carried_to_now():
+@pytest.mark.parametrize("remembered_s", [3.0, 0.0])
+def test_a_pixel_of_an_older_picture_is_carried_to_now(remembered_s: float, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("quest.live.session._REMEMBERED_S", remembered_s)
     square = np.zeros((120, 160, 3), np.uint8)
     square[:] = cv2.resize(np.random.default_rng(0).integers(0, 255, (15, 20, 3), np.uint8), (160, 120))
-    rgb = np.stack([np.roll(square, 2 * t, axis=1) for t in range(8)])
+    rgb = np.stack([np.roll(square, 2 * t, axis=1) for t in range(24)])
     clip = Clip.from_arrays(rgb, fov_deg=60)
     session = Session(make_tracker(), source_of_clip(clip), [], wait=True)
     asked = []
     for t, _ in enumerate(session.run()):
-        if t == 4:
-            asked.append(session.ask(Edit("point", frame=1, x=60, y=60, name="old")))
+        if t == 20:
+            asked.append(session.ask(Edit("point", frame=1, x=20, y=60, name="old")))
+    if not remembered_s:
+        with pytest.raises(InputError, match="frame 1 is over"):
+            asked[0].result()
+        return
     assert asked[0].result() == "followed"
     assert session.state is not None
-    np.testing.assert_allclose(session.state.uv_px[0], (60 + 12, 60), atol=1.5)
+    np.testing.assert_allclose(session.state.uv_px[0], (20 + 44, 60), atol=1.5)
 
 
 def test_what_is_kept(clip: Clip, tmp_path: Path):

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Literal, TextIO
@@ -22,6 +22,7 @@ from jaxtyping import UInt8
 from quest.data.frame_source import FrameSource
 from quest.errors import InputError
 from quest.filter import step as filtering
+from quest.filter.picture import Picture
 from quest.filter.step import FilterState
 from quest.geometry import project, transform
 from quest.track import Stream, StreamState, Tracker
@@ -32,8 +33,9 @@ from quest.types import Camera, Frame, Query
 from quest.viz.joint_lines import state_lines
 from quest.viz.palette import query_colour
 
-_REMEMBERED = 16
-"""Frames back that a page's picture may be when somebody points at it."""
+_REMEMBERED_S = 3.0
+"""How old a page's picture may be when somebody has pointed at it, or dragged a box over it, seconds; the last two
+pictures may be older."""
 _RATE_FRAMES = 20
 _IDLE_S = 0.05
 _QUALITY = 80
@@ -108,7 +110,7 @@ class Session:
         self._record = record
         self._asked: queue.Queue[tuple[Edit, Future[str]]] = queue.Queue()
         self._shown: Callable[[Shot], object] = lambda shot: None
-        self._recent: deque[tuple[int, FilterState]] = deque(maxlen=_REMEMBERED)
+        self._recent: deque[tuple[int, float, FilterState]] = deque()
         self._ends_s: deque[float] = deque(maxlen=_RATE_FRAMES)
         self._stopped = self._paused = False
 
@@ -161,18 +163,22 @@ class Session:
                 yield self._show(number, frame, self.state)
             self._take_edits(edits)
 
-    def _show(self, number: int, frame: Frame, state: StreamState) -> tuple[Event, ...]:
+    def _show(self, number: int, frame: Frame, answer: StreamState) -> tuple[Event, ...]:
+        self._ends_s.append(time.monotonic())
         filtered = self.stream.memory.filter
         if filtered is not None:
-            self._recent.append((number, filtered))
-        self._ends_s.append(time.monotonic())
+            blind = self._recent and self._recent[-1][2].stamp_s == filtered.stamp_s
+            state = self._recent[-1][2] if blind else _compact(filtered)
+            self._recent.append((number, self._ends_s[-1], state))
+        while len(self._recent) > 2 and self._ends_s[-1] - self._recent[0][1] > _REMEMBERED_S:
+            self._recent.popleft()
         took_s = self._ends_s[-1] - self._ends_s[0]
-        events = self.events.step(number, state)
+        events = self.events.step(number, answer)
         header = {
             "frame": number,
-            "state": json.loads(state_line(state, frame=number)),
-            "colours": [query_colour(n) for n in state.query],
-            "joints": drawn_joints(state, self.source.camera),
+            "state": json.loads(state_line(answer, frame=number)),
+            "colours": [query_colour(n) for n in answer.query],
+            "joints": drawn_joints(answer, self.source.camera),
             "waiting": [{"query": w.number, "words": str(w.query)} for w in self.stream.memory.queries.waiting],
             "events": [asdict(event) for event in events],
             "notes": list(self.source.flags),
@@ -233,17 +239,22 @@ class Session:
         Raises:
             InputError: the frame is too old, or the pixel is outside.
         """
-        at = next((i for i, (number, _) in enumerate(self._recent) if number == edit.frame), None)
+        at = next((i for i, (number, *_) in enumerate(self._recent) if number == edit.frame), None)
         if at is None:
             raise InputError(f"frame {edit.frame} is over; point at a newer picture, or pause first")
         uv_px, size = np.array([[edit.x, edit.y]], np.float64), (self.stream.camera.width, self.stream.camera.height)
         if not (np.isfinite(uv_px).all() and (uv_px >= 0).all() and (uv_px <= size).all()):
             raise InputError(f"expected a pixel within {size[0]} x {size[1]}, got ({edit.x:.1f}, {edit.y:.1f})")
-        warp, states = np.eye(3), [state for _, state in self._recent][at:]
+        warp, states = np.eye(3), [state for *_, state in self._recent][at:]
         for before, after in pairwise(states):
             warp = warp if after is before else after.warp @ warp
         x, y = filtering.carry(states[0], states[-1], warp, uv_px)[0].clip((0, 0), size).tolist()
         return x, y
+
+
+def _compact(state: FilterState) -> FilterState:
+    """The same, its picture without what was computed from it, which is several times as large."""
+    return replace(state, picture=Picture(state.picture.grey, state.picture.descriptors))
 
 
 def drawn_joints(state: StreamState, camera: Camera) -> list[dict[str, list[list[float]]] | None]:
