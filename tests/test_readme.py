@@ -8,14 +8,20 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 from tests.track.clips import make_calibration
+
+if TYPE_CHECKING:  # the hook of the shape checks comes first
+    from quest.model.weights import LoadedNetwork
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "README.md"
@@ -123,10 +129,20 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def read_once() -> Callable[[str], LoadedNetwork]:
+    """Reads weights as the tracker does, those that ship once for all pages."""
+    from quest.model.weights import load_network, shipped_weights
+
+    shipped = cache(load_network)
+    return lambda name: shipped(name) if name in shipped_weights() else load_network(name)
+
+
 @pytest.fixture
-def there(made: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def there(made: Path, read_once: Callable[[str], LoadedNetwork], monkeypatch: pytest.MonkeyPatch) -> Path:
     """That folder, as the one where one is, and with the clip that is packaged."""
     monkeypatch.chdir(made)
+    monkeypatch.setattr("quest.track.tracker.load_network", read_once)
     monkeypatch.setattr("quest.data.sample.sample_folder", lambda *name: made / "sample")
     return made
 

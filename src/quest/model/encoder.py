@@ -15,6 +15,7 @@ import torch
 import torch.nn.functional as F
 from jaxtyping import Float, UInt8
 from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from quest.errors import ConfigError, WeightsError
 from quest.untrusted import reading
@@ -154,9 +155,19 @@ def read_into(make: Callable[[], _Module], state: Mapping[str, Tensor], *, what:
     with reading(what, WeightsError, "fetch or train them again"):
         with torch.device("meta"):
             _check_shapes(make(), state, what=what)
-        module = make()
+        with _NoRandomValues():
+            module = make()
     load_exactly(module, state, what=what)
     return module
+
+
+class _NoRandomValues(TorchFunctionMode):
+    """Leaves parameters as they were allocated: drawing values that a file overwrites takes as long as reading it."""
+
+    def __torch_function__(self, func: Callable, types: object, args: tuple = (), kwargs: dict | None = None) -> object:
+        if getattr(func, "__module__", None) == "torch.nn.init":
+            return (kwargs or {}).get("tensor", args[0] if args else None)
+        return func(*args, **(kwargs or {}))
 
 
 def load_exactly(module: nn.Module, state: Mapping[str, Tensor], *, what: str) -> None:
