@@ -138,6 +138,7 @@ def drawn() -> str:
     return "\n".join([head, *bands, *arrows, *boxes, "</svg>"]) + "\n"
 
 
+@pytest.mark.slow
 def test_the_picture_of_the_rooms_is_up_to_date():
     assert PICTURE.read_text(encoding="utf-8") == drawn(), "run `python -m tests.test_architecture`"
 
@@ -147,6 +148,7 @@ def test_every_room_has_a_rank():
     assert rooms <= set(RANKS), "a new room: give it a rank (and a line in the docs)"
 
 
+@pytest.mark.slow
 def test_imports_point_one_way():
     wrong = [
         f"{name(path)}:{line} imports {module}"

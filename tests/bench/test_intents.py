@@ -52,6 +52,7 @@ def test_pairs_are_labels_with_both_intents(take: Take):
     assert intent_pairs(make_take(frames=12, views=1, entities=3, seed=0), 0) == []
 
 
+@pytest.mark.slow
 def test_both_intents_are_asked_for_and_judged(take: Take):
     tracker: Any = Perfect(take)
     (answer,) = judge_intents(tracker, take, 0, part="validation")
@@ -69,6 +70,7 @@ def test_both_intents_are_asked_for_and_judged(take: Take):
     assert not answer.both
 
 
+@pytest.mark.slow
 def test_a_track_beside_its_entity_may_stay_on_its_link(take: Take):
     """Half a unit beside the moving entity, on its link; then on the other link."""
     link = take.info.entities[0].link

@@ -60,6 +60,7 @@ def bench(work: Path, out: Path, *tables: str) -> int:
     return program.main(["bench", *tables, "--smoke", "--work", str(work), "--out", str(out)])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_table_is_made_and_found_again(work: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     assert bench(work, tmp_path, "levels", "noise") == 0
@@ -101,6 +102,7 @@ def test_some_rows_alone(work: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "expected some of full, no queries" in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_cases_and_curves(work: Path, tmp_path: Path):
     assert bench(work, tmp_path, "drift", "failures", "intents") == 0
@@ -113,6 +115,7 @@ def test_cases_and_curves(work: Path, tmp_path: Path):
     assert json.loads((tmp_path / "intents.json").read_text())["answers"] == []  # nor to be opened
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_a_run_of_other_settings_is_not_taken_for_this_one(
     work: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -250,6 +253,7 @@ def test_where_nothing_is_there_takes_are_rendered(tmp_path: Path, monkeypatch: 
     assert Asked("x", tracker="lk", noise=0.05).key == "lk-noise-0.05"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small")
 def test_time_and_memory_are_of_one_tracker_alone(tmp_path: Path):
     """Hold-still needs next to no time, and less memory than a process that has everything loaded."""

@@ -112,6 +112,7 @@ def test_a_card_of_a_file_that_says_little():
     assert "| licence | not said |" in text
 
 
+@pytest.mark.slow
 def test_loaded_from_the_hub_and_then_from_the_cache(hub: FakeHub, file: Path, monkeypatch: pytest.MonkeyPatch):
     hub.files["owner/name"] = {"main": {FILE: file.read_bytes()}, "v1": {FILE: file.read_bytes()}}
     loaded = load_network("owner/name")
@@ -179,6 +180,7 @@ def test_a_hub_that_does_not_answer_is_asked_once(hub: FakeHub, monkeypatch: pyt
         load_network("owner/name")
 
 
+@pytest.mark.slow
 def test_push_and_load(hub: FakeHub, file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture):
     assert main(["weights", "push", str(file), "owner/mine"]) == 2
     assert "hf auth login" in capsys.readouterr().err

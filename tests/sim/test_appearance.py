@@ -67,6 +67,7 @@ def test_handles_have_a_material_of_their_own() -> None:
     assert choose_surface(look, "drawer_front-1", 1) == choose_surface(look, "drawer_front-9", 1)
 
 
+@pytest.mark.slow
 @pytest.mark.render
 def test_apply_appearance_renders_something_lit(renderer: Renderer) -> None:
     sapien = pytest.importorskip("sapien", reason="SAPIEN is not installed")

@@ -132,6 +132,7 @@ def test_lockers_are_identical(category: str, seed: int) -> None:
             np.testing.assert_allclose(a.mesh.vertices, b.mesh.vertices, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_half_of_the_mix_has_four_handled_joints() -> None:
     models = [build_model(category_for_seed(seed), seed) for seed in range(60)]
     share = np.mean([sum(link.has_handle for link in model.links) >= 4 for model in models])
@@ -173,6 +174,7 @@ def test_drawers_of_apron_tables_are_flat_and_between_the_legs() -> None:
             assert front[0, 2] > 0.5 * top[0, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", [name for name in CATEGORIES if name.startswith("long_")])
 def test_long_handles_run_along_their_fronts(category: str) -> None:
     links = [link for seed in range(4) for link in build_model(category, seed).links if link.has_handle]
@@ -188,6 +190,7 @@ def test_long_handles_run_along_their_fronts(category: str) -> None:
         assert handle[:, along].mean() == pytest.approx((low[along] + high[along]) / 2, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("category", ["chest", "cabinet", "long_refrigerator", "range"])
 def test_clutter_adds_nothing_to_take_hold_of(category: str) -> None:
     added: set[str] = set()

@@ -173,6 +173,7 @@ def make_set(folder: Path, *, name: str, value: int, licence: str = "") -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_sets_of_pictures_keep_apart(tmp_path: Path) -> None:
     """Files of one name in two sets are two pictures; what one set has labelled says nothing of the other."""
     handles = make_set(tmp_path / "a" / "same", name="handle", value=10, licence="CC BY 4.0")
@@ -213,6 +214,7 @@ def test_a_network_has_only_so_many_blocks_to_learn() -> None:
         StageFind(make_finder(), learned_blocks=13)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("learned_blocks", [0, 2])
 def test_a_finder_learns_a_white_handle(tmp_path: Path, learned_blocks: int) -> None:
     torch.manual_seed(0)
