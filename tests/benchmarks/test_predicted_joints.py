@@ -82,7 +82,6 @@ def test_rows():
     assert rows["prismatic", "far"]["axis_error_deg"] is None
 
 
-@pytest.mark.slow
 def test_a_view_is_judged(take: Take):
     tracker = make_tracker()
     answers = judge_view(tracker, take, 0, part="unlisted")

@@ -26,7 +26,6 @@ def test_faults_change_pictures_or_depth_and_keep_their_form(name: str) -> None:
     assert (BLIND | DEGRADED | DEPTH)[name](frame.rgb, None, last, np.random.default_rng(0))[1] is None
 
 
-@pytest.mark.slow
 def test_a_covered_camera_is_flagged_and_nothing_is_tracked() -> None:
     player = Player("made up", "depth", CLIP, [Query.point(0, 20.0, 20.0)], make_tracker())
     found = player.play("covered, black", BLIND["covered, black"])

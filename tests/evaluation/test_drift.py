@@ -223,7 +223,6 @@ def test_losses_of_one_object_alone_have_no_interval(detectors: tuple[Detector, 
     assert (row.losses, missed.low, missed.high) == (1, None, None)
 
 
-@pytest.mark.slow
 def test_false_alarms_keep_the_promise():
     """No detector alarms on more new loss-free streams than one block may spend of alpha, nor on far fewer."""
     most = share(0.2, block=1, restart=0)

@@ -141,7 +141,6 @@ def test_command_writes_what_it_prints(
     assert len(read_records(records_path(out))) == sum(row.tracks for row in results.rows if row.reading == "all")
 
 
-@pytest.mark.slow
 def test_command_says_what_to_mind(store: TakeStore, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     torn = TakeStore(tmp_path)
     torn.write(_take(100000))

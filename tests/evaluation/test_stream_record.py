@@ -161,7 +161,6 @@ def recorded(
     return found, told
 
 
-@pytest.mark.slow
 def test_recording_goes_on_where_it_stopped(store: TakeStore, tmp_path: Path):
     tracker = make_tracker()
     found, told = recorded(tracker, store, tmp_path, "0/2")

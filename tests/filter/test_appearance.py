@@ -74,7 +74,6 @@ def test_a_query_that_was_left_behind_is_found_again() -> None:
     assert tracks.confidence[-1, 0] > 0.9
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depth", [True, False])
 def test_what_is_out_of_view_is_neither_visible_nor_elsewhere(depth: bool) -> None:
     camera_m = np.concatenate([np.linspace(0, 1.4, 24), np.full(6, 1.4), np.linspace(1.4, 0, 24)])

@@ -125,7 +125,6 @@ def test_a_camera_stands_still_until_points_say_otherwise() -> None:
     assert not stands_still(place, after.project(place)[0] + jitter, VIEW, after)
 
 
-@pytest.mark.slow
 @pytest.mark.xfail(
     reason="where most points are on one body, the world's own error seems as large as its motion: it is found late"
 )

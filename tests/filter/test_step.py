@@ -37,7 +37,6 @@ LAGS = pytest.mark.xfail(
 )
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stride", "depth"),
     [
@@ -68,7 +67,6 @@ def test_an_occluder_that_passes_takes_nothing_along() -> None:
     np.testing.assert_allclose(tracks.uv_px[:, 0], there, atol=1.0)
 
 
-@pytest.mark.slow
 def test_queries_come_in_when_they_are_asked_for() -> None:
     clip = scene(np.linspace(0, 0.2, FRAMES))
     queries = [Query.point(5, 90.0, 50.0, name="late"), Query.point(0, *AT, name="first")]

@@ -84,7 +84,6 @@ def test_no_probability_and_no_budget():
             Budget(0.1, frames)
 
 
-@pytest.mark.slow
 def test_what_is_spent_adds_up():
     blocks = [share(0.1, block=b, restart=0) for b in range(1, 10_001)]
     assert sum(blocks) == pytest.approx(0.1, rel=1e-3)

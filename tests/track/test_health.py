@@ -52,7 +52,6 @@ def in_good_health(depth: bool) -> list[StreamState]:
     return played(lambda rgb, before: rgb, depth=depth)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("what", BLIND)
 def test_a_blind_camera_follows_nothing_and_finds_it_again(what: str, depth: bool) -> None:

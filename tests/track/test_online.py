@@ -63,7 +63,6 @@ def use(monkeypatch: pytest.MonkeyPatch, find: Finder) -> Tracker:
     return make_tracker(CONFIG)
 
 
-@pytest.mark.slow
 def test_what_comes_into_view_is_found_and_nothing_twice(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     """The left one leaves the view meanwhile, and comes back."""
     tracker = use(monkeypatch, finder(clip, THERE_AND_BACK, (LEFT, lambda _: 0.9), (RIGHT, lambda _: 0.9)))
@@ -80,7 +79,6 @@ def test_what_comes_into_view_is_found_and_nothing_twice(clip: Clip, monkeypatch
         np.testing.assert_allclose(tracks.uv_px[seen, k], true_px[seen], atol=2)
 
 
-@pytest.mark.slow
 def test_what_comes_back_displaced_is_the_same(monkeypatch: pytest.MonkeyPatch):
     """By colours alone: it is gone for a second, and is then somewhere else; it looks as it did."""
     out, shift = np.full(15, -60), 60
@@ -144,7 +142,6 @@ def test_weak_sightings_under_several_views_are_enough(clip: Clip, monkeypatch: 
     np.testing.assert_allclose(state.uv_px[0], at(LEFT, 19), atol=2)
 
 
-@pytest.mark.slow
 @ONCE
 @pytest.mark.parametrize("p", [lambda t: 0.3 * (t % 9 == 0), lambda _: 0.1], ids=["flickers", "is hardly there"])
 def test_flicker_is_not_found(p: Callable[[int], float], clip: Clip, monkeypatch: pytest.MonkeyPatch):
@@ -152,7 +149,6 @@ def test_flicker_is_not_found(p: Callable[[int], float], clip: Clip, monkeypatch
     assert tracker.track(clip, online=0.2).names == ()
 
 
-@pytest.mark.slow
 def test_a_still_picture_is_looked_at_once(monkeypatch: pytest.MonkeyPatch):
     clip = scene(np.zeros(60))
     clip = replace(clip, rgb=clip.rgb.copy())
@@ -173,7 +169,6 @@ def test_candidates_are_bounded(clip: Clip, monkeypatch: pytest.MonkeyPatch):
         assert 0 < len(finding.candidates.uv_px) <= CONFIG.most
 
 
-@pytest.mark.slow
 def test_what_moves_by_itself_needs_less(monkeypatch: pytest.MonkeyPatch):
     """A board that moves, and no query on it: what is on it is found above the threshold of prompts."""
     corner = np.stack([np.concatenate([np.full(8, 20), 20 + 2 * np.arange(24)]), np.full(32, 20)], axis=1)
@@ -245,7 +240,6 @@ def test_the_thread_ends_with_its_stream(clip: Clip, monkeypatch: pytest.MonkeyP
         assert not thread.is_alive()
 
 
-@pytest.mark.slow
 def test_a_saved_stream_goes_on_to_the_bit(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     things = (LEFT, lambda _: 0.3), (RIGHT, lambda _: 0.9)
     tracker = use(monkeypatch, finder(clip, THERE_AND_BACK, *things))

@@ -138,7 +138,6 @@ def test_a_lost_view_is_outvoted_and_put_back(take: Take, tracker: Tracker):
     assert own_error[-1] < 0.03
 
 
-@pytest.mark.slow
 def test_what_views_discover_is_one_entity_where_it_is_near(take: Take, tracker: Tracker, monkeypatch):
     pixels = [view.uv_px[0] for view in take.views[:2]]
     found = iter(
@@ -158,7 +157,6 @@ def test_what_views_discover_is_one_entity_where_it_is_near(take: Take, tracker:
     assert np.isfinite(made.views[1].uv_px[-1, 0]).all()
 
 
-@pytest.mark.slow
 def test_queries_of_one_name_in_several_views_are_one(take: Take, tracker: Tracker):
     clips = clips_of(take)[:2]
     made = track_views(tracker, clips, [*asked(take), asked(take, 1)[1]], view=[0, 0, 1])

@@ -138,7 +138,6 @@ def test_the_best_checkpoint_is_the_mean_of_the_weights(run: Run, tmp_path: Path
     assert reports[-1].scores is not None
 
 
-@pytest.mark.slow
 def test_micro_batches_add_up_to_the_batch(run: Run):
     """Windows of different numbers of entities, so that the mean of the parts' means would be another one."""
     whole, reports = run(out="whole")

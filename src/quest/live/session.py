@@ -253,7 +253,7 @@ class Session:
 
 
 def _compact(state: FilterState) -> FilterState:
-    """The same, its picture without what was computed from it, which is several times as large."""
+    """The same, its picture without what was computed from it: half the memory."""
     return replace(state, picture=Picture(state.picture.grey, state.picture.descriptors))
 
 

@@ -162,7 +162,7 @@ def read_into(make: Callable[[], _Module], state: Mapping[str, Tensor], *, what:
 
 
 class _NoRandomValues(TorchFunctionMode):
-    """Leaves parameters as they were allocated: drawing values that a file overwrites takes as long as reading it."""
+    """Leaves parameters as they were allocated: it takes time to draw values that a file overwrites."""
 
     def __torch_function__(self, func: Callable, types: object, args: tuple = (), kwargs: dict | None = None) -> object:
         if getattr(func, "__module__", None) == "torch.nn.init":
