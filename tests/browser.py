@@ -19,6 +19,11 @@ CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "google-chrome", "ch
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium here")
 _START_S = 30.0
 _PATIENCE_S = 30.0
+_STEADY_BOX = """new Promise(done => {
+  const box = () => (b => [b.left, b.top, b.width, b.height])(document.querySelector(%s).getBoundingClientRect());
+  const look = last => requestAnimationFrame(() => String(box()) === String(last) ? done(last) : look(box()));
+  look(box());
+})"""  # where an element is once the layout stands still: a click elsewhere is lost
 
 
 class Page:
@@ -56,7 +61,8 @@ class Page:
         """Wait until a script gives something true."""
         ends_s = time.monotonic() + _PATIENCE_S
         while not (value := await self.run(script)):
-            assert time.monotonic() < ends_s, f"in vain: {script}; console: {self.errors}"
+            if time.monotonic() > ends_s:
+                pytest.fail(f"in vain: {script}; console: {self.errors}; {await self.run('document.body.innerText')}")
             await asyncio.sleep(0.05)
         return value
 
@@ -64,9 +70,7 @@ class Page:
         self, selector: str, x: float = 0.5, y: float = 0.5, *, to: tuple[float, float] | None = None
     ) -> None:
         """Click at a share of an element's width and height, or drag from there to another."""
-        box = await self.run(
-            f"(b => [b.left, b.top, b.width, b.height])(document.querySelector({selector!r}).getBoundingClientRect())"
-        )
+        box = await self.run(_STEADY_BOX % repr(selector))
         ends = [(box[0] + u * box[2], box[1] + v * box[3]) for u, v in ((x, y), to or (x, y))]
         steps = [("mousePressed", ends[0]), ("mouseMoved", ends[1]), ("mouseReleased", ends[1])]
         for kind, (px, py) in steps:

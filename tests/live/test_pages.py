@@ -152,6 +152,7 @@ def test_pick_in_a_browser(clip: Clip, tmp_path: Path):
         await page.click("#preview")
         await page.until("answers.length > 1")
         await page.until("socket === null")
+        assert await page.run("document.querySelector('#status').innerText") == "the end of the recording"
         await page.click("#save")
         await page.until("document.querySelector('#events').innerText.includes('saved')")
         await page.click("#done")

@@ -287,22 +287,25 @@ function listen(first = 0) {
   socket = new WebSocket(new URL("feed", location.href.replace(/^http/, "ws")));
   socket.binaryType = "arraybuffer";
   const mine = socket;
-  socket.onmessage = async event => {
-    if (mine !== socket) return;
-    if (typeof event.data === "string") {
-      const told = JSON.parse(event.data);
-      if (told.error) say(told.error, "error");
-      if (told.done) say(told.done);
-      if (told.ended) { say(told.ended); finish(told.ended); }
-      return;
-    }
-    const length = new DataView(event.data).getUint32(0, true);
-    const header = JSON.parse(new TextDecoder().decode(new Uint8Array(event.data, 4, length)));
-    const bitmap = await createImageBitmap(new Blob([new Uint8Array(event.data, 4 + length)], {type: "image/jpeg"}));
-    mine.readyState === WebSocket.OPEN && mine.send("ready");
-    take(header, bitmap, first);
-  };
-  socket.onclose = () => { if (mine === socket) { if (mode === "live" && !$("status").dataset.ended) finish("the program ended"); socket = null; } };
+  let handled = Promise.resolve();
+  const then = what => { handled = handled.then(() => mine === socket && what()).catch(error => say(String(error), "error")); };
+  socket.onmessage = event => then(() => hear(mine, event.data, first));  // in the order in which it comes, though pictures take time to decode
+  socket.onclose = () => then(() => { if (mode === "live" && !$("status").dataset.ended) finish("the program ended"); socket = null; });
+}
+
+async function hear(from, data, first) {
+  if (typeof data === "string") {
+    const told = JSON.parse(data);
+    if (told.error) say(told.error, "error");
+    if (told.done) say(told.done);
+    if (told.ended) { say(told.ended); finish(told.ended); }
+    return;
+  }
+  const length = new DataView(data).getUint32(0, true);
+  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  const bitmap = await createImageBitmap(new Blob([new Uint8Array(data, 4 + length)], {type: "image/jpeg"}));
+  if (from.readyState === WebSocket.OPEN) from.send("ready");
+  take(header, bitmap, first);
 }
 
 function take(header, bitmap, first) {
