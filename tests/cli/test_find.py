@@ -54,7 +54,7 @@ def test_coco_has_boxes_points_and_scores() -> None:
 @pytest.fixture
 def picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A picture in which that is found."""
-    tracker = Tracker(make_finder(), TrackerConfig(size_px=64), device=torch.device("cpu"))
+    tracker = Tracker(make_finder(), TrackerConfig(size_px=64, follow_px=64), device=torch.device("cpu"))
     monkeypatch.setattr(Tracker, "find", lambda *_: made_up())
     monkeypatch.setattr(quest, "load", lambda *_, **__: tracker, raising=False)
     path = tmp_path / "kitchen.png"

@@ -38,7 +38,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     folder = tmp_path_factory.mktemp("weights")
     network, alarming = make_finder(), make_calibration(alarming=True)
     for name, threshold in (("eager", 0.0), ("blind", 1.0)):
-        settings = TrackerConfig(threshold=threshold, prompt_threshold=threshold, size_px=64).to_json()
+        settings = TrackerConfig(threshold=threshold, prompt_threshold=threshold, size_px=64, follow_px=64).to_json()
         save_network(folder / f"{name}.safetensors", network, settings=settings, about="a test")
     found = {name: ["--weights", str(folder / f"{name}.safetensors")] for name in ("eager", "blind")}
     for name, made in (

@@ -380,7 +380,7 @@ def test_what_was_stopped_goes_on(clips: Path, tmp_path: Path) -> None:
 def test_command_writes_what_it_prints(
     clips: Path, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tracker = Tracker(make_finder(), TrackerConfig(bias=100.0, size_px=64), device=torch.device("cpu"))
+    tracker = Tracker(make_finder(), TrackerConfig(bias=100.0, size_px=64, follow_px=64), device=torch.device("cpu"))
     monkeypatch.setattr(quest, "load", lambda weights: tracker, raising=False)
     pictures = tmp_path / "photos"
     (pictures / "pictures").mkdir(parents=True)

@@ -19,7 +19,7 @@ from quest.types import Clip, Query
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
-EAGER = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64)
+EAGER = TrackerConfig(threshold=0.0, prompt_threshold=0.0, size_px=64, follow_px=64)
 """Discovery takes whatever is found, which random weights need."""
 
 

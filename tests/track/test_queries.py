@@ -78,7 +78,7 @@ def test_texts_wait_as_labels_do(clip: Clip, monkeypatch: pytest.MonkeyPatch):
     """A text looks for a quarter of a second, and follows what it found then, wherever others appear later."""
     frames = iter([make_found(), HANDLES.select([1]), HANDLES, HANDLES, HANDLES, HANDLES])
     monkeypatch.setattr("quest.track.stream.find", lambda *_, **__: next(frames))
-    tracker = make_tracker(TrackerConfig(size_px=64))
+    tracker = make_tracker(TrackerConfig(size_px=64, follow_px=64))
     stream = tracker.stream(clip.camera, [Query.text("left handle"), Query.text("left knob")])
     states = [feed(stream, clip, range(t, t + 1), stamp_s=0.1 * t)[0] for t in range(4)]
     assert [state.names for state in states] == [(), ("left handle",), ("left handle",), ("left handle",)]

@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ConfigError, InputError
+from quest.filter.landmarks import Landmarks
 from quest.filter.picture import Picture
 from quest.filter.queries import Queries
+from quest.filter.step import FilterState
+from quest.filter.view import View
+from quest.geometry import scale_camera
 from quest.monitor import Alarm, Budget
 from quest.track import StreamState, Tracker
 from quest.track.events import Events
@@ -38,6 +43,29 @@ def assert_equal(got: StreamState, expected: StreamState) -> None:
 def watched(alarming: bool = False) -> Tracker:
     """A tracker with a monitor, which finds everything or nothing suspicious."""
     return make_tracker(depth=make_calibration(alarming=alarming))
+
+
+def test_small_pictures_are_enlarged(clip: Clip):
+    """They are answered in their own pixels, as the user's own enlargement would be in its own."""
+    assert clip.depth_m is not None
+    grey = clip.rgb.mean(axis=-1).round().astype(np.uint8)  # colours would be rounded before they became grey
+    small = replace(clip, rgb=np.repeat(grey[..., None], 3, axis=-1))
+    camera = scale_camera(clip.camera, scale=(2.0, 2.0), pad_left_px=0, pad_top_px=0, width=128, height=128)
+    images = [cv2.resize(image, (128, 128), interpolation=cv2.INTER_LINEAR) for image in small.rgb]
+    depths = [cv2.resize(depth, (128, 128), interpolation=cv2.INTER_NEAREST_EXACT) for depth in clip.depth_m]
+    large = replace(small, camera=camera, rgb=np.stack(images), depth_m=np.stack(depths))
+    twice = [replace(q, uv_px=(2 * q.uv_px[0], 2 * q.uv_px[1])) for q in POINTS if q.uv_px is not None]
+    streams = [make_tracker(replace(EAGER, follow_px=n)).stream(c.camera, q) for n, c, q in (
+        (128, small, POINTS), (64, large, twice),
+    )]  # fmt: skip
+    for t in range(len(clip)):
+        (got,), (expected,) = (feed(s, c, range(t, t + 1)) for s, c in zip(streams, (small, large), strict=True))
+        np.testing.assert_allclose(2 * got.uv_px, expected.uv_px, atol=1e-3)
+        np.testing.assert_allclose(got.point_world, expected.point_world, atol=1e-5)
+        if t == 4:
+            streams[0].place("a", 30.0, 24.0)
+            streams[1].place("a", 60.0, 48.0)
+    assert np.ptp([s.memory.answer.uv_px[0] for s in streams], axis=0).max() > 10  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize(("frame", "flag"), [(1, "late"), (3, "duplicate")])
@@ -357,4 +385,6 @@ def test_why_something_is_lost():
         ({"seen_log_odds": 0.5}, "looks little like its anchor"),
     ):
         changed = replace(queries, **{name: np.array([value]) for name, value in changes.items()})
-        assert reason(changed, 0, at[0]) == words
+        view = View(np.eye(3), np.eye(4), None)
+        state = FilterState(picture, view, 0.0, Landmarks.none(), changed)
+        assert reason(state, 0, at[0]) == words

@@ -228,11 +228,11 @@ def by_unit(records: Sequence[StreamRecord], unit: Unit) -> tuple[StreamRecord, 
 
 
 def tracker_id(tracker: Tracker) -> str:
-    """Twelve hexadecimal digits that tell apart the noise parameters and code of trackers, and versions of records.
+    """Twelve hexadecimal digits that tell apart the noise, picture size and code of trackers, and versions of records.
 
     Streams are asked for by points, which the filter follows by itself: no network has a part in it.
     """
-    made_of = json.dumps([asdict(tracker.noise), REVISION, FORMAT], sort_keys=True)
+    made_of = json.dumps([asdict(tracker.noise), tracker.config.follow_px, REVISION, FORMAT], sort_keys=True)
     return hashlib.sha256(made_of.encode()).hexdigest()[:12]
 
 

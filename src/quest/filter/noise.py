@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Noise:
-    """How far each kind of evidence is off. Pixels are those of the source image."""
+    """How far each kind of evidence is off. Pixels are those of pictures with a longer side of 480 or more."""
 
     chain_px2_s: float = 4.0
     """Variance that a patch gathers which is followed from frame to frame, pixels squared per second."""

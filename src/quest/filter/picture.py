@@ -20,6 +20,16 @@ class Picture:
     grey: UInt8[np.ndarray, "H W"]
     descriptors: Float32[np.ndarray, "D h w"]
     """Of length 1; pixel (x, y) lies at (x * w / W, y * h / H)."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    """Pixels for one pixel of the camera, along x and y."""
+
+    def to_camera(self, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        """Pixels of the camera."""
+        return uv_px / self.scale
+
+    def from_camera(self, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2"]:
+        """Pixels of this picture for those of the camera."""
+        return uv_px * self.scale
 
     @property
     def size(self) -> tuple[int, int]:

@@ -3,6 +3,9 @@
 A query *rides* on a body, the still world or one that moves against it, or it goes with its *own* patch. All are kept
 until they part (:mod:`quest.filter.posterior`); a hypothesis below odds of 1 : 150 begins anew at the best one.
 Without depth nothing is known to ride, and the own patch, guided by the camera's motion, is the answer.
+
+The filter counts in the pixels of its pictures, which may be larger than the camera's; what it is asked and what it
+answers are pixels of the camera.
 """
 
 from __future__ import annotations
@@ -36,7 +39,7 @@ class FilterState:
     landmarks: Landmarks
     queries: Queries
     warp: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
-    """Homography of the picture since the previous frame, for places without depth."""
+    """Homography of the picture since the previous frame, for places without depth; in the picture's pixels."""
 
 
 def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterState:
@@ -83,6 +86,7 @@ def _at(
 
 def ask(state: FilterState, uv_px: Float[np.ndarray, "K 2"], noise: Noise) -> FilterState:
     """Follow some pixels of the newest frame as well."""
+    uv_px = state.picture.from_camera(uv_px)
     depth_m, pose = state.view.near_depth_at(uv_px), state.landmarks.pose
     point = state.view.lift(uv_px, depth_m)
     place = move_back(pose, np.repeat(point[:, None], len(pose), axis=1))
@@ -110,13 +114,14 @@ def carry(
     """
     if old is new or not len(uv_px):
         return uv_px
+    uv_px = old.picture.from_camera(uv_px)
     expected_px = _carried(uv_px, _body_at(old, uv_px), old, new.landmarks, new.view, warp)
-    return follow(old.picture, new.picture, uv_px, expected_px).uv_px
+    return new.picture.to_camera(follow(old.picture, new.picture, uv_px, expected_px).uv_px)
 
 
 def moves_alone(state: FilterState, uv_px: Float[np.ndarray, "N 2"]) -> Bool[np.ndarray, " N"]:
     """Whether pixels lie on a body that moved against the world and that no query rides on."""
-    body = _body_at(state, uv_px)
+    body = _body_at(state, state.picture.from_camera(uv_px))
     return (body > 0) & ~np.isin(body, state.queries.body[state.queries.rides])
 
 
@@ -125,6 +130,7 @@ def returns(state: FilterState, uv_px: Float[np.ndarray, "N 2"], noise: Noise) -
     queries = state.queries.only(np.flatnonzero(state.queries.seen_log_odds <= 0))
     if not (len(queries) and len(uv_px)):
         return np.zeros(len(uv_px), dtype=bool)
+    uv_px = state.picture.from_camera(uv_px)
     likeness = Likeness.of(state.picture, queries.descriptor, queries.patch)
     alike = likeness.at(np.repeat(uv_px[None], len(queries), axis=0), noise, CELL_REACH_PX).log_odds
     left = np.minimum(queries.lost_log_odds, 0)
@@ -158,6 +164,7 @@ class Answer:
     """Where K queries are."""
 
     uv_px: Float[np.ndarray, "K 2"]
+    """Pixels of the camera."""
     point_world: Float[np.ndarray, "K 3"]
     """Metres; NaN without depth."""
     visible: Bool[np.ndarray, " K"]
@@ -175,4 +182,5 @@ def read_off(state: FilterState, noise: Noise) -> Answer:
     point = np.where(rides[:, None], ride, view.lift(uv_px, measured))
     hidden = rides & (measured < ride_depth - 3 * depth_error(ride_depth, noise))
     visible = in_image(uv_px, state.picture.size) & ~hidden & (queries.seen_log_odds > 0)
-    return Answer(uv_px, point, visible, queries.lost_log_odds, joints_of(queries, state.landmarks, noise))
+    seen_px = state.picture.to_camera(uv_px)
+    return Answer(seen_px, point, visible, queries.lost_log_odds, joints_of(queries, state.landmarks, noise))

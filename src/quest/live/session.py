@@ -254,7 +254,7 @@ class Session:
 
 def _compact(state: FilterState) -> FilterState:
     """The same, its picture without what was computed from it: half the memory."""
-    return replace(state, picture=Picture(state.picture.grey, state.picture.descriptors))
+    return replace(state, picture=Picture(state.picture.grey, state.picture.descriptors, state.picture.scale))
 
 
 def drawn_joints(state: StreamState, camera: Camera) -> list[dict[str, list[list[float]]] | None]:

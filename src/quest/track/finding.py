@@ -60,10 +60,11 @@ class Candidates:
     def carried(self, old: FilterState, new: FilterState, warp: Float[np.ndarray, "3 3"]) -> Candidates:
         """Those that are in view in a later frame; ``warp`` is the homography to it."""
         uv_px = filtering.carry(old, new, warp, self.uv_px)
-        cosine = (old.picture.describe(self.uv_px) * new.picture.describe(uv_px)).sum(axis=1)
+        looks = [p.describe(p.from_camera(uv)) for p, uv in ((old.picture, self.uv_px), (new.picture, uv_px))]
+        cosine = (looks[0] * looks[1]).sum(axis=1)
         repeats = self.repeats * np.exp(np.minimum(cosine.astype(np.float64) - 1, 0) / CHANGE)
         there = Candidates(uv_px, self.log_odds, self.evidence, repeats)
-        return there.only(np.flatnonzero(in_image(uv_px, new.picture.size)))
+        return there.only(np.flatnonzero(in_image(new.picture.from_camera(uv_px), new.picture.size)))
 
     def after(self, found: Found, same: Bool[np.ndarray, "N C"]) -> Candidates:
         """What was found and is not followed, in its order, then the candidates that none of it may be."""

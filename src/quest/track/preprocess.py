@@ -57,9 +57,9 @@ class Prepared:
     """A frame as the filter takes it."""
 
     grey: UInt8[np.ndarray, "H W"]
-    """Grey values."""
+    """Grey values, enlarged if they are few."""
     depth_m: Float[np.ndarray, "H W"] | None
-    """Metres, 0 where missing; None without any."""
+    """Metres, as large, 0 where missing; None without any."""
     cam_from_world: Float[np.ndarray, "4 4"] | None
     """Pose of the camera; None where none is given, and before those that are given change."""
     first_pose: Float[np.ndarray, "4 4"] | None
@@ -71,17 +71,24 @@ class Prepared:
 class Preprocessor:
     """Checks the frames of one stream and prepares them; all that the next frame depends on is its ``state``.
 
+    Pictures whose longer side is below ``follow_px`` are enlarged to it.
+
     Raises:
         InputError: pictures with a side below 16 pixels.
     """
 
-    def __init__(self, camera: Camera) -> None:
+    def __init__(self, camera: Camera, follow_px: int) -> None:
         if min(camera.width, camera.height) < LEAST_PX:
             raise InputError(
                 f"camera: expected pictures with sides of at least {LEAST_PX} pixels, got {camera.width} x "
                 f"{camera.height}; enlarge them"
             )
         self.camera = camera
+        by = max(1.0, follow_px / max(camera.width, camera.height))
+        self.size = (round(by * camera.width), round(by * camera.height))
+        """Width and height of what the filter sees, pixels."""
+        self.scale = (self.size[0] / camera.width, self.size[1] / camera.height)
+        """Its pixels for one of the camera."""
         self.state = PreprocessorState()
 
     def check(
@@ -184,7 +191,17 @@ class Preprocessor:
             if state.pose is not None or state.now_s > 0:
                 state.flags += (DEPTH_BEGINS_FLAG,)
             state.has_depth = True
-        return Prepared(grey_of(rgb), depth_m, *self._poses(cam_from_world), blind)
+        grey = grey_of(rgb)
+        if self.scale != (1.0, 1.0):
+            grey = cv2.resize(grey, self.size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+            if depth_m is not None:  # never mixed between pixels
+                depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
+        return Prepared(grey, depth_m, *self._poses(cam_from_world), blind)
+
+    @property
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """Intrinsics of what the filter sees, pixels."""
+        return np.diag([*self.scale, 1.0]) @ self.camera.matrix.astype(np.float64)
 
     def _poses(self, cam_from_world: np.ndarray | None) -> tuple[np.ndarray | None, np.ndarray | None]:
         """The frame's pose, and the same if it is the stream's first.
@@ -208,11 +225,11 @@ def grey_of(rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
 
 
 @torch.inference_mode()
-def to_picture(grey: UInt8[np.ndarray, "H W"], features: XFeat) -> Picture:
+def to_picture(grey: UInt8[np.ndarray, "H W"], features: XFeat, scale: tuple[float, float] = (1.0, 1.0)) -> Picture:
     """What the filter reads of a frame: grey values, and the descriptors of a network."""
     device = next(features.parameters()).device
     descriptors, _ = features.features(torch.from_numpy(grey).to(device))
-    return Picture(grey, descriptors.float().cpu().numpy())
+    return Picture(grey, descriptors.float().cpu().numpy(), scale)
 
 
 def _implausible(depth_m: Float32[np.ndarray, "H W"]) -> float | None:

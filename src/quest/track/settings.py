@@ -35,6 +35,9 @@ class TrackerConfig:
     """Probability above which a label or slot is bound; lower, because the user says that it is there."""
     size_px: int = 640
     """Longer side of the picture that the finder sees, pixels."""
+    follow_px: int = 480
+    """Longer side that smaller pictures are enlarged to before anything is followed in them, pixels: the filter's
+    patches and noises are of such pictures."""
     most: int = 32
     """Most entities that discovery follows."""
 

@@ -15,7 +15,6 @@ from quest.errors import InputError
 from quest.filter import step as filtering
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
-from quest.filter.queries import Queries
 from quest.filter.step import Answer, FilterState
 from quest.filter.view import View, in_image, move
 from quest.model.finder import FinderNetwork
@@ -79,7 +78,7 @@ class Stream:
         self._noise = noise
         self._config = config
         self._calibrations = calibrations
-        self._preprocessor = Preprocessor(camera)
+        self._preprocessor = Preprocessor(camera, config.follow_px)
         self._network = network
         self._queries = StreamQueries(config, camera, queries if finding is None else ())
         self._monitor = None
@@ -278,10 +277,10 @@ class Stream:
         memory, now_s = self._memory, self._preprocessor.state.now_s
         if frame.blind and memory.filter is not None:
             return memory.filter
-        picture = to_picture(frame.grey, self._features)
+        picture = to_picture(frame.grey, self._features, self._preprocessor.scale)
         if memory.filter is None:
             # In the first camera's axes, so that answers do not depend on where the world has its origin.
-            view = View(self.camera.matrix.astype(np.float64), np.eye(4), frame.depth_m)
+            view = View(self._preprocessor.matrix, np.eye(4), frame.depth_m)
             state = filtering.begin(picture, view, now_s, self._noise)
         else:
             given = None if frame.cam_from_world is None else frame.cam_from_world @ memory.world_from_filter
@@ -316,7 +315,7 @@ class Stream:
         now_px = filtering.carry(look, state, finding.warp, found.uv_px[sure])
         moved = np.tile(now_px - found.uv_px[sure], 2)
         now = replace(found.select(sure), uv_px=now_px, box_px=found.box_px[sure] + moved)
-        there = np.flatnonzero(in_image(now_px, state.picture.size))
+        there = np.flatnonzero(in_image(now_px, (self.camera.width, self.camera.height)))
         begun = there[queries.discover(now.select(there), filtering.read_off(state, self._noise).uv_px)]
         left = np.setdiff1d(np.flatnonzero(told.log_odds > FORGOTTEN), sure[begun])
         finding.candidates = told.only(left[np.argsort(-told.log_odds[left], kind="stable")][: config.most])
@@ -381,7 +380,7 @@ class Stream:
         verdict = monitor.step(
             numbers,
             answer.lost_log_odds,
-            lambda row: reason(state.queries, row, answer.uv_px[row]),
+            lambda row: reason(state, row, answer.uv_px[row]),
             frame=memory.frame - 1,
             stamp_s=stamp_s,
         )
@@ -403,8 +402,9 @@ def coordinate(joint: Joint | None, point: Float[np.ndarray, "3"]) -> float:
     return float(joint.locate(point[None])[0])
 
 
-def reason(queries: Queries, row: int, uv_px: Float[np.ndarray, "2"]) -> str:
+def reason(state: FilterState, row: int, uv_px: Float[np.ndarray, "2"]) -> str:
     """Why the query of a row, which is answered by a pixel, is probably lost: words for who holds the camera."""
+    queries = state.queries
     seen, unseen_s = queries.seen_log_odds[row], queries.unseen_s[row]
     if seen > 0:
         why = "looks little like its anchor"
@@ -414,4 +414,5 @@ def reason(queries: Queries, row: int, uv_px: Float[np.ndarray, "2"]) -> str:
         why = "behind something or out of view"
     if queries.rival_log_odds[row] < seen:
         return why
-    return f"{why}; looks more like what is {np.linalg.norm(queries.rival_px[row] - uv_px):.0f} px away"
+    apart_px = np.linalg.norm(state.picture.to_camera(queries.rival_px[row : row + 1])[0] - uv_px)
+    return f"{why}; looks more like what is {apart_px:.0f} px away"
