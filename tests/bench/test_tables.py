@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from quest.baselines.hold_still import HoldStill
-from quest.bench import workbench
+from quest.bench import training, workbench
 from quest.bench.settings import Making
 from quest.bench.tables import SHARES, TABLES, drift_rows
 from quest.bench.trackers import ChainedFlow, NoisyColours
@@ -51,7 +51,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         return [TakeSpec("procedural", f"panels-{TAKES[name]}", 1, 0)]
 
     monkeypatch.setattr(workbench, "planned", there)
-    monkeypatch.setattr(workbench, "take_encoder", lambda network: None)
+    monkeypatch.setattr(training, "take_encoder", lambda network: None)
     tiny = replace(BASES["remedies"], network=replace(PAPER, place_from="map"))
     monkeypatch.setitem(BASES, "remedies", tiny)  # type: ignore[arg-type]
 
@@ -80,14 +80,16 @@ def test_a_table_is_made_and_found_again(work: Path, tmp_path: Path, monkeypatch
         assert (tmp_path / f"levels.{kind}").read_bytes().startswith(start)
     noisy = json.loads((tmp_path / "noise.json").read_text())["rows"]
     assert {(row["line"], row["noise"]) for row in noisy} == {
-        (line, noise) for line in ("quest", "hold-still", "lk-grid", "published network") for noise in (0.0, 0.05)
+        (line, noise)
+        for line in ("quest", "hold-still", "lk-grid", "cotracker-retrained", "published network")
+        for noise in (0.0, 0.05)
     }
 
     def refuse(*_: object) -> None:
         raise AssertionError("asked again")
 
     monkeypatch.setattr(workbench, "build", refuse)
-    monkeypatch.setattr(workbench, "fit", refuse)
+    monkeypatch.setattr(training, "fit", refuse)
     assert bench(work, tmp_path / "again", "levels") == 0
     assert json.loads((tmp_path / "again" / "levels.json").read_text())["rows"] == report["rows"]
 
@@ -110,7 +112,7 @@ def test_cases_and_curves(work: Path, tmp_path: Path):
     assert shares == {*SHARES}
     assert (tmp_path / "drift.png").is_file()
     failures = json.loads((tmp_path / "failures.json").read_text())
-    assert {row["line"] for row in failures["lockers"]} == {"quest", "hold-still", "lk-grid"}
+    assert {row["line"] for row in failures["lockers"]} == {"quest", "hold-still", "lk-grid", "cotracker-retrained"}
     assert failures["occlusion"] == []  # nothing is hidden there
     assert json.loads((tmp_path / "intents.json").read_text())["answers"] == []  # nor to be opened
 

@@ -1,7 +1,8 @@
 """Trackers to compare: each is one line in :data:`TRACKERS`, from which commands take names, help and errors.
 
-The plain ones follow pixels and need no weights; others are QueST without one of its parts, or run their authors' code
-and weights, where the user has them. Nothing heavy is imported before a tracker is built.
+The plain ones follow pixels and need no weights; others are QueST without one of its parts, run their authors' code and
+weights, where the user has them, or are networks of the same kind that our takes taught (:mod:`.retrained`). Nothing
+heavy is imported before a tracker is built.
 """
 
 from __future__ import annotations
@@ -44,28 +45,36 @@ class Entry:
     """What it does, in a few words."""
     maker: str
     """``module:function`` in this package. It is called with the settings; before them with the name and, for trackers
-    of weights, QueST's own, for official ones, the folder of code and weights. Empty for QueST itself."""
+    of weights, QueST's own, for official and retrained ones, the folder of code and weights. Empty for QueST itself."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Keyword arguments of the maker."""
     of_weights: bool = False
     """Whether it needs weights of QueST."""
     official: bool = False
     """Whether it is its authors' own code and checkpoint, which the user has to have; its name ends so."""
+    retrained: bool = False
+    """Whether it is a network of a rival's kind that our takes taught, whose weights the user has trained; its name
+    ends so."""
     inputs: tuple[Inputs, ...] = ("colours",)
     """What it is shown of real recordings, one row of the table each; what a recording lacks is left out."""
 
     @property
     def plain(self) -> bool:
         """Whether it needs nothing."""
-        return not (self.of_weights or self.official)
+        return not (self.of_weights or self.official or self.retrained)
 
     def build(self, name: str, tracker: ClipTracker | None = None, *, rivals: Path | None = None) -> ClipTracker:
         """The tracker.
 
         Raises:
             ConfigError: official code is not there, or lacks what it needs.
-            WeightsError: the network lacks what the tracker needs, or official weights are not there or do not fit.
+            WeightsError: the network lacks what the tracker needs, or other weights are not there or do not fit.
         """
+        if self.retrained and rivals is None:
+            raise ConfigError(
+                f"tracker {name!r}: it needs weights that `quest bench comparison` trains; put them into a folder as "
+                f"{name}.safetensors, and name that with --rivals"
+            )
         if self.official and rivals is None:
             raise ConfigError(
                 f"tracker {name!r}: it runs its authors' code and weights; put both into a folder as docs/metrics.md "
@@ -76,7 +85,7 @@ class Entry:
             return tracker
         module, _, function = self.maker.partition(":")
         make = attrgetter(function)(import_module(f"quest.baselines.{module}"))
-        return make(*(() if self.plain else (name, rivals if self.official else tracker)), **self.settings)
+        return make(*(() if self.plain else (name, tracker if self.of_weights else rivals)), **self.settings)
 
 
 def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHING, **settings: Any) -> Entry:
@@ -85,6 +94,10 @@ def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHI
 
 def _official(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",), **settings: Any) -> Entry:
     return Entry(about, maker, settings, official=True, inputs=inputs)
+
+
+def _retrained(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",)) -> Entry:
+    return Entry(about, f"retrained.trackers:{maker}", retrained=True, inputs=inputs)
 
 
 TRACKERS: dict[str, Entry] = {
@@ -114,6 +127,9 @@ TRACKERS: dict[str, Entry] = {
     "tapnextpp-official": _official("TAPNext++, frame by frame", "tapnet:TapNext"),
     "raft-official": _official("RAFT, chained", "raft:Raft"),
     "raft-3d-official": _official("RAFT-3D, chained; CUDA", "raft:Raft3D", inputs=("depth",)),
+    "raft-3d-retrained": _retrained("rigid flow of its kind, chained", "FlowTracker", inputs=("depth", "colours")),
+    "tapnet-retrained": _retrained("volume of costs of its kind, frame by frame", "MatchTracker"),
+    "cotracker-retrained": _retrained("refined windows of its kind, 8 frames", "RefineTracker"),
 }
 """Every tracker by the name that commands and tables call it."""
 
@@ -124,7 +140,7 @@ def line_up(names: Sequence[str], *, weights: str, rivals: Path | None = None) -
     Args:
         names: of :data:`TRACKERS`; each counts once.
         weights: name or file of the weights.
-        rivals: folder of the code and weights of official trackers.
+        rivals: folder of the code and weights of official trackers and the weights of retrained ones.
 
     Raises:
         ConfigError: no tracker of that name, or official code that is not there.

@@ -52,7 +52,10 @@ class Making:
     """Of our tracker and of plain trackers that need some."""
     rivals: Path | None = None
     """Folder of code and weights of the rivals named -official."""
-    trackers: tuple[str, ...] = ("quest", "hold-still", "lk-grid", "lk-reinit", "dis", "xfeat", "dino")
+    trackers: tuple[str, ...] = (
+        *("quest", "hold-still", "lk-grid", "lk-reinit", "dis", "xfeat", "dino"),
+        *("raft-3d-retrained", "tapnet-retrained", "cotracker-retrained"),
+    )
     """Beside the published network."""
     lines: tuple[str, ...] = ()
     """Rows to make, by their names, and those that they are compared with; all by default."""
@@ -61,9 +64,11 @@ class Making:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Of every training."""
     steps: int = 2500
-    """Of every training."""
+    """Of every training of the published network."""
+    rival_steps: int = 5000
+    """Of every training of a rival named -retrained."""
     batch: int = 8
-    """Windows of a step."""
+    """Windows of a step of the published network."""
     learning_rate: float = 5e-4
     """Peak of the schedule, of AdamW."""
     noise: tuple[float, ...] = (0.0, 0.01, 0.02, 0.05, 0.1)
@@ -74,7 +79,7 @@ class Making:
     """Share the work on a Ray cluster: its address, auto, or local for one on this machine."""
 
     def __post_init__(self) -> None:
-        counts = (self.takes_per_object, self.views, self.steps, self.batch, self.resamples)
+        counts = (self.takes_per_object, self.views, self.steps, self.rival_steps, self.batch, self.resamples)
         if min(*counts, *self.levels, *self.teach_levels) < 1:
             raise ConfigError(f"bench: expected counts, levels, steps and resamples of 1 or more, got {self}")
         lists = (self.seeds, self.levels, self.teach_levels, self.taught)

@@ -11,33 +11,30 @@ Everything goes on where it stopped, and what is there is not made again unless 
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from rich.console import Console
 
-from quest.baselines import ClipTracker, line_up
+from quest.baselines import TRACKERS, ClipTracker, line_up
 from quest.bench.encoded import serve_cached
 from quest.bench.rows import Answers
 from quest.bench.settings import Making
 from quest.bench.trackers import ChainedFlow, NoisyColours
+from quest.bench.training import store_of, train_published, train_rival
 from quest.bench.variants import Variant
-from quest.data.provenance import code_commit, code_hash, combined_hash, file_hash, package_versions
+from quest.data.provenance import code_hash, file_hash, package_versions
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
 from quest.evaluation.finished import FinishedTakes, KeptAnswers
-from quest.evaluation.results import write_report
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import Shard, select_takes
 from quest.extras import require
 from quest.model.weights import find_weights
-from quest.paper.network import PaperNetwork, read_paper
-from quest.paper.objective import PaperStageOne
+from quest.paper.network import read_paper
 from quest.paper.tracker import PaperTracker
 from quest.sim.cluster import ClusterSettings, connected, produce_on_cluster
 from quest.sim.plan import TakeSpec, parse_object, plan_takes, procedural_objects
@@ -45,10 +42,6 @@ from quest.sim.production import Notice, StudioSettings, TakeSkipped, missing_ta
 from quest.sim.settings import TakeSettings
 from quest.sim.suites import Suite, find_suites
 from quest.track.tracker import pick_device
-from quest.train.checkpoint import load_checkpoint
-from quest.train.dataset import open_dataset
-from quest.train.loop import StepReport, fit
-from quest.train.settings import TrainingConfig
 
 TakesName = Literal["teach", "choose", "motions", "views", "objects", "hidden", "lockers", "laptops"]
 
@@ -79,9 +72,14 @@ class Asked:
     """Label of the row that it is compared with; None for the reference."""
 
     @property
+    def is_trained(self) -> bool:
+        """Whether something has to be trained that answers."""
+        return self.variant is not None or (self.tracker in TRACKERS and TRACKERS[self.tracker].retrained)
+
+    @property
     def is_seeded(self) -> bool:
-        """Whether it answers otherwise for every seed of a training."""
-        return self.variant is not None or self.flow_noise is not None
+        """Whether it answers otherwise for every seed."""
+        return self.is_trained or self.flow_noise is not None
 
     @property
     def key(self) -> str:
@@ -104,11 +102,11 @@ class Workbench:
         levels, store = tuple(levels or self.making.levels), self.takes(takes)
         known = sorted({info.level for info in store.infos().values()})
         levels = tuple(level for level in levels if level in known)
-        variants = {a.variant.name: a.variant for a in asked if a.variant}
-        if variants:
+        trained = {a.variant.name if a.variant else a.tracker: a for a in asked if a.is_trained}
+        if trained:
             for name in ("teach", "choose"):
                 self.takes(name)
-            self._each(_train, [(self.making, v, seed) for v in variants.values() for seed in self.making.seeds])
+            self._each(_train, [(self.making, a, seed) for a in trained.values() for seed in self.making.seeds])
         jobs = [(a, seed) for a in asked for seed in (self.making.seeds if a.is_seeded else (0,))]
         parts = 1 if self.making.ray is None else _PARTS_ON_CLUSTER
         shards = [Shard(i, parts) for i in range(parts)]
@@ -121,7 +119,7 @@ class Workbench:
         Raises:
             ConfigError: to learn from, it has others as well.
         """
-        store, specs = _store(self.making, name), planned(self.making, name)
+        store, specs = store_of(self.making, name), planned(self.making, name)
         missing, others = missing_takes(specs, store), {*store.names()} - {spec.name for spec in specs}
         if others and name in ("teach", "choose"):
             raise ConfigError(f"{store.url}: {min(others)} was made for other settings; use another --work")
@@ -213,90 +211,18 @@ def planned(making: Making, name: TakesName) -> list[TakeSpec]:
             return plan(procedural_objects(2 * len(new), _LAPTOPS, "laptop"), levels=(1,))
 
 
-def _store(making: Making, name: TakesName) -> TakeStore:
-    return TakeStore(making.work / "takes" / name)
-
-
-def _train(making: Making, variant: Variant, seed: int) -> Path:
-    """The weights of one training, which goes on where it stopped: the last ones, whatever their score."""
-    folder = making.work / "runs" / variant.name / f"seed-{seed}"
-    weights = folder / "weights.safetensors"
-    stores = [_store(making, name) for name in ("teach", "choose")]
-    _check(folder, _settings(making, variant, seed, stores))
-    if weights.exists():
-        return weights
-    torch.manual_seed(seed)
-    network = PaperNetwork(variant.network)
-    take_encoder(network)
-    dataset = open_dataset(
-        network,
-        stores=[stores[0].url],
-        validation_stores=[stores[1].url],
-        cache=making.work / "features",
-        windows=replace(variant.windows, batch=making.batch),
-        device=pick_device("auto"),
-        report=lambda done, total, frames: None,
-    )
-    config = TrainingConfig(
-        steps=making.steps,
-        optimizer="adamw",
-        learning_rate=making.learning_rate,
-        warmup_steps=max(1, min(100, making.steps // 10)),
-        validate_every=making.steps,  # once, so that the best are the last weights
-        validation_batches=2,
-        seed=seed,
-    )
-    objective, out = PaperStageOne(network, variant.losses, order=variant.order), folder / "stage-1"
-    out.mkdir(parents=True, exist_ok=True)
-    best = fit(objective, dataset.training, dataset.validation, config, out=out, report=_silent)
-    load_checkpoint(best, network.cpu(), None)
-    network.save(weights, about=f"variant {variant.name}, seed {seed}, {making.steps} steps of {making.batch} windows")
-    return weights
-
-
-def take_encoder(network: PaperNetwork) -> None:
-    """Give a network the frozen encoder of the shipped one."""
-    network.encoder.load_state_dict(read_paper(find_weights("quest-paper")).network.encoder.state_dict())
-
-
-def _silent(report: StepReport) -> None:
-    """Trainings say nothing; their folder has the curves."""
-
-
-def _settings(making: Making, variant: Variant, seed: int, stores: Sequence[TakeStore]) -> dict[str, Any]:
-    own = {name: getattr(making, name) for name in ("steps", "batch", "learning_rate")}
-    hashes = ((f"{i}/{name}", store.data_hash(name)) for i, store in enumerate(stores) for name in store.names())
-    return own | {
-        "variant": variant.name,
-        "seed": seed,
-        "network": json.loads(variant.network.to_json()),
-        "losses": dict(variant.losses),
-        "order": variant.order,
-        "windows": asdict(variant.windows),
-        "takes": combined_hash(hashes),
-    }
-
-
-def _check(folder: Path, settings: dict[str, Any]) -> None:
-    """Refuse to mix trainings of other settings; note the commit that began one."""
-    file = folder / "settings.json"
-    if not file.exists():
-        write_report(settings | {"commit": code_commit()}, file)
-        return
-    known = json.loads(file.read_text(encoding="utf-8"))
-    for name, value in settings.items():
-        if known.get(name) != value:
-            raise ConfigError(
-                f"{folder}: this training was begun with {name} {known.get(name)}, now it is {value}; use another "
-                "--work, or remove this one"
-            )
+def _train(making: Making, asked: Asked, seed: int) -> Path:
+    """The weights of who answers, which are trained if they are not there."""
+    if asked.variant is not None:
+        return train_published(making, asked.variant, seed)
+    return train_rival(making, asked.tracker, seed)
 
 
 def _answer(
     making: Making, asked: Asked, takes: TakesName, levels: tuple[int, ...], seed: int, shard: Shard
 ) -> Answers:
     """Everybody's answers to takes, as far as they are in a shard."""
-    store, tracker = _store(making, takes), _Late(making, asked, seed)
+    store, tracker = store_of(making, takes), _Late(making, asked, seed)
     finished = FinishedTakes(**_place(making, asked, takes, seed))
     wanted = {spec.name for spec in planned(making, takes)}
     infos = {name: info for name, info in store.infos().items() if name in wanted}
@@ -309,8 +235,8 @@ def _answer(
 def _place(making: Making, asked: Asked, takes: TakesName, seed: int) -> dict[str, Any]:
     """The folder of somebody's answers to takes, and a digest of what they depend on beside the takes."""
     made_by: list[object] = [code_hash(), package_versions()]
-    if asked.variant is not None:
-        made_by.append(file_hash(_train(making, asked.variant, seed)))
+    if asked.is_trained:
+        made_by.append(file_hash(_train(making, asked, seed)))
     elif asked.tracker:
         made_by += [making.weights, file_hash(find_weights(making.weights)), str(making.rivals)]
     digest = hashlib.sha256(repr([*made_by, asked.key, seed]).encode()).hexdigest()
@@ -346,10 +272,12 @@ def build(making: Making, asked: Asked, seed: int, *, cached: bool = True) -> Cl
     """Who answers; a published network reads what the encoder has said of frames before if it may."""
     if asked.flow_noise is not None:
         return ChainedFlow(asked.flow_noise, seed)
+    tracker: ClipTracker
     if asked.variant is None:
-        (tracker,) = line_up([asked.tracker], weights=making.weights, rivals=making.rivals)
+        rivals = _train(making, asked, seed) if asked.is_trained else making.rivals
+        (tracker,) = line_up([asked.tracker], weights=making.weights, rivals=rivals)
     else:
-        network = read_paper(_train(making, asked.variant, seed)).network
+        network = read_paper(_train(making, asked, seed)).network
         if cached and not asked.noise:
             serve_cached(network, making.work / "encoded")
         tracker = PaperTracker(network, device=pick_device("auto"), persistent=asked.persistent)

@@ -24,9 +24,10 @@ SMOKE: Mapping[str, Any] = {
     "takes_per_object": 1,
     "levels": (1,),
     "teach_levels": (1,),
-    "trackers": ("quest", "hold-still", "lk-grid"),
+    "trackers": ("quest", "hold-still", "lk-grid", "cotracker-retrained"),
     "seeds": (0,),
     "steps": 4,
+    "rival_steps": 2,
     "batch": 2,
     "noise": (0.0, 0.05),
     "resamples": 50,
@@ -39,7 +40,8 @@ class BenchTable:
     """Make tables of the publication: JSON, Markdown, LaTeX and pictures.
 
     What they rest on is made as far as it is missing, and kept in --work: simulated takes, trainings of the
-    published network and its variants, answers of all trackers. Run a command that was stopped again and it goes on.
+    published network, its variants and its rivals, answers of all trackers. Run a command that was stopped again and
+    it goes on.
     """
 
     tables: tyro.conf.Positional[tuple[str, ...]]
@@ -118,7 +120,8 @@ class BenchTapvid:
     weights: str = "quest-s16"
     """Name or file of the weights of the trackers that need some."""
     rivals: Path | None = None
-    """Folder of code and weights of the rivals named -official; docs/metrics.md says what lies there."""
+    """Folder of code and weights of the rivals named -official and of weights those named -retrained; docs/metrics.md
+    says what lies there."""
     resamples: int = 1000
     """Of the bootstrap over videos."""
     seed: int = 0

@@ -57,7 +57,8 @@ class Eval:
     weights: str = "quest-s16"
     """Name or file of the weights of the trackers that need some."""
     rivals: Path | None = None
-    """Folder of code and weights of the rivals named -official; docs/metrics.md says what lies there."""
+    """Folder of code and weights of the rivals named -official and of weights those named -retrained; docs/metrics.md
+    says what lies there."""
     split: tuple[Literal["train", "validation", "test", "unlisted"], ...] = ("validation", "test", "unlisted")
     """Parts of the object split; training objects are reported only if train is named here."""
     level: tuple[int, ...] = ()

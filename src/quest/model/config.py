@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 from quest.errors import ConfigError
 from quest.model.encoder import EncoderConfig
 from quest.untrusted import build, parse_json, reading
 
-_Config = TypeVar("_Config", bound="NetworkConfig")
+_Config = TypeVar("_Config", bound="StoredConfig")
 
 
 @dataclass(frozen=True, kw_only=True)
-class NetworkConfig:
-    """A network with a vision transformer."""
+class StoredConfig:
+    """Shapes of a network."""
 
-    encoder: EncoderConfig = field(default_factory=EncoderConfig)
-    """The vision transformer; the side of its image says for which grid its places are stored."""
+    _always: ClassVar[tuple[str, ...]] = ()
+    """What a stored one must name; for all else there are defaults."""
 
     def to_json(self) -> str:
         """One line, stored beside the weights."""
@@ -34,4 +34,14 @@ class NetworkConfig:
         what, remedy = "network configuration", "fetch or train the network again"
         values = parse_json(text, what, ConfigError, remedy)
         with reading(what, ConfigError, remedy):
-            return build(cls, {**values, "encoder": values["encoder"]}, "configuration")
+            return build(cls, {**values, **{name: values[name] for name in cls._always}}, "configuration")
+
+
+@dataclass(frozen=True, kw_only=True)
+class NetworkConfig(StoredConfig):
+    """A network with a vision transformer."""
+
+    _always: ClassVar[tuple[str, ...]] = ("encoder",)
+
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    """The vision transformer; the side of its image says for which grid its places are stored."""

@@ -18,7 +18,7 @@ from safetensors.torch import load_file
 from torch import nn
 
 from quest.errors import WeightsError
-from quest.model.config import NetworkConfig
+from quest.model.config import StoredConfig
 from quest.model.encoder import load_exactly
 from quest.model.tensor_file import save_tensors
 
@@ -133,7 +133,7 @@ def _load_optimizer(
         ) from error
 
 
-def check_same_run(progress: Progress, config: NetworkConfig, objective: str, begun: str, folder: Path) -> None:
+def check_same_run(progress: Progress, config: StoredConfig, objective: str, begun: str, folder: Path) -> None:
     """Refuse to resume with another network or objective, or from other weights: what is not trained is kept too.
 
     Raises:
