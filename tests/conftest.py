@@ -48,10 +48,12 @@ def _shape_checks(request: pytest.FixtureRequest) -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", False)
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist reads the groups
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what is plain; keep on one worker what is dear to set up; skip what this machine cannot do.
 
-    The first picture of a process compiles shaders for half a minute of processor time.
+    The first picture of a process compiles shaders for half a minute of processor time. What renders is the largest
+    group, and begins first, so that no worker waits for it in the end.
     """
     no_objects = None if _partnet_root() else "no PartNet-Mobility objects: set QUEST_OBJECTS"
     no_renderer = _why_no_renderer() if any(item.get_closest_marker("render") for item in items) else None
@@ -64,6 +66,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(pytest.mark.skip(reason=no_objects))
         if no_renderer and item.get_closest_marker("render"):
             item.add_marker(pytest.mark.skip(reason=no_renderer))
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
 
 
 @pytest.fixture(scope="session")
