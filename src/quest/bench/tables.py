@@ -289,9 +289,9 @@ TABLES: Mapping[str, Recipe] = {
                 "comparison",
                 "Comparison",
                 f"{_WHO}tracker = line | {_COUNTS}{_SHOWN['ape']}{_MORE}{_ACC}",
-                about="The published network learned from other motions of the objects of the first two sets; the "
-                "others learned from no object how to follow points, but for the noises of our filter. Published "
-                "figures are of other objects.",
+                about="The published network and rivals named -retrained learned from other motions of the objects of "
+                "the first two sets; the others learned from no object how to follow points, but for the noises of our "
+                "filter. Published figures are of other objects.",
                 **_MOVED,
             ),
         ),
