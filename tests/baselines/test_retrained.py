@@ -183,3 +183,8 @@ def test_weights_are_of_the_right_network(weights: Path, tmp_path: Path):
         line_up(["tapnet-retrained"], weights="any", rivals=tmp_path)
     with pytest.raises(ConfigError, match="quest bench comparison"):
         line_up(["tapnet-retrained"], weights="any")
+
+
+def test_a_network_has_a_size():
+    with pytest.raises(ConfigError, match="from 1 to 4096"):
+        RefinerConfig(image_size=10**9)

@@ -15,7 +15,7 @@ from quest.errors import ConfigError, InputError, WeightsError
 from quest.model.weights import save_network
 from quest.monitor import write_calibrations
 from quest.track import Tracker, load
-from quest.track.settings import REVISION
+from quest.track.settings import REVISION, TrackerConfig
 from quest.track.tracker import (
     NO_DEPTH_FLAG,
     NOTHING_FOUND_FLAG,
@@ -338,3 +338,11 @@ def test_a_monitor_of_another_filter_is_refused(tmp_path: Path):
 def test_devices_that_are_not_there(name: str):
     with pytest.raises(ConfigError, match="cpu"):
         pick_device(name)
+
+
+@pytest.mark.parametrize("name", ["size_px", "follow_px"])
+def test_pictures_are_brought_to_a_size_that_fits_into_memory(name: str):
+    with pytest.raises(ConfigError, match=f"expected {name} from 16 to 4096"):
+        TrackerConfig(**{name: 10**9})
+    with pytest.raises(WeightsError, match=f"expected {name}"):
+        TrackerConfig.from_json(f'{{"{name}": 8}}')

@@ -1,4 +1,4 @@
-"""What discovery is told besides its weights; chosen on validation data and stored with the weights."""
+"""What a tracker is told besides its weights; chosen on validation data and stored with the weights."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import json
 from dataclasses import asdict, dataclass
 from typing import TypedDict
 
-from quest.errors import WeightsError
+from quest.errors import ConfigError, WeightsError
 from quest.untrusted import build, parse_json, reading
 
 REVISION = 10
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
+_SIZES_PX = (16, 4096)
+"""Smallest and largest side that pictures are brought to."""
 
 
 class Looking(TypedDict):
@@ -23,7 +25,7 @@ class Looking(TypedDict):
 
 @dataclass(frozen=True)
 class TrackerConfig:
-    """Settings of discovery."""
+    """Settings of discovery, and how large pictures are at least."""
 
     gain: float = 1.0
     """Multiplies the finder's logits ..."""
@@ -40,6 +42,11 @@ class TrackerConfig:
     patches and noises are of such pictures."""
     most: int = 32
     """Most entities that discovery follows."""
+
+    def __post_init__(self) -> None:
+        for name in ("size_px", "follow_px"):
+            if not _SIZES_PX[0] <= getattr(self, name) <= _SIZES_PX[1]:
+                raise ConfigError(f"tracker: expected {name} from {_SIZES_PX[0]} to {_SIZES_PX[1]}, got {self}")
 
     @property
     def looking(self) -> Looking:

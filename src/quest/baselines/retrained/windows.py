@@ -26,6 +26,8 @@ _SAME_SHARE, _SAME_M = 0.02, 0.01
 """Depth that differs from a point's by no more than this shows the point."""
 _REST = 1e-3
 """Poses that differ by no more than this, in metres or in their rotations, are of what rests."""
+_MOST = 4096
+"""Of anything in a network's shapes."""
 _BEYOND_PX = 32.0
 """Points farther outside the picture than this teach nothing."""
 
@@ -38,6 +40,10 @@ class ShownConfig(StoredConfig):
     """Side of the canvas that frames are letterboxed to, pixels."""
     frames: int
     """Of a window to learn from."""
+
+    def __post_init__(self) -> None:
+        if not all(1 <= value <= _MOST for value in vars(self).values()):
+            raise ConfigError(f"network: expected sizes and counts from 1 to {_MOST}, got {self}")
 
 
 @dataclass(frozen=True)
