@@ -61,13 +61,18 @@ class FrameBatch:
         return torch.where(valid.unsqueeze(-1), point, torch.full_like(point, torch.nan))
 
     def depth_at(self, uv_px: Float[Tensor, "B T Q 2"]) -> Float[Tensor, "B T Q"]:
-        """Depth of the pixel that each position falls in; 0 where missing or outside."""
-        h, w = self.depth_m.shape[-2:]
-        inside = (uv_px >= 0).all(-1) & (uv_px[..., 0] < w) & (uv_px[..., 1] < h)
-        x = uv_px[..., 0].nan_to_num().long().clamp(0, w - 1)
-        y = uv_px[..., 1].nan_to_num().long().clamp(0, h - 1)
-        depth = self.depth_m.flatten(-2).gather(-1, y * w + x)
-        return torch.where(inside, depth, torch.zeros_like(depth))
+        """As :func:`depth_at`."""
+        return depth_at(self.depth_m, uv_px)
+
+
+def depth_at(depth_m: Float[Tensor, "*B H W"], uv_px: Float[Tensor, "*B Q 2"]) -> Float[Tensor, "*B Q"]:
+    """Depth of the pixel that each position falls in; 0 where missing or outside."""
+    h, w = depth_m.shape[-2:]
+    inside = (uv_px >= 0).all(-1) & (uv_px[..., 0] < w) & (uv_px[..., 1] < h)
+    x = uv_px[..., 0].nan_to_num().long().clamp(0, w - 1)
+    y = uv_px[..., 1].nan_to_num().long().clamp(0, h - 1)
+    depth = depth_m.flatten(-2).gather(-1, y * w + x)
+    return torch.where(inside, depth, torch.zeros_like(depth))
 
 
 def cell_depth(depth_m: Float[Tensor, "B H W"], cell_px: int) -> Float[Tensor, "B Hc Wc"]:

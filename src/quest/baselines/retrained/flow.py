@@ -15,8 +15,9 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from quest.baselines.retrained.layers import ConvEncoder, as_maps, read_at, square
+from quest.baselines.retrained.layers import ConvEncoder, as_maps, mesh, read_at, square
 from quest.baselines.retrained.windows import PointNetwork, PointTruth, PointWindow, ShownConfig
+from quest.model.frames import depth_at
 from quest.train.losses import masked_mean
 
 STRIDE = 8
@@ -138,11 +139,11 @@ class FlowNetwork(PointNetwork):
         own = read_at(bodies[:, 1:], window.uv_px, STRIDE)
         alike = (-(bodies[:, 1:].flatten(2).unsqueeze(2) - own.unsqueeze(-1)).square().sum(1)).exp()
         start, end = place.flatten(1, 2), place.flatten(1, 2) + flow.flatten(2).mT
-        depth_m = [_nearest(window.depth_m[:, i], uv) for i, uv in enumerate((start, end))]
+        depth_m = [depth_at(window.depth_m[:, i], uv) for i, uv in enumerate((start, end))]
         seen = (depth_m[0] > 0) & (depth_m[1] > 0)
         weight = alike * (bodies[:, 0].flatten(1).sigmoid() * seen)[:, None]
         from_, to = (_lifted(uv, d, window.intrinsics) for uv, d in zip((start, end), depth_m, strict=True))
-        own_m = _nearest(window.depth_m[:, 0], window.uv_px)
+        own_m = depth_at(window.depth_m[:, 0], window.uv_px)
         with torch.autocast(weight.device.type, enabled=False):
             moved = _move(_lifted(window.uv_px, own_m, window.intrinsics), from_, to, weight)
         lens = window.intrinsics[:, None]
@@ -155,12 +156,7 @@ def _places(maps: Float[Tensor, "B S C h w"]) -> Float[Tensor, "B h w 2"]:
     """The pixel in the middle of every token."""
     b, *_, h, w = maps.shape
     x, y = (STRIDE * (torch.arange(n, device=maps.device) + 0.5) for n in (w, h))
-    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).expand(b, -1, -1, -1)
-
-
-def _nearest(depth_m: Float[Tensor, "B H W"], uv_px: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N"]:
-    column, row = (uv_px[..., i].long().clamp(0, depth_m.shape[2 - i] - 1) for i in (0, 1))
-    return depth_m[torch.arange(len(depth_m), device=depth_m.device)[:, None], row, column]
+    return mesh(x, y).expand(b, -1, -1, -1)
 
 
 def _lifted(
@@ -197,9 +193,7 @@ def _move(
 
 
 def _rotation(angle: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3 3"]:
-    """By Rodrigues' formula."""
-    zero, size = torch.zeros_like(angle[..., 0]), (angle.square().sum(-1) + 1e-12).sqrt()[..., None, None]
+    """Of rotation vectors, radians."""
     x, y, z = angle.unbind(-1)
-    skew = torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
-    bend = (1 - size.cos()) / size.square()
-    return torch.eye(3, device=angle.device) + size.sin() / size * skew + bend * (skew @ skew)
+    zero = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3)))

@@ -55,7 +55,12 @@ def read_at(maps: Float[Tensor, "B C h w"], uv_px: Float[Tensor, "B *N 2"], stri
 def square(radius: int, device: torch.device) -> Float[Tensor, "N 2"]:
     """Whole steps to all neighbours within a square."""
     step = torch.arange(-radius, radius + 1, device=device, dtype=torch.float32)
-    return torch.stack(torch.meshgrid(step, step, indexing="xy"), dim=-1).flatten(0, 1)
+    return mesh(step, step).flatten(0, 1)
+
+
+def mesh(x: Float[Tensor, " w"], y: Float[Tensor, " h"]) -> Float[Tensor, "h w 2"]:
+    """All places (x, y)."""
+    return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
 
 def waves(value: Float[Tensor, "*B D"], count: int) -> Float[Tensor, "*B E"]:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from quest.baselines.chained import Chained, Points, Stepped
 from quest.baselines.point_queries import Followed, PointTracker
-from quest.baselines.retrained.layers import read_at
+from quest.baselines.retrained.layers import mesh, read_at
 from quest.baselines.retrained.matcher import STRIDE, place_of
 from quest.baselines.retrained.objective import read_retrained
 from quest.baselines.retrained.refiner import Window
@@ -137,8 +137,7 @@ class RefineTracker(_Windowed):
         network, maps = self.network, _Frames(self, clip)
         size, span = network.config.image_size, network.config.window
         side = (torch.arange(_SUPPORT, device=uv_px.device) + 0.5) * size / _SUPPORT
-        grid = torch.stack(torch.meshgrid(side, side, indexing="xy"), dim=-1).flatten(0, 1)
-        asked = torch.cat((uv_px, grid[None]), dim=1)
+        asked = torch.cat((uv_px, mesh(side, side).flatten(0, 1)[None]), dim=1)
         last: Window | None = None
         for at in range(start, max(start + 1, len(clip) - span // 2), span // 2):
             frames = range(at, min(at + span, len(clip)))
