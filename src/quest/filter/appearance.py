@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 
 from quest.filter.noise import Noise
@@ -42,8 +43,10 @@ class Likeness:
         cls, picture: Picture, descriptor: Float[np.ndarray, "K V D"], patch: Float[np.ndarray, "K V S S"]
     ) -> Likeness:
         """Compare a frame with views of entities."""
-        cosine = np.einsum("kvd,dhw->kvhw", descriptor, picture.descriptors, optimize=True)
-        return cls(picture, cosine.max(axis=1), patch)
+        # Not by NumPy, whose BLAS would keep the other cores busy with waiting for 25 ms afterwards.
+        one, other = torch.from_numpy(descriptor).float(), torch.from_numpy(picture.descriptors)
+        cosine = torch.einsum("kvd,dhw->kvhw", one, other).amax(dim=1).numpy()
+        return cls(picture, cosine, patch)
 
     def at(self, uv_px: Float[np.ndarray, "K C 2"], noise: Noise, reach_px: int = _REACH_PX) -> Places:
         """How like the anchor C places of each query are; the best correlation may be ``reach_px`` off."""

@@ -17,7 +17,7 @@ from quest.filter.bodies import Bodies, about, go_on, on_joint, update
 from quest.filter.camera_motion import estimate_pose, picture_motion, stands_still
 from quest.filter.local_motion import corners, follow
 from quest.filter.noise import Noise
-from quest.filter.picture import Picture
+from quest.filter.picture import GreyPicture
 from quest.filter.rigid_motion import GATE, Seen, Surface, common_motion, fit, misfit_unsure, predicted_spread
 from quest.filter.surfaces import Surfaces, depth_error, measure, sow_surfaces
 from quest.filter.view import View, move, move_back
@@ -119,8 +119,8 @@ class Landmarks:
 
 def observe(
     landmarks: Landmarks,
-    previous: Picture,
-    picture: Picture,
+    previous: GreyPicture,
+    picture: GreyPicture,
     old: View,
     depth_m: Float[np.ndarray, "H W"] | None,
     given: Float[np.ndarray, "4 4"] | None,
@@ -261,7 +261,7 @@ def _refit(
 
 def sow(
     landmarks: Landmarks,
-    picture: Picture,
+    picture: GreyPicture,
     view: View,
     around_px: Float[np.ndarray, "K 2"],
     noise: Noise,

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from quest.filter.picture import WINDOW_PX, Picture
+from quest.filter.picture import WINDOW_PX, GreyPicture
 from quest.filter.view import in_image
 
 _LEVELS = 4
@@ -42,8 +42,8 @@ class LocalMotion:
 
 
 def follow(
-    previous: Picture,
-    picture: Picture,
+    previous: GreyPicture,
+    picture: GreyPicture,
     uv_px: Float[np.ndarray, "N 2"],
     guess_px: Float[np.ndarray, "N 2"],
 ) -> LocalMotion:
@@ -82,7 +82,7 @@ def _flow(
     return np.where(found[:, None], end, guess_px), found, differ.astype(np.float64)
 
 
-def _covariance(picture: Picture, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
+def _covariance(picture: GreyPicture, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "N 2 2"]:
     """Noise over structure: the inverse of the summed products of gradients in the window."""
     xx, xy, yy = picture.structure(uv_px).T
     xx, yy = xx + 1.0, yy + 1.0  # a flat patch is nowhere, not at infinity
@@ -91,7 +91,7 @@ def _covariance(picture: Picture, uv_px: Float[np.ndarray, "N 2"]) -> Float[np.n
 
 
 def corners(
-    picture: Picture, allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
+    picture: GreyPicture, allowed: Bool[np.ndarray, "H W"], *, cell_px: int, count: int
 ) -> Float[np.ndarray, "N 2"]:
     """The best corners where they are allowed, at most ``count``, no two nearer than a cell is wide."""
     mask = allowed.astype(np.uint8)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from quest.filter.local_motion import follow
-from quest.filter.picture import Picture
+from quest.filter.picture import GreyPicture
 
 _SIDE = 5
 _WIDTH_PX = 24.0
@@ -41,8 +41,8 @@ class PatchMotion:
 
 
 def patch_motion(
-    previous: Picture,
-    picture: Picture,
+    previous: GreyPicture,
+    picture: GreyPicture,
     uv_px: Float[np.ndarray, "K 2"],
     guess_px: Float[np.ndarray, "K 2"],
     share: Float[np.ndarray, "K P"] | None = None,
@@ -80,16 +80,18 @@ def _heaviest(
     )
 
 
-def tiles(picture: Picture, uv_px: Float[np.ndarray, "K 2"]) -> UInt8[np.ndarray, "K S S"]:
+def tiles(picture: GreyPicture, uv_px: Float[np.ndarray, "K 2"]) -> UInt8[np.ndarray, "K S S"]:
     """What is around each place, with the place in the middle."""
     return np.rint(picture.patches(uv_px, _TILE_PX)).astype(np.uint8)
 
 
-def tile_motion(tile: UInt8[np.ndarray, "K S S"], picture: Picture, guess_px: Float[np.ndarray, "K 2"]) -> PatchMotion:
+def tile_motion(
+    tile: UInt8[np.ndarray, "K S S"], picture: GreyPicture, guess_px: Float[np.ndarray, "K 2"]
+) -> PatchMotion:
     """Find the middle of each tile, which may be of any frame, again: how far it is from where it is expected."""
     middle = np.stack([(np.arange(len(tile)) + 0.5) * _TILE_PX, np.full(len(tile), _TILE_PX / 2)], axis=-1)
     both = (tile, tiles(picture, guess_px))
-    before, now = (Picture(np.hstack(tuple(each)), picture.descriptors) for each in both)
+    before, now = (GreyPicture(np.hstack(tuple(each))) for each in both)
     return patch_motion(before, now, middle, middle)
 
 

@@ -10,19 +10,19 @@ answers are pixels of the camera.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Float32, Int
 
 from quest.filter.appearance import CELL_REACH_PX, Likeness
 from quest.filter.joints import Joint, joints_of
 from quest.filter.landmarks import Landmarks, observe, ray_error, sow
 from quest.filter.local_motion import follow
 from quest.filter.noise import Noise
-from quest.filter.picture import Picture
+from quest.filter.picture import GreyPicture, Picture
 from quest.filter.posterior import weigh
 from quest.filter.queries import Queries, follow_patches
 from quest.filter.surfaces import depth_error
@@ -52,23 +52,29 @@ def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterS
 
 def step(
     state: FilterState,
-    picture: Picture,
+    grey: GreyPicture,
+    describe: Callable[[], Float32[np.ndarray, "D h w"]],
     depth_m: Float[np.ndarray, "H W"] | None,
     stamp_s: float,
     cam_from_world: Float[np.ndarray, "4 4"] | None,
     noise: Noise,
 ) -> FilterState:
-    """Take in the next frame; depth is 0 where missing and None without any, the pose None to estimate it."""
+    """Take in the next frame; depth is 0 where missing and None without any, the pose None to estimate it.
+
+    ``describe`` gives the descriptors of the picture. They are needed last, and may be made meanwhile.
+    """
     dt_s = stamp_s - state.stamp_s
     landmarks, pose, warp = observe(
-        state.landmarks, state.picture, picture, state.view, depth_m, cam_from_world, dt_s, noise
+        state.landmarks, state.picture, grey, state.view, depth_m, cam_from_world, dt_s, noise
     )
     view = View(state.view.matrix, pose, depth_m)
     queries = state.queries.meet(len(landmarks.pose))
     if len(queries):
         body = np.where(queries.rides, queries.body, 0)
         expected_px = _carried(queries.own_px, body, state, landmarks, view, warp)
-        queries = follow_patches(queries, state.picture, picture, expected_px, state.view, view, dt_s, noise)
+        queries = follow_patches(queries, state.picture, grey, expected_px, state.view, view, dt_s, noise)
+    picture = grey.described(describe())
+    if len(queries):
         queries = weigh(queries, landmarks, picture, view, dt_s, noise)
     landmarks = sow(landmarks, picture, view, _at(queries, landmarks, view)[0], noise)
     return FilterState(picture, view, stamp_s, landmarks, queries, warp)
@@ -172,6 +178,11 @@ class Answer:
     """That it is not there."""
     joint: tuple[Joint | None, ...]
     """What moves it, in the filter's world; None where that is not known."""
+
+
+def pixels(state: FilterState) -> Float[np.ndarray, "K 2"]:
+    """The more probable place of every query, in pixels of the camera."""
+    return state.picture.to_camera(_at(state.queries, state.landmarks, state.view)[0])
 
 
 def read_off(state: FilterState, noise: Noise) -> Answer:

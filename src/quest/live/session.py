@@ -22,7 +22,6 @@ from jaxtyping import UInt8
 from quest.data.frame_source import FrameSource
 from quest.errors import InputError
 from quest.filter import step as filtering
-from quest.filter.picture import Picture
 from quest.filter.step import FilterState
 from quest.geometry import project, transform
 from quest.track import Stream, StreamState, Tracker
@@ -254,7 +253,7 @@ class Session:
 
 def _compact(state: FilterState) -> FilterState:
     """The same, its picture without what was computed from it: half the memory."""
-    return replace(state, picture=Picture(state.picture.grey, state.picture.descriptors, state.picture.scale))
+    return replace(state, picture=state.picture.described(state.picture.descriptors))
 
 
 def drawn_joints(state: StreamState, camera: Camera) -> list[dict[str, list[list[float]]] | None]:

@@ -6,7 +6,7 @@ filter takes no evidence from it. What changes at once in a way that no motion e
 
 from __future__ import annotations
 
-import hashlib
+import zlib
 from dataclasses import dataclass, field
 
 import cv2
@@ -38,9 +38,9 @@ _RARELY = 0.1
 """Share of repeated pictures so far, below which one is a fault."""
 
 
-def digest_of(data: np.ndarray) -> str:
-    """A few letters that tell arrays apart."""
-    return hashlib.blake2b(np.ascontiguousarray(data).data, digest_size=16).hexdigest()
+def digest_of(data: np.ndarray) -> int:
+    """A number by which a frame is told from the one before."""
+    return zlib.crc32(np.ascontiguousarray(data).data)
 
 
 @dataclass
@@ -49,7 +49,7 @@ class Repeats:
 
     noiseless: float
     """Share of pixels as before above which there is no noise."""
-    digest: str = ""
+    digest: int | None = None
     """Of the newest."""
     some: Shaped[np.ndarray, "rows columns ..."] | None = None
     """Every eighth of its pixels along each side; None before the first."""
@@ -62,7 +62,7 @@ class Repeats:
     still: bool = False
     """Whether they do now."""
 
-    def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: str) -> bool:
+    def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: int | None) -> bool:
         """Whether the next one, with its digest, is that before, and this is not what is usual.
 
         Without noise, what stands still may be a scene that does.
@@ -91,7 +91,7 @@ class Health:
     pictures: Repeats = field(default_factory=lambda: Repeats(_STILLEST))
     depths: Repeats = field(default_factory=lambda: Repeats(_STILLEST_DEPTH))
 
-    def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: str) -> tuple[tuple[str, ...], bool]:
+    def of_picture(self, rgb: UInt8[np.ndarray, "H W 3"], digest: int | None) -> tuple[tuple[str, ...], bool]:
         """What is wrong with the next picture, in words, and whether it shows nothing."""
         height, width = rgb.shape[:2]
         cell_px = max(_CELL_PX, max(width, height) / _SIDE)

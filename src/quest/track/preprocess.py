@@ -6,14 +6,13 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, Float32, UInt8
 
 from quest.depth import PLAUSIBLE_DEPTH_M
 from quest.errors import InputError
-from quest.filter.picture import Picture
+from quest.filter.picture import GreyPicture
 from quest.geometry.poses import is_rigid, nearest_rigid
-from quest.model.xfeat import LEAST_PX, XFeat
+from quest.model.xfeat import LEAST_PX
 from quest.track.health import ELSEWHERE, Health, digest_of
 from quest.types import Camera
 from quest.untrusted import reading
@@ -40,7 +39,7 @@ class PreprocessorState:
     """Between the newest frame and the one before."""
     now_s: float = 0.0
     """Time of the newest frame, by a clock that never goes back."""
-    digest: str = ""
+    digest: int | None = None
     """Of the colours of the newest frame."""
     pose: Float[np.ndarray, "4 4"] | None = None
     """``cam_from_world`` of the newest frame that had one."""
@@ -56,10 +55,8 @@ class PreprocessorState:
 class Prepared:
     """A frame as the filter takes it."""
 
-    grey: UInt8[np.ndarray, "H W"]
-    """Grey values, enlarged if they are few."""
     depth_m: Float[np.ndarray, "H W"] | None
-    """Metres, as large, 0 where missing; None without any."""
+    """Metres, of the size that the filter sees, 0 where missing; None without any."""
     cam_from_world: Float[np.ndarray, "4 4"] | None
     """Pose of the camera; None where none is given, and before those that are given change."""
     first_pose: Float[np.ndarray, "4 4"] | None
@@ -161,13 +158,20 @@ class Preprocessor:
         state.stamp_s, state.digest = stamp_s, digest
         return True
 
+    def picture(self, rgb: UInt8[np.ndarray, "H W 3"]) -> GreyPicture:
+        """What the filter follows in a frame."""
+        grey = grey_of(rgb)
+        if self.scale != (1.0, 1.0):
+            grey = cv2.resize(grey, self.size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
+        return GreyPicture(grey, scale=self.scale)
+
     def prepare(
         self,
         rgb: UInt8[np.ndarray, "H W 3"],
         depth_m: Float32[np.ndarray, "H W"] | None,
         cam_from_world: Float[np.ndarray, "4 4"] | None,
     ) -> Prepared:
-        """The frame that was accepted last."""
+        """What else it takes of the frame that was accepted last."""
         state = self.state
         flags, blind = state.health.of_picture(rgb, state.digest)
         state.flags += flags
@@ -191,12 +195,9 @@ class Preprocessor:
             if state.pose is not None or state.now_s > 0:
                 state.flags += (DEPTH_BEGINS_FLAG,)
             state.has_depth = True
-        grey = grey_of(rgb)
-        if self.scale != (1.0, 1.0):
-            grey = cv2.resize(grey, self.size, interpolation=cv2.INTER_LINEAR).astype(np.uint8, copy=False)
-            if depth_m is not None:  # never mixed between pixels
-                depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
-        return Prepared(grey, depth_m, *self._poses(cam_from_world), blind)
+        if depth_m is not None and self.scale != (1.0, 1.0):  # never mixed between pixels
+            depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
+        return Prepared(depth_m, *self._poses(cam_from_world), blind)
 
     @property
     def matrix(self) -> Float[np.ndarray, "3 3"]:
@@ -222,14 +223,6 @@ class Preprocessor:
 def grey_of(rgb: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W"]:
     """Luminance."""
     return cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY).astype(np.uint8, copy=False)
-
-
-@torch.inference_mode()
-def to_picture(grey: UInt8[np.ndarray, "H W"], features: XFeat, scale: tuple[float, float] = (1.0, 1.0)) -> Picture:
-    """What the filter reads of a frame: grey values, and the descriptors of a network."""
-    device = next(features.parameters()).device
-    descriptors, _ = features.features(torch.from_numpy(grey).to(device))
-    return Picture(grey, descriptors.float().cpu().numpy(), scale)
 
 
 def _implausible(depth_m: Float32[np.ndarray, "H W"]) -> float | None:

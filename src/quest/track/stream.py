@@ -15,14 +15,16 @@ from quest.errors import InputError
 from quest.filter import step as filtering
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
+from quest.filter.picture import GreyPicture
 from quest.filter.step import Answer, FilterState
 from quest.filter.view import View, in_image, move
 from quest.model.finder import FinderNetwork
 from quest.model.found import Found, find
 from quest.model.xfeat import XFeat
 from quest.monitor import Alarm, Budget, Calibration, Inputs, Monitor, MonitorState, probability
+from quest.track.describing import Describer
 from quest.track.finding import FORGOTTEN, Finding, Looker
-from quest.track.preprocess import Prepared, Preprocessor, PreprocessorState, to_picture
+from quest.track.preprocess import Prepared, Preprocessor, PreprocessorState
 from quest.track.queries import QueriesState, StreamQueries
 from quest.track.settings import TrackerConfig
 from quest.track.state import StreamState
@@ -74,7 +76,7 @@ class Stream:
         budget: Budget | None,
         finding: Finding | None = None,
     ) -> None:
-        self._features = features
+        self._describer = Describer(features)
         self._noise = noise
         self._config = config
         self._calibrations = calibrations
@@ -255,9 +257,11 @@ class Stream:
         memory.frame += 1
         if not accepted:
             return self._repeated()
+        grey = preprocessor.picture(rgb)
+        describe = self._describer.begin(grey.grey)
         frame = preprocessor.prepare(rgb, depth_m, cam_from_world)
-        state = self._filter(frame)
-        at_px = filtering.read_off(state, self._noise).uv_px
+        state = self._filter(frame, grey, describe)
+        at_px = filtering.pixels(state)
         new_px = self._queries.bind(memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb))
         memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
         if memory.finding is not None:
@@ -272,19 +276,20 @@ class Stream:
                     _LOG.exception("a callback of on_alarm failed")
         return memory.answer
 
-    def _filter(self, frame: Prepared) -> FilterState:
+    def _filter(
+        self, frame: Prepared, grey: GreyPicture, describe: Callable[[], Float32[np.ndarray, "D h w"]]
+    ) -> FilterState:
         """The filter's state after a frame."""
         memory, now_s = self._memory, self._preprocessor.state.now_s
         if frame.blind and memory.filter is not None:
             return memory.filter
-        picture = to_picture(frame.grey, self._features, self._preprocessor.scale)
         if memory.filter is None:
             # In the first camera's axes, so that answers do not depend on where the world has its origin.
             view = View(self._preprocessor.matrix, np.eye(4), frame.depth_m)
-            state = filtering.begin(picture, view, now_s, self._noise)
+            state = filtering.begin(grey.described(describe()), view, now_s, self._noise)
         else:
             given = None if frame.cam_from_world is None else frame.cam_from_world @ memory.world_from_filter
-            state = filtering.step(memory.filter, picture, frame.depth_m, now_s, given, self._noise)
+            state = filtering.step(memory.filter, grey, describe, frame.depth_m, now_s, given, self._noise)
         if frame.first_pose is not None:
             memory.world_from_filter = np.linalg.inv(frame.first_pose) @ state.view.cam_from_world
             self._preprocessor.state.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
@@ -305,7 +310,7 @@ class Stream:
             return state
         finding.looked_s = look.stamp_s
         found = found.select(np.isin(found.labels, LABELS))
-        followed = queries.near(found, filtering.read_off(look, self._noise).uv_px).any(axis=1)
+        followed = queries.near(found, filtering.pixels(look)).any(axis=1)
         found = found.select(np.flatnonzero(~followed))
         told = finding.candidates.after(found, queries.near(found, finding.candidates.uv_px))
         alone = filtering.moves_alone(look, found.uv_px)
@@ -316,7 +321,7 @@ class Stream:
         moved = np.tile(now_px - found.uv_px[sure], 2)
         now = replace(found.select(sure), uv_px=now_px, box_px=found.box_px[sure] + moved)
         there = np.flatnonzero(in_image(now_px, (self.camera.width, self.camera.height)))
-        begun = there[queries.discover(now.select(there), filtering.read_off(state, self._noise).uv_px)]
+        begun = there[queries.discover(now.select(there), filtering.pixels(state))]
         left = np.setdiff1d(np.flatnonzero(told.log_odds > FORGOTTEN), sure[begun])
         finding.candidates = told.only(left[np.argsort(-told.log_odds[left], kind="stable")][: config.most])
         return filtering.ask(state, now_px[begun], self._noise) if len(begun) else state

@@ -1,0 +1,44 @@
+"""Dense descriptors of pictures, made in the background while the filter follows what moves.
+
+The filter is hundreds of small operations, which no second core makes faster; the network is one large one. They need
+each other late in a frame, so each gets a core.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from threadpoolctl import ThreadpoolController
+
+from quest.model.xfeat import XFeat
+
+_LIBRARIES = ThreadpoolController()
+
+
+class Describer:
+    """A network of descriptors in a thread, which ends with the describer."""
+
+    def __init__(self, features: XFeat) -> None:
+        self._features = features
+        self._pool = ThreadPoolExecutor(1, "quest-describer", _leave_a_core)
+
+    def begin(self, grey: UInt8[np.ndarray, "H W"]) -> Callable[[], Float32[np.ndarray, "D h w"]]:
+        """Begin with a picture; what is returned waits for its descriptors."""
+        described: Future[Float32[np.ndarray, "D h w"]] = self._pool.submit(describe, self._features, grey)
+        return described.result
+
+
+@torch.inference_mode()
+def describe(features: XFeat, grey: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "D h w"]:
+    """Descriptors of a picture, as the filter reads them."""
+    device = next(features.parameters()).device
+    return features.features(torch.from_numpy(grey).to(device))[0].float().cpu().numpy()
+
+
+def _leave_a_core() -> None:
+    """Of this thread alone: PyTorch asks its own OpenMP how many threads a new one may use, once."""
+    _LIBRARIES.limit(limits=max(1, torch.get_num_threads() - 1), user_api="openmp")
