@@ -27,7 +27,8 @@ from quest.filter.local_motion import corners
 from quest.filter.posterior import RIVALS
 from quest.filter.view import View, in_image
 from quest.model.xfeat import XFeat
-from quest.track.preprocess import grey_of, to_picture
+from quest.track.describing import described
+from quest.track.preprocess import grey_of
 from quest.types import Clip
 
 NAMES = ("look_wide", "look_near", "look_bias", "jump_log_odds")
@@ -82,7 +83,7 @@ class FitAppearance:
     def choices(self, clip: Clip, rng: np.random.Generator) -> Choices:
         """Corners of some frames, looked for in the others."""
         chosen = np.unique(np.linspace(0, len(clip) - 1, min(len(clip), self.frames)).astype(int))
-        pictures = {i: to_picture(grey_of(clip.rgb[i]), self.features) for i in chosen}
+        pictures = {i: described(self.features, grey_of(clip.rgb[i])) for i in chosen}
         matrix = clip.camera.matrix.astype(np.float64)
         views = {i: View(matrix, (f := clip.frame(int(i))).cam_from_world, f.depth_m) for i in chosen}
         made: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []

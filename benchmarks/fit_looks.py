@@ -25,7 +25,8 @@ from quest.evaluation.real.measures import score_picture
 from quest.evaluation.real.run import discover
 from quest.evaluation.real.sets import open_set
 from quest.track import Tracker
-from quest.track.preprocess import grey_of, to_picture
+from quest.track.describing import described
+from quest.track.preprocess import grey_of
 from quest.track.queries import StreamQueries
 from quest.types import LABELS, Query
 
@@ -86,7 +87,7 @@ class FitLooks:
             at_px = tracks.uv_px[t].astype(float)
             near = queries.near(found, at_px)
             says = np.where(near, found.logit[:, None], -np.inf).max(axis=0, initial=-np.inf)
-            descriptor = to_picture(grey_of(clip.rgb[t]), tracker.features).describe(at_px)
+            descriptor = described(tracker.features, grey_of(clip.rgb[t])).describe(at_px)
             looks.append((descriptor, np.where(tracks.visible[t] & np.isfinite(says), says, np.nan)))
         rows = [
             np.stack(((one[0] * other[0]).sum(axis=1), np.square(one[1] - other[1])), axis=-1)

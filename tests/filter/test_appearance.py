@@ -9,7 +9,7 @@ from quest.filter.appearance import PATCH_PX, Likeness
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.model.xfeat import XFeat
-from quest.track.preprocess import to_picture
+from quest.track.describing import described
 from quest.types import Query
 from tests.filter.scenes import SIZE, Board, follow, scene, shifted, texture
 
@@ -29,7 +29,7 @@ def likeness(anchors: Picture, now: Picture) -> Likeness:
 
 
 def test_an_entity_is_likest_where_it_is(features: XFeat) -> None:
-    one, other = to_picture(shifted(WIDE, 100, 100), features), to_picture(shifted(WIDE, 107, 103), features)
+    one, other = (described(features, shifted(WIDE, *at)) for at in ((100, 100), (107, 103)))
     like = likeness(one, other)
     right = AT - [7.0, 3.0]
     places = like.at(np.stack([right, right[::-1]], axis=1), NOISE)
@@ -39,7 +39,7 @@ def test_an_entity_is_likest_where_it_is(features: XFeat) -> None:
 
 
 def test_it_is_found_anywhere_in_the_frame_but_where_it_is_followed(features: XFeat) -> None:
-    one, other = to_picture(shifted(WIDE, 100, 100), features), to_picture(shifted(WIDE, 130, 90), features)
+    one, other = (described(features, shifted(WIDE, *at)) for at in ((100, 100), (130, 90)))
     like = likeness(one, other)
     right = AT - [30.0, -10.0]
     found = like.elsewhere(AT + np.array([20.0, 40.0]), 3, NOISE)

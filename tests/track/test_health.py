@@ -78,8 +78,8 @@ def test_exchanged_colours_are_said() -> None:
     health, rgb = Health(), RNG.integers(0, 256, (60, 80, 3)).astype(np.uint8)
     rgb = cv2.GaussianBlur(rgb, (0, 0), 4.0)
     rgb = cv2.normalize(rgb, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)  # type: ignore[call-overload]
-    assert health.of_picture(rgb, "a") == ((), False)
-    flags, blind = health.of_picture(np.ascontiguousarray(rgb[..., ::-1]), "b")
+    assert health.of_picture(rgb, 1) == ((), False)
+    flags, blind = health.of_picture(np.ascontiguousarray(rgb[..., ::-1]), 2)
     assert "red and blue exchanged at once" in flags
     assert not blind
 

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from quest.filter.appearance import PATCH_PX
 from quest.filter.noise import Noise
 from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
-from quest.filter.picture import Picture
+from quest.filter.picture import GreyPicture, Picture
 from quest.filter.surfaces import depth_error
 from quest.filter.view import View, move
 
@@ -144,8 +144,8 @@ class Queries:
 
 def follow_patches(
     queries: Queries,
-    previous: Picture,
-    picture: Picture,
+    previous: GreyPicture,
+    picture: GreyPicture,
     expected_px: Float[np.ndarray, "K 2"],
     old: View,
     view: View,

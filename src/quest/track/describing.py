@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float32, UInt8
 from threadpoolctl import ThreadpoolController
 
+from quest.filter.picture import Picture
 from quest.model.xfeat import XFeat
 
 _LIBRARIES = ThreadpoolController()
@@ -28,13 +29,17 @@ class Describer:
 
     def begin(self, grey: UInt8[np.ndarray, "H W"]) -> Callable[[], Float32[np.ndarray, "D h w"]]:
         """Begin with a picture; what is returned waits for its descriptors."""
-        described: Future[Float32[np.ndarray, "D h w"]] = self._pool.submit(describe, self._features, grey)
+        described: Future[Float32[np.ndarray, "D h w"]] = self._pool.submit(_describe, self._features, grey)
         return described.result
 
 
+def described(features: XFeat, grey: UInt8[np.ndarray, "H W"]) -> Picture:
+    """A picture with its descriptors, made at once."""
+    return Picture(grey, _describe(features, grey))
+
+
 @torch.inference_mode()
-def describe(features: XFeat, grey: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "D h w"]:
-    """Descriptors of a picture, as the filter reads them."""
+def _describe(features: XFeat, grey: UInt8[np.ndarray, "H W"]) -> Float32[np.ndarray, "D h w"]:
     device = next(features.parameters()).device
     return features.features(torch.from_numpy(grey).to(device))[0].float().cpu().numpy()
 
