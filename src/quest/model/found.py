@@ -14,7 +14,6 @@ from scipy.special import expit
 from torch import Tensor
 
 from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
-from quest.model.precision import fast_bfloat16
 from quest.types import LABELS
 
 LABELS_FOUND = (*LABELS, "hinge")
@@ -107,7 +106,7 @@ def find(
     height, width = rgb.shape[:2]
     device = next(network.parameters()).device
     canvas, inside = placed(rgb, size_px)
-    with torch.inference_mode(), torch.autocast(device.type, torch.bfloat16, fast_bfloat16(device)):
+    with torch.inference_mode():
         maps = network(torch.from_numpy(canvas).to(device).permute(2, 0, 1)[None] / 255)
     found = read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
     return replace(found, logit=gain * found.logit + bias)
