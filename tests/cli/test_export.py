@@ -45,6 +45,6 @@ def test_the_published_network_has_no_export(tmp_path: Path, capsys):
 
 def test_an_engine_that_is_no_folder(tmp_path: Path, capsys):
     assert main(["track", "sample", "--engine", "onx", "--out", str(tmp_path / "out")]) == 2
-    assert "onx/manifest.json: no such file; expected a folder of `quest export`, or torch or onnx" in (
+    assert "onx/manifest.json: no such file; expected a folder of `quest export`, or torch, bfloat16 or onnx" in (
         " ".join(capsys.readouterr().err.split())
     )

@@ -206,7 +206,7 @@ def test_without_the_extra_it_is_named(loaded: LoadedNetwork, monkeypatch: pytes
 
 
 def test_what_no_engine_can_run(loaded: LoadedNetwork, tmp_path: Path):
-    with pytest.raises(WeightsError, match="expected a folder of `quest export`, or torch or onnx"):
+    with pytest.raises(WeightsError, match="expected a folder of `quest export`, or torch, bfloat16 or onnx"):
         quest.load(loaded.path, engine="tensorrt")
     with pytest.raises(ConfigError, match="ONNX Runtime runs on the processor"):
         quest.load(loaded.path, engine=tmp_path, device="cuda")

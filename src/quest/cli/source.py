@@ -58,7 +58,8 @@ class Source:
     device: str = "auto"
     """cpu, cuda, mps or auto."""
     engine: str = "torch"
-    """What runs the networks: torch; onnx, which is ONNX Runtime on the processor; or a folder of quest export."""
+    """What runs the networks: torch; bfloat16, faster where the device has it; onnx, which is ONNX Runtime on the
+    processor; or a folder of quest export."""
     alpha: float = 0.05
     """Share of streams without any loss that may raise an alarm."""
     alpha_frames: int | None = None

@@ -48,7 +48,7 @@ def file_sha256(path: Path) -> str:
 
 def _read_manifest(folder: Path) -> Manifest:
     path = folder / MANIFEST
-    remedy = "expected a folder of `quest export`, or torch or onnx"
+    remedy = "expected a folder of `quest export`, or torch, bfloat16 or onnx"
     require_file(path, WeightsError, remedy)
     values = read_json(path, WeightsError, remedy)
     with reading(path, WeightsError, _REMEDY):

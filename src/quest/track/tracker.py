@@ -21,7 +21,7 @@ from quest.model.found import Found, find
 from quest.model.weights import load_network
 from quest.model.xfeat import XFeat
 from quest.monitor import Budget, Calibration, Inputs, read_calibrations
-from quest.track.engine import networks
+from quest.track.engine import BY_TORCH, networks
 from quest.track.finding import Finding
 from quest.track.preprocess import NO_DEPTH_FLAG
 from quest.track.saving import load as restored
@@ -248,8 +248,9 @@ def load(
         device: ``cpu``, ``cuda``, ``cuda:1``, ``mps``, or ``auto``: CUDA if there is any, else the CPU.
         monitor: whether to read the packaged calibrations of the monitor, without which there are no alarms; or the
             file of others that ``quest calibrate`` made.
-        engine: what runs the networks: ``torch``; ``onnx``, which is ONNX Runtime on the processor; or the same from
-            the path of a folder that ``quest export`` wrote.
+        engine: what runs the networks: ``torch``; ``bfloat16``, the same in that precision, faster on processors and
+            GPUs that have it; ``onnx``, which is ONNX Runtime on the processor; or the same from the path of a folder
+            that ``quest export`` wrote.
 
     Raises:
         WeightsError: no such weights here or on the hub, the hub cannot be reached and the cache has no copy, or a
@@ -257,10 +258,11 @@ def load(
         ConfigError: no such device, or ONNX Runtime is to run elsewhere than on the processor.
         MissingExtraError: ONNX Runtime is not installed.
     """
-    if engine != "torch" and device not in ("auto", "cpu"):
+    if engine not in BY_TORCH and device not in ("auto", "cpu"):
         raise ConfigError(f"device {device!r}: ONNX Runtime runs on the processor; leave it out, or the engine")
+    where = pick_device(device if engine in BY_TORCH else "cpu")
     loaded = load_network(name)
-    network, features = networks(loaded, engine)
+    network, features = networks(loaded, engine, where)
     calibrations = {} if monitor is False else read_calibrations(None if monitor is True else Path(monitor))
     for inputs, calibration in calibrations.items():
         if calibration.revision != REVISION:
@@ -271,7 +273,7 @@ def load(
     return Tracker(
         network,
         TrackerConfig.from_json(loaded.settings),
-        device=pick_device(device if engine == "torch" else "cpu"),
+        device=where,
         weights_hash=loaded.sha256,
         calibrations=calibrations,
         features=features,
