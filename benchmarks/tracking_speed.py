@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import os
 import time
+from collections import defaultdict
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -46,30 +48,41 @@ class TrackingSpeed:
     weights: str = "quest-s16"
     """Name or file of the weights."""
     device: str = "auto"
-    """Where the network runs."""
+    """Where the networks run."""
+    engines: tuple[str, ...] = ("torch", "bfloat16")
+    """What runs them, as of quest track --engine."""
     out: Path | None = None
     """Result file."""
 
     def run(self) -> int:
         """Play all turns and print medians, high quantiles and frames per second."""
         clip = read_recording(sample_folder())
-        if min(self.queries, default=0) < 1 or self.turns < 1 or not 0 < self.settled < len(clip):
-            raise SystemExit(f"tracking_speed: expected queries, turns and 1 to {len(clip) - 1} settled, got {self}")
-        tracker = quest.load(self.weights, device=self.device)
-        self._discovery_ms(tracker, clip)  # warms up
-        frames_ms: dict[int, list[np.ndarray]] = {count: [] for count in self.queries}
-        discovery_ms: list[float] = []
-        for _ in range(self.turns):
-            discovery_ms.append(self._discovery_ms(tracker, clip))
+        if not self.engines or min(self.queries, default=0) < 1 or self.turns < 1 or not 0 < self.settled < len(clip):
+            raise SystemExit(
+                f"tracking_speed: expected engines, queries, turns and 1 to {len(clip) - 1} settled, got {self}"
+            )
+        trackers = {engine: quest.load(self.weights, device=self.device, engine=engine) for engine in self.engines}
+        frames_ms: dict[tuple[str, int], list[np.ndarray]] = defaultdict(list)
+        discovery_ms: dict[str, list[float]] = defaultdict(list)
+        for (engine, tracker), _ in product(trackers.items(), range(self.turns)):
+            self._discovery_ms(tracker, clip)  # warms up
+            discovery_ms[engine].append(self._discovery_ms(tracker, clip))
             for count in self.queries:
                 stream = tracker.stream(clip.camera, queries_on(clip, count))
-                frames_ms[count].append(played_ms(stream, clip)[self.settled :])
+                frames_ms[engine, count].append(played_ms(stream, clip)[self.settled :])
         result = {
-            "rows": [{"queries": count, **_summary(np.array(turns))} for count, turns in frames_ms.items()],
-            "discovery_ms": {"median": float(np.median(discovery_ms)), "n": len(discovery_ms)},
+            "rows": [
+                {"engine": engine, "queries": count, **_summary(np.array(turns))}
+                for (engine, count), turns in frames_ms.items()
+            ],
+            "discovery": [
+                {"engine": engine, "median_ms": float(np.median(ms)), "n": len(ms)}
+                for engine, ms in discovery_ms.items()
+            ],
         }
         Console(highlight=False).print_json(data=result, default=asdict)
         if self.out is not None:
+            tracker = next(iter(trackers.values()))
             about = {"weights": self.weights, "weights_hash": tracker.weights_hash, "threads": torch.get_num_threads()}
             about |= {"device": device_name(tracker.device), "load": os.getloadavg()[0]}
             about |= {"source_px": [clip.camera.width, clip.camera.height]}

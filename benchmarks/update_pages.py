@@ -159,31 +159,10 @@ RESULTS = Page(
         ),
         *(table for recipe in TABLES.values() for table in recipe.pages),
         Table(
-            "speed/tracking.json",
-            "Time of a frame on two processor cores, alarms on",
-            "queries = queries | frames = frames | median, ms = median_ms | 95 % within, ms = p95_ms | "
-            "frames/s = frames_per_s",
-            about="No GPU was timed.",
-        ),
-        Table(
-            "speed/tracking.json",
-            "Time of the first frame with discovery",
-            "threads = threads | times = discovery_ms.n | median, ms = discovery_ms.median",
-            rows="",
-        ),
-        Table(
             "data/verify.json",
             "Takes of all suites, verified",
             "check = key | worst = worst | limit = limit | unit = unit",
             rows="worst",
-        ),
-        Table(
-            "speed/generation.json",
-            "Making takes beside a bare SAPIEN loop",
-            "takes = n_takes | frames = n_frames | frames/s = frames_per_s | bare loop = bare_frames_per_s | "
-            "share of bare % = %share_of_bare",
-            rows="",
-            about="Three views of 224 × 224 pixels.",
         ),
     ),
 )
@@ -235,6 +214,48 @@ HISTORY = Page(
 )
 
 
+PERFORMANCE = (
+    Table(
+        "speed/tracking.json",
+        "Time of a frame on two processor cores",
+        "engine = engine | queries = queries | frames = frames | median, ms = median_ms | "
+        "95 % within, ms = p95_ms | frames/s = frames_per_s",
+        about="640 x 480 pixels with depth, alarms on. No GPU was timed.",
+    ),
+    Table(
+        "speed/tracking.json",
+        "Time of the first frame with discovery",
+        "engine = engine | times = n | median, ms = median_ms",
+        rows="discovery",
+    ),
+    Table(
+        "speed/roofline.json",
+        "Networks beside what the processor can do",
+        "network = network | precision = precision | threads = threads | GFLOP = gflop | floor, ms = floor_ms | "
+        "measured, ms = ms | times the floor = times",
+        rows="networks",
+        about="The floor is the network's operations over the rate of one product of 1024 x 1024 matrices in the "
+        "same precision and with as many threads. The finder includes reading its maps off.",
+    ),
+    Table(
+        "speed/roofline.json",
+        "Parts of a frame",
+        "part = part | ms = ms | OpenCV, SciPy, PyTorch, ms = compiled_ms | Python and NumPy, ms = rest_ms",
+        rows="parts",
+        about="Eight queries, one thread each; processor time. Descriptors are made meanwhile, on the other core.",
+    ),
+    Table(
+        "speed/generation.json",
+        "Making takes beside a bare SAPIEN loop",
+        "takes = n_takes | frames = n_frames | frames/s = frames_per_s | bare loop = bare_frames_per_s | "
+        "share of bare % = %share_of_bare",
+        rows="",
+        about="Three views of 224 × 224 pixels.",
+    ),
+)
+"""Tables of the page of speed, whose text is written by hand."""
+
+
 @dataclass(frozen=True)
 class UpdatePages:
     """Rewrite the tables of README, cards and pages of results."""
@@ -264,6 +285,8 @@ def pages(folder: Path) -> dict[Path, str]:
         ROOT / "docs" / "results.md": whole(RESULTS, folder),
         ROOT / "docs" / "history" / "results.md": whole(HISTORY, folder),
     }
+    speed = ROOT / "docs" / "performance.md"
+    written[speed] = between_markers(speed.read_text(encoding="utf-8"), sections(PERFORMANCE, folder))
     for page in (ROOT / "README.md", *sorted(CARDS.glob("*.md"))):
         default = page.name == "README.md" or page.stem in DEFAULTS.values()
         text = page.read_text(encoding="utf-8")
@@ -283,8 +306,12 @@ def between_markers(text: str, table: str) -> str:
 
 def whole(page: Page, folder: Path) -> str:
     """A page as Markdown; tables whose report is missing or has no such rows are left out."""
-    sections = [section for table in page.tables if (section := as_section(table, folder))]
-    return "\n\n".join([f"# {page.title}", page.about, *sections]) + "\n"
+    return f"# {page.title}\n\n{page.about}\n\n{sections(page.tables, folder)}\n"
+
+
+def sections(tables: Iterable[Table], folder: Path) -> str:
+    """Tables one below the other."""
+    return "\n\n".join(section for table in tables if (section := as_section(table, folder)))
 
 
 SUMMARY = ("measured on", "n", "measure", "QueST", "LK on a grid", "hold still")

@@ -73,9 +73,10 @@ def _origin(path: Path) -> Origin:
 
 def provenance() -> dict[str, Any]:
     """What a report must carry to be made again: command, commit, machine, versions and time."""
-    script = Path(sys.argv[0])
+    script, spec = Path(sys.argv[0]), sys.modules["__main__"].__spec__
+    program = [f"{script.parent.name}/{script.name}"] if spec is None else ["-m", spec.name]
     return {
-        "command": shlex.join(["python", f"{script.parent.name}/{script.name}", *sys.argv[1:]]),
+        "command": shlex.join(["python", *program, *sys.argv[1:]]),
         "commit": code_commit(),
         "machine": machine(),
         "versions": package_versions(),

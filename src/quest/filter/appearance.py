@@ -43,7 +43,7 @@ class Likeness:
         cls, picture: Picture, descriptor: Float[np.ndarray, "K V D"], patch: Float[np.ndarray, "K V S S"]
     ) -> Likeness:
         """Compare a frame with views of entities."""
-        # Not by NumPy, whose BLAS would keep the other cores busy with waiting for 25 ms afterwards.
+        # Not by NumPy: threads of OpenBLAS keep all cores busy with waiting long after such a product.
         one, other = torch.from_numpy(descriptor).float(), torch.from_numpy(picture.descriptors)
         cosine = torch.einsum("kvd,dhw->kvhw", one, other).amax(dim=1).numpy()
         return cls(picture, cosine, patch)
