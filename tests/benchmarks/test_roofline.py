@@ -14,7 +14,7 @@ from quest.types import Camera
 def test_kernels_count_within_their_part() -> None:
     clock, before = Clock(), cv2.cvtColor
     with clock.running():
-        Preprocessor(Camera(64, 48, 50, 50, 32, 24), follow_px=480).picture(np.zeros((48, 64, 3), np.uint8))
+        Preprocessor(Camera(50, 50, 32, 24, 64, 48), follow_px=480).picture(np.zeros((48, 64, 3), np.uint8))
         cv2.cvtColor(np.zeros((480, 640, 3), np.uint8), cv2.COLOR_RGB2GRAY)
     assert cv2.cvtColor is before
     spent_s = clock.spent_s
