@@ -93,6 +93,15 @@ def test_help_imports_nothing_heavy():
     assert done.stdout == "[]\n", done.stderr
 
 
+def test_weights_are_read_without_what_pytorch_compiles_with():
+    code = (
+        "import sys, quest; quest.load(); "
+        "print([m for m in ('torch._dynamo', 'torch.fx.experimental.symbolic_shapes', 'sympy') if m in sys.modules])"
+    )
+    done = python("-c", code)
+    assert done.stdout == "[]\n", done.stderr
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

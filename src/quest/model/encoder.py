@@ -87,7 +87,7 @@ class Encoder(nn.Module):
         self.config = config
         self.patch = nn.Conv2d(3, config.width, config.patch_size, config.patch_size)
         self.class_token = nn.Parameter(torch.zeros(1, 1, config.width))
-        self.position = nn.Parameter(0.02 * torch.randn(1, 1 + config.grid**2, config.width))
+        self.position = nn.Parameter(nn.init.normal_(torch.empty(1, 1 + config.grid**2, config.width), std=0.02))
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.depth))
         self.norm = nn.LayerNorm(config.width, eps=1e-6)
         self.register_buffer("mean", torch.tensor(_MEAN).view(1, 3, 1, 1), persistent=False)
@@ -153,7 +153,7 @@ def read_into(make: Callable[[], _Module], state: Mapping[str, Tensor], *, what:
         WeightsError: names or shapes differ from the network's, or no network can be of such a shape.
     """
     with reading(what, WeightsError, "fetch or train them again"):
-        with torch.device("meta"):
+        with torch.device("meta"), _NoRandomValues():
             _check_shapes(make(), state, what=what)
         with _NoRandomValues():
             module = make()
