@@ -4,17 +4,22 @@
 
 The packaged clip is played as a stream, in turn with each number of queries, which are points spread over what is
 nearest to the camera in its first frame. Frame 0, in which they bind, and the few after it are not timed. `discovery`
-is a first frame in which everything is to be found. Let nothing else run meanwhile.
+is a first frame in which everything is to be found. `start` is a process of its own from its beginning to its end, with
+compiled Python files. Let nothing else run meanwhile.
 """
 
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -33,6 +38,18 @@ from quest.types import Clip, Query
 
 NEAREST = 0.3
 """Share of the first frame's pixels with depth that queries are asked for at: the nearest ones."""
+
+
+STARTS = {
+    "`import quest`": ["-c", "import quest"],
+    "`quest --help`": ["-m", "quest", "--help"],
+    "weights read, one picture answered": [
+        "-c",
+        "import quest; from quest.data.sample import sample_folder; clip = quest.read(sample_folder()); "
+        "frame = clip.frame(0); quest.load().stream(clip.camera).step(frame.rgb, frame.depth_m, frame.stamp_s)",
+    ],
+}
+"""What is started, and the arguments of Python."""
 
 
 @dataclass(frozen=True)
@@ -79,6 +96,7 @@ class TrackingSpeed:
                 {"engine": engine, "median_ms": float(np.median(ms)), "n": len(ms)}
                 for engine, ms in discovery_ms.items()
             ],
+            "start": list(self._starts()),
         }
         Console(highlight=False).print_json(data=result, default=asdict)
         if self.out is not None:
@@ -88,6 +106,17 @@ class TrackingSpeed:
             about |= {"source_px": [clip.camera.width, clip.camera.height]}
             write_report(provenance() | about | result, self.out)
         return 0
+
+    def _starts(self) -> Iterable[dict[str, Any]]:
+        with TemporaryDirectory() as cache:
+            environ = os.environ | {"PYTHONPYCACHEPREFIX": cache, "PYTHONDONTWRITEBYTECODE": ""}
+            for what, arguments in STARTS.items():
+                took_s = []
+                for _ in range(self.turns + 1):  # the first compiles
+                    start_s = time.perf_counter()
+                    subprocess.run([sys.executable, *arguments], env=environ, check=True, stdout=subprocess.DEVNULL)
+                    took_s.append(time.perf_counter() - start_s)
+                yield {"what": what, "median_s": float(np.median(took_s[1:])), "n": self.turns}
 
     def _discovery_ms(self, tracker: Tracker, clip: Clip) -> float:
         return float(played_ms(tracker.stream(clip.camera), clip, frames=1)[0])

@@ -228,6 +228,7 @@ PERFORMANCE = (
         "engine = engine | times = n | median, ms = median_ms",
         rows="discovery",
     ),
+    Table("speed/tracking.json", "Start", "what = what | times = n | median, s = median_s", rows="start"),
     Table(
         "speed/roofline.json",
         "Networks beside what the processor can do",
