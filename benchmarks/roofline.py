@@ -10,6 +10,7 @@ take, and the rest, which is Python and NumPy. Let nothing else run meanwhile.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
@@ -35,6 +36,7 @@ from quest.evaluation.report import device_name, provenance, write_report
 from quest.filter import landmarks
 from quest.filter import step as filtering
 from quest.model.found import find
+from quest.model.xfeat import XFeat
 from quest.monitor import Monitor
 from quest.track import Tracker
 from quest.track import describing as making
@@ -64,8 +66,9 @@ KERNELS: tuple[tuple[Any, str], ...] = (
     (landmarks, "KDTree"),
     (landmarks.KDTree, "query"),
     (torch, "einsum"),
+    (XFeat, "features"),
 )  # fmt: skip
-"""What is compiled and does its own work; the network of descriptors is another."""
+"""What is compiled and does its own work."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +138,6 @@ class Roofline:
         frames = len(clip) - self.settled
         for name in names:
             all_ms, compiled_ms = (1e3 * clock.spent_s[name, what] / frames for what in ("all", "compiled"))
-            compiled_ms = all_ms if name == "dense descriptors" else compiled_ms
             yield {"part": name, "ms": all_ms, "compiled_ms": compiled_ms, "rest_ms": all_ms - compiled_ms}
 
 
@@ -144,7 +146,7 @@ class Clock:
 
     def __init__(self) -> None:
         self.spent_s: defaultdict[tuple[str, str], float] = defaultdict(float)
-        self._part = ""
+        self._here = threading.local()  # descriptors have a thread of their own
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -158,14 +160,12 @@ class Clock:
 
     def _timed(self, call: Callable[..., Any], part: str | None) -> Callable[..., Any]:
         def timed(*args: Any, **settings: Any) -> Any:
-            outer, aside = self._part, part == "dense descriptors"  # which has a thread of its own
-            if part is not None and not aside:
-                self._part = part
+            outer = getattr(self._here, "part", "")
+            self._here.part = part or outer
             start_s = time.thread_time()
             result = call(*args, **settings)
-            took_s = time.thread_time() - start_s
-            self.spent_s[part or outer, "all" if part else "compiled"] += took_s
-            self._part = self._part if aside else outer
+            self.spent_s[self._here.part, "all" if part else "compiled"] += time.thread_time() - start_s
+            self._here.part = outer
             return result
 
         return timed

@@ -20,6 +20,7 @@ import numpy as np
 import tyro
 
 from quest.cli.main import main
+from quest.data.cut import cut_clip
 from quest.data.recording import write_recording
 from quest.data.store import TakeStore
 from quest.types import Take
@@ -28,7 +29,6 @@ from tests.golden.streams import (
     GoldenClip,
     Truth,
     arrays_of,
-    cut,
     follow,
     judge,
     load,
@@ -72,7 +72,7 @@ def write(golden: GoldenClip, take: Take) -> None:
     view, e = take.views[0], [entity.name for entity in take.info.entities].index(golden.entities[0])
     hidden = np.flatnonzero(~view.visible[:, e])
     rows = slice(max(hidden[0] - IN_FRONT, 0), hidden[-1] + 1 + BEHIND)
-    clip = cut(view.clip, rows)
+    clip = cut_clip(view.clip, rows)
     assert clip.depth_m is not None
     shutil.rmtree(golden.folder, ignore_errors=True)
     write_recording(replace(clip, name=golden.name, depth_m=None), golden.folder)

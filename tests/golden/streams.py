@@ -14,6 +14,7 @@ import numpy as np
 
 import quest
 from quest import Clip, Query, Tracker, Tracks
+from quest.data.cut import cut_clip
 from quest.data.sample import sample_folder
 
 HERE = Path(__file__).parent
@@ -141,17 +142,6 @@ CLIPS = (
 )
 
 
-def cut(clip: Clip, frames: slice) -> Clip:
-    """Some frames of a clip."""
-    return replace(
-        clip,
-        rgb=clip.rgb[frames],
-        depth_m=None if clip.depth_m is None else clip.depth_m[frames],
-        stamp_s=clip.stamp_s[frames],
-        cam_from_world=clip.cam_from_world[frames],
-    )
-
-
 def write_depth(folder: Path, depth_m: np.ndarray) -> None:
     """Millimetres as differences from frame to frame, which are few where the camera stands still."""
     mm = np.rint(depth_m * 1e3).astype(np.uint16)
@@ -166,7 +156,7 @@ def read_depth(folder: Path) -> np.ndarray:
 
 def follow(tracker: Tracker, clip: Clip, queries: list[Query] | None, stride: int) -> Tracks:
     """Answers to every query of a clip."""
-    return tracker.track(cut(clip, slice(None, None, stride)), queries)
+    return tracker.track(cut_clip(clip, slice(None, None, stride)), queries)
 
 
 def judge(tracks: Tracks, truth: Truth, stride: int) -> dict[str, Figures]:

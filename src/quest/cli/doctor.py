@@ -107,7 +107,7 @@ def _torch() -> Iterator[Finding]:
         return
     yield Finding("torch", "ok", f"{torch.__version__}, {torch.get_num_threads()} of {os.cpu_count()} threads")
     capability = torch.backends.cpu.get_cpu_capability()
-    fast = "native" if torch.cpu._is_avx512_bf16_supported() or torch.cpu._is_amx_tile_supported() else "emulated"
+    fast = "native" if fast_bfloat16(torch.device("cpu")) else "emulated"
     yield Finding("cpu", "ok", f"{platform.processor() or platform.machine()}, {capability}, bfloat16 {fast}")
     for index in range(torch.cuda.device_count()):
         properties = torch.cuda.get_device_properties(index)

@@ -45,5 +45,6 @@ def _describe(features: XFeat, grey: UInt8[np.ndarray, "H W"]) -> Float32[np.nda
 
 
 def _leave_a_core() -> None:
-    """Of this thread alone: PyTorch asks its own OpenMP how many threads a new one may use, once."""
-    _LIBRARIES.limit(limits=max(1, torch.get_num_threads() - 1), user_api="openmp")
+    """Let PyTorch use one thread less here. Its own setting would also change it for threads that begin later."""
+    allowed = torch.get_num_threads()  # before the limit: PyTorch sets its number when it is first asked in a thread
+    _LIBRARIES.limit(limits=max(1, allowed - 1), user_api="openmp")
