@@ -164,7 +164,7 @@ def test_tracking_and_help_need_no_extra():
     )
     done = python("-c", code)
     assert done.returncode == 0, done.stderr
-    assert "static,orbit,handheld,pan,mixed" in done.stdout
+    assert "static,orbit,handheld,pan,walk,mixed" in done.stdout
 
 
 def test_require(monkeypatch):

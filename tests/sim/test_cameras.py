@@ -156,6 +156,19 @@ def test_pan_keeps_the_centre_in_the_image(seed: int) -> None:
         assert np.linalg.norm(eye - eye[0], axis=1).max() < 0.2 * np.linalg.norm(eye[0] - points.mean(axis=0))
 
 
+@settings(max_examples=20)
+@given(seeds)
+def test_who_walks_gets_somewhere_and_looks_at_the_object(seed: int) -> None:
+    points = cloud(seed)
+    for path in paths_of(seed, CameraStyle("walk"), 150):
+        assert_rigid(path)
+        assert inside(path, points).mean() > 0.6
+        eye = -(path.cam_from_world[:, :3, :3].transpose(0, 2, 1) @ path.cam_from_world[:, :3, 3:])[..., 0]
+        walked = np.linalg.norm(eye - eye[0], axis=1).max()
+        assert 0.1 * np.linalg.norm(eye[0] - points.mean(axis=0)) < walked < 5.1
+        assert np.linalg.norm(np.diff(eye, axis=0), axis=1).max() * FRAMES_PER_S < 2.2
+
+
 def test_mixed_draws_every_motion() -> None:
     paths = paths_of(0, CameraStyle("mixed"), frames=30, count=24)
     assert 0 < sum(path.static for path in paths) < 20

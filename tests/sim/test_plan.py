@@ -91,6 +91,8 @@ def test_shelf_keeps_objects_and_failures(tmp_path: Path) -> None:
         "--out a --suite lockers --procedural 4 --level 2",
         "--out a --suite noise --variant 5 stereo --procedural 4",
         "--out a --procedural 4 --size 640 480",
+        "--out a --suite kitchen --camera walk --procedural 2",
+        "--out a --room --objects procedural:chest-1",
         "--out s3://bucket/takes --procedural 2 --camera orbit --motion robot --overlap 0.5 --sensor stereo --physics",
         "--out a --procedural 2 --camera orbit --azimuth -40.0 40.0 --elevation 30.0 80.0",
     ],
@@ -108,6 +110,14 @@ def test_cameras_of_a_suite_move_where_the_arguments_say() -> None:
     command = Generate(out="a", procedural=1, suite="moving", variant=("pan",), elevation=(30.0, 80.0))
     (suite,) = command._suites()
     assert suite.settings.cameras == CameraStyle(motion="pan", elevation_deg=(30.0, 80.0))
+
+
+def test_a_kitchen_keeps_its_room() -> None:
+    (suite,) = Generate(out="a", procedural=1, suite="kitchen", camera="walk")._suites()
+    assert suite.settings.room
+    assert suite.settings.size == (640, 480)
+    assert suite.settings.cameras.motion == "walk"
+    assert suite.settings.cameras.azimuth_deg != CameraStyle().azimuth_deg
 
 
 def test_one_number_is_the_side_of_a_square() -> None:

@@ -53,7 +53,9 @@ class Generate:
     """Folder of PartNet-Mobility folders; default: the environment variable QUEST_OBJECTS."""
     mix: Literal["usual", "broad"] = "usual"
     """Kinds of procedural objects, and materials of all: the usual furniture and appliances, or everything there is."""
-    suite: Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "long", "published"] | None = None
+    suite: (
+        Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "kitchen", "long", "published"] | None
+    ) = None
     """Takes that are hard in one way: a named preset of the options below. docs/simulator.md describes each."""
     variant: tuple[str, ...] = ()
     """Kinds of a suite, such as blur and bump of shift; default: all of them."""
@@ -93,6 +95,8 @@ class Generate:
     """Drive the joints through a physics engine: friction, damping, inertia."""
     gripper: bool = False
     """A gripper comes and pulls the parts that move."""
+    room: bool = False
+    """Put the object into a room, among other furniture."""
     randomize_materials: bool = True
     """Give objects random materials: procedural ones always, others now and then."""
     stretch: float = 1.0
@@ -194,6 +198,7 @@ class Generate:
             preset,
             physics=preset.physics or self.physics,
             gripper=preset.gripper or self.gripper,
+            room=preset.room or self.room,
             randomize_materials=preset.randomize_materials and self.randomize_materials,
             stretch=self.stretch,
             broad_materials=self.mix == "broad",

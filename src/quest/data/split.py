@@ -39,27 +39,36 @@ SplitPart = Literal["train", "validation", "test", "unlisted"]
 """A part of the object split; ``unlisted`` objects are in none."""
 
 
+def part_of_object(source: str, object_id: str) -> Part | None:
+    """Which part of the split an object belongs to; None for none.
+
+    Raises:
+        ObjectError: it is procedural and has no seed in its name.
+    """
+    split = object_split()
+    if source == "partnet-mobility":
+        return next((part for part in PARTS if object_id in split.partnet_mobility[part]), None)
+    if source != "procedural":
+        return None
+    match = re.fullmatch(r".+-(\d+)", object_id)
+    if match is None:
+        raise ObjectError(
+            f"object {object_id!r}: expected a procedural object to be called category-seed, such as "
+            f"'fridge-100003'; rename it so that its part of the split is known"
+        )
+    ranges = split.procedural_seeds
+    return next((part for part in PARTS if ranges[part][0] <= int(match[1]) <= ranges[part][1]), None)
+
+
 def split_of(info: TakeInfo) -> Part:
     """Which part of the split the object of a take belongs to.
 
     Raises:
         ObjectError: the object is in no part, so that neither training nor a reported number may use it.
     """
-    split = object_split()
-    found: list[Part] = []
-    if info.source == "partnet-mobility":
-        found = [part for part in PARTS if info.object_id in split.partnet_mobility[part]]
-    elif info.source == "procedural":
-        match = re.fullmatch(r".+-(\d+)", info.object_id)
-        if match is None:
-            raise ObjectError(
-                f"object {info.object_id!r}: expected a procedural object to be called category-seed, such as "
-                f"'fridge-100003'; rename it so that its part of the split is known"
-            )
-        ranges = split.procedural_seeds
-        found = [part for part in PARTS if ranges[part][0] <= int(match[1]) <= ranges[part][1]]
-    if found:
-        return found[0]
+    found = part_of_object(info.source, info.object_id)
+    if found is not None:
+        return found
     raise ObjectError(
         f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's objects "
         f"or a procedural seed in its ranges"

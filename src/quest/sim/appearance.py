@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from jaxtyping import Float
 from quest.sim.cameras import CAMERA_AZIMUTH_DEG
 from quest.sim.entities import NAMED
 from quest.sim.surfaces import (
+    TEXTURE_KINDS,
     TILE_M,
     Colour,
     Surface,
@@ -32,6 +34,8 @@ from quest.sim.surfaces import (
     wear,
 )
 
+ROOM = "room"
+"""First word of the names of parts that belong to no piece of furniture, such as ``room/wall-0``."""
 _FLOORS: tuple[TextureKind, ...] = ("noise", "checker", "planks", "tiles", "speckle", "stripes")
 _WALLS: tuple[TextureKind, ...] = ("noise", "stripes", "tiles", "planks", "speckle")
 _MORE_FOR_ROOMS: tuple[TextureKind, ...] = ("bricks", "concrete", "marble", "weave")
@@ -230,8 +234,8 @@ def apply_appearance(
     """
     _light(scene, appearance, region)
     _surround(scene, appearance, region, wide)
-    if appearance.look is not None and (procedural or appearance.look.repaint_original):
-        _paint(appearance.look, bodies)
+    if appearance.look is not None:
+        _paint(appearance.look, bodies, own=procedural or appearance.look.repaint_original)
 
 
 def _light(scene: Any, appearance: Appearance, region: Region) -> None:
@@ -339,16 +343,40 @@ def add_shape(scene: Any, shape: Any, pose: Any = None) -> Any:
     return entity
 
 
-def _paint(look: ObjectLook, bodies: Sequence[Any]) -> None:
-    """Parts of one kind look alike unless the look says that links differ."""
-    textures = {surface: make_texture(surface) for surface in {*look.surfaces, look.handle}}
+def _paint(look: ObjectLook, bodies: Sequence[Any], *, own: bool) -> None:
+    """Parts of one kind look alike unless the look says that links differ.
+
+    Neighbours have looks of their own, or that of the object; without ``own`` the object itself keeps its materials.
+    """
+    texture_of = cache(make_texture)
     for index, body in enumerate(bodies):
         for shape in body.render_shapes:
-            surface = choose_surface(look, shape.name, index)
+            piece, _, name = shape.name.rpartition("/")
+            if piece == ROOM:
+                surface = _room_surface(look.seed, name)
+            elif piece or own:
+                surface = choose_surface(_look_of(look, piece), name, index)
+            else:
+                continue
             for part in shape.parts:
                 if surface.texture is not None:
                     ensure_uv(part, np.asarray(getattr(shape, "scale", np.ones(3))))
-                wear(part.material, surface, textures.get(surface))
+                wear(part.material, surface, texture_of(surface))
+
+
+def _look_of(look: ObjectLook, piece: str) -> ObjectLook:
+    """Materials of a piece of furniture: half of the rooms are of one make, in the others each has its own."""
+    if not piece or np.random.default_rng(look.seed).random() < 0.5:
+        return look
+    row = piece.partition("-")[0]  # those above the others are of one make
+    alike = row if row == "above" else piece
+    return _sample_look(np.random.default_rng([look.seed, *alike.encode()]), _MORE_FOR_OBJECTS)
+
+
+def _room_surface(seed: int, name: str) -> Surface:
+    """What a part of the room wears: walls and pictures what walls do, things on top anything."""
+    kinds = (*_WALLS, *_MORE_FOR_ROOMS) if name.startswith("wall") else TEXTURE_KINDS
+    return sample_surface(np.random.default_rng([seed, *name.encode()]), kinds=kinds, textured=0.5)
 
 
 _ROLE = re.compile(r"^(.*?)-?\d*$")

@@ -151,6 +151,13 @@ _PAN_FILL = (0.55, 0.80)
 _SHAKE_SHIFT = (0.004, 0.010)  # root mean square of each axis, per metre between camera and object
 _SHAKE_TURN_DEG = (0.4, 1.0)  # root mean square about each axis
 _NECK = (0.03, 0.10)  # from the axes of pan and tilt to the camera, per metre between camera and object
+_WALK_FILL = (0.65, 0.85)
+_WALK_M_PER_S = (0.2, 1.0)
+_WALK_SHARE = (0.15, 0.6)  # of the distance to the object that is walked at most
+_WALK_OBLIQUE_DEG = 70.0  # off a way straight past the object
+_WALK_AIMED = (0.6, 1.0)
+_STEPS_HZ = (1.5, 2.1)
+_BOB_M = (0.005, 0.025)
 _GLANCE = (0.3, 1.1)  # of the way from the middle of the object to one of its points
 _CENTRE_WITHIN = 0.9  # of the half image, in which the object's centre stays while a head pans
 _BUMP_TURN_DEG = (2.0, 4.0)
@@ -405,6 +412,37 @@ def _pan(request: PathRequest) -> CameraPath:
         angles = 0.8 * angles
 
 
+def _walk(request: PathRequest) -> CameraPath:
+    """A person walks past the object, or up to it, with the camera in hand, and turns it towards the object.
+
+    The head bobs once a step and sways once in two (Pozzo et al. 1990, head stabilization during various locomotor
+    tasks); the camera is turned by most of what would keep the object where it is in the image.
+    """
+    rng, points, posed = request.rng, request.points, request.aimed(_WALK_FILL)
+    start, distance = posed.cam_from_world[:3, :3], _distance(request.points, posed)
+    eye = -start.T @ posed.cam_from_world[:3, 3]
+    seconds = np.arange(request.frames) / FRAMES_PER_S
+    way = min(rng.uniform(*_WALK_M_PER_S) * seconds[-1], rng.uniform(*_WALK_SHARE) * distance)
+    heading = rng.choice([0.0, np.pi]) + rng.uniform(-1, 1) * np.deg2rad(_WALK_OBLIQUE_DEG)
+    along = np.cos(heading) * start[0] + np.sin(heading) * start[2]
+    along[2] = 0.0
+    step, phase = 2 * np.pi * rng.uniform(*_STEPS_HZ) * seconds, rng.uniform(0, 2 * np.pi)
+    bob = rng.uniform(*_BOB_M) * np.stack((0.5 * np.sin(step / 2 + phase), np.sin(step + phase)), axis=-1)
+    gone = way * (there_and_back(request.frames, rng)[:, None] - 0.5) * along
+    path = eye + gone + bob[:, :1] * start[0] + bob[:, 1:] * [0.0, 0.0, 1.0]
+    centre = points.mean(axis=0)
+    aim = centre + (1 - rng.uniform(*_WALK_AIMED)) * (path - eye)
+    towards = path - aim
+    azimuth, elevation = (
+        np.arctan2(towards[:, 1], towards[:, 0]), np.arctan2(towards[:, 2], np.hypot(towards[:, 0], towards[:, 1]))
+    )  # fmt: skip
+    off = eye - centre
+    (level,) = look(np.array([np.arctan2(off[1], off[0])]), np.array([np.arctan2(off[2], np.hypot(*off[:2]))]))[1]
+    shake = np.deg2rad(rng.uniform(*_SHAKE_TURN_DEG)) * hand_shake(request.frames, rng)[:, :3]
+    poses = _poses(start @ level.T @ look(azimuth, elevation)[1], path)
+    return CameraPath(posed.camera, displaced(poses, shake, np.zeros_like(shake)))
+
+
 def _distance(points: Float[np.ndarray, "N 3"], posed: PosedCamera) -> float:
     """Along the line of sight, from a camera to the middle of what it sees, metres."""
     return float(posed.cam_from_world[2, :3] @ points.mean(axis=0) + posed.cam_from_world[2, 3])
@@ -423,6 +461,7 @@ CAMERA_MOTIONS: dict[str, Callable[[PathRequest], CameraPath]] = {
     "orbit": _orbit,
     "handheld": _handheld,
     "pan": _pan,
+    "walk": _walk,
 }
 """How a camera may move, by name; a new motion is a function and a line here."""
 

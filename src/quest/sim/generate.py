@@ -15,7 +15,9 @@ from quest.sim.cameras import CameraPath
 from quest.sim.motion import FRAMES_PER_S
 from quest.sim.objects import SimObject
 from quest.sim.occlusion import stage_occlusion
+from quest.sim.procedural.model import Dice
 from quest.sim.renderer import Picture, Renderer
+from quest.sim.room import furnished
 from quest.sim.sensor import SensorModel, sense
 from quest.sim.settings import TakeSettings
 from quest.sim.staging import Staging, see_entities, stage_plain
@@ -67,6 +69,9 @@ def generate_take(
         np.random.default_rng([*(scene if n in (1, 2) else key), n]) for n in range(5)
     )
     sim_object, shape = _shaped(sim_object, np.random.default_rng([*key, 5]), settings)
+    if settings.room:
+        sim_object, beside = furnished(sim_object, Dice(np.random.PCG64([*scene, 6])))
+        shape = {**shape, "beside": beside}
     if hiding is None:
         staging = stage_plain(
             sim_object, level, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
@@ -161,7 +166,7 @@ def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     for what in ("cameras", "motion", "sensor"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = asdict(getattr(settings, what))
-    for what in ("physics", "gripper", "disturbance", "broad_materials", "fixed_scene"):
+    for what in ("physics", "gripper", "disturbance", "broad_materials", "fixed_scene", "room"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = getattr(settings, what)
     variant = {"variant": suite.variant} if suite is not None and suite.variant else {}

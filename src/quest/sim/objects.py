@@ -70,13 +70,17 @@ class SimObject:
     """Metres per unit of the URDF."""
     warnings: tuple[str, ...]
     """Degradations, in words: missing meshes, a category that is not known."""
+    movers: tuple[int, ...] | None = None
+    """Joints that may move in takes; None for all of them."""
+    view_m: Float[np.ndarray, "2 3"] | None = None
+    """Box that cameras film, least and greatest world coordinates, metres; None for the whole object."""
 
     @property
     def movable(self) -> tuple[int, ...]:
         """Joints that carry an entity (hinges aside) that moves at least 0.1 normalised units."""
         least = MOVES_AT_LEAST * self.half_diagonal_m
         moving = {e.joint for e in self.entities if e.label != "hinge" and not e.fixed and e.travel_m >= least}
-        return tuple(sorted(moving))
+        return tuple(sorted(moving if self.movers is None else moving.intersection(self.movers)))
 
 
 def find_objects(root: Path | None = None) -> list[Path]:

@@ -47,6 +47,8 @@ class TakeSettings:
     """What the sensor makes of colours and depth; the ground truth knows nothing of it."""
     disturbance: Disturbance = "none"
     """What happens to light, materials or cameras."""
+    room: bool = False
+    """Whether the object stands in a room, among other furniture that stands still."""
     stretch: float = 1.0
     """Up to which factor every take has the object stretched along its depth, width and height; 1 leaves it as it
     is."""

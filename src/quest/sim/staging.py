@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from trimesh.bounds import corners
 
 from quest.errors import ObjectError
 from quest.sim.annotate import project_points, visible_entities
@@ -198,7 +199,7 @@ def _cameras(
     stage: Stage | None = None
     for _ in range(_CAMERA_ATTEMPTS):
         paths = sample_camera_paths(
-            playback.swept,
+            playback.swept if sim_object.view_m is None else corners(sim_object.view_m),
             settings.views,
             frames,
             rng,

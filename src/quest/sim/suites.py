@@ -99,6 +99,7 @@ def _with(**changes: object) -> TakeSettings:
 
 
 _ODD_VIEWPOINT = CameraStyle(azimuth_deg=(50.0, 70.0), elevation_deg=(55.0, 75.0), mirrored=True)
+_IN_A_ROOM = CameraStyle(motion="handheld", azimuth_deg=(-50.0, 50.0), elevation_deg=(0.0, 40.0))
 
 SUITES: dict[str, tuple[Suite, ...]] = {
     "occlusion": (Suite("occlusion", hiding=Hiding(None, False, before=(34, 41), after=(24, 30))),),
@@ -128,6 +129,7 @@ SUITES: dict[str, tuple[Suite, ...]] = {
         if motion != "static"
     ),
     "gripper": (Suite("gripper", settings=_with(gripper=True, frames_per_joint=90)),),
+    "kitchen": (Suite("kitchen", settings=_with(room=True, size=(640, 480), cameras=_IN_A_ROOM)),),
     "long": (Suite("long", settings=_with(frames=10_000), level=2),),
     "published": (Suite("published", settings=_with(views=3, randomize_materials=False, fixed_scene=True)),),
 }
@@ -139,6 +141,8 @@ SUITES: dict[str, tuple[Suite, ...]] = {
 - ``shift``: light that changes, odd materials, blur, JPEG, a bumped camera, a camera high above or far to the side;
 - ``moving``: a camera that orbits, is held by hand, or sits on a robot's head;
 - ``gripper``: a gripper comes, pulls, and goes;
+- ``kitchen``: the object in a row of other furniture, with things on top and cupboards above, before a hand-held
+  camera that is near or far;
 - ``long``: 10,000 frames in which two joints open and close again and again;
 - ``published``: as the publication seems to have filmed: three cameras that stand where they stand for all takes of an
   object, in its own materials, under one light; only the motion is another in every take.

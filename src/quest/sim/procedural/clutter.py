@@ -31,7 +31,7 @@ def with_clutter(model: ObjectModel, rng: Dice) -> ObjectModel:
     links = tuple(_decorated(link, rng) for link in model.links)
     vertices = np.concatenate([part.mesh.vertices for part in model.body])
     low, high = vertices.min(axis=0), vertices.max(axis=0)
-    body = [*model.body, *_on_top(low, high, rng)]
+    body = [*model.body, *things_on(low, high, rng)]
     if rng.chance(0.4):
         body.append(_shelf(low, high, rng))
     model = ObjectModel(model.model_cat, tuple(body), links)
@@ -106,8 +106,8 @@ def _moulding(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Mesh
     ])  # fmt: skip
 
 
-def _on_top(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice) -> list[Part]:
-    """None to three bottles and boxes on the highest face."""
+def things_on(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice) -> list[Part]:
+    """None to three bottles and boxes on top of a bounding box, metres, z up."""
     things: list[Part] = []
     for _ in range(rng.whole(0, 4)):
         radius, height = rng.real(0.025, 0.07), rng.real(0.06, 0.28)

@@ -344,7 +344,7 @@ def as_urdf(model: ObjectModel) -> Urdf:
     joints = [UrdfJoint("body_joint", "fixed", "base", "body", yaw, np.array([1.0, 0.0, 0.0]), 0.0, 0.0)]
     number = 0
     for name, parts in (("body", model.body), *((f"link_{n}", link.parts) for n, link in enumerate(model.links))):
-        links[name] = tuple(_visual(part, number + n) for n, part in enumerate(parts))
+        links[name] = tuple(as_visual(part, number + n) for n, part in enumerate(parts))
         number += len(parts)
     for n, link in enumerate(model.links):
         pose, axis = pose_matrix(_short(link.origin), np.zeros(3)), _short(link.axis)
@@ -358,7 +358,8 @@ def _short(values: tuple[float, float, float]) -> Float[np.ndarray, "3"]:
     return np.array([float(f"{value:.6g}") for value in values])
 
 
-def _visual(part: Part, number: int) -> UrdfVisual:
+def as_visual(part: Part, number: int) -> UrdfVisual:
+    """A part as a URDF would hold it, called after its role and a number."""
     mesh, corner = part.mesh, part.mesh.faces.ravel()
     uv = _single(mesh.uv, 5)[corner]
     uv[:, 1] = 1 - uv[:, 1]  # images begin at their upper edge
