@@ -69,6 +69,8 @@ class Tool(ABC):
     """Its size for an object."""
     pad_half_m: tuple[float, float, float]
     """Half extents of what touches, along x, y, z."""
+    span_share: float
+    """Least share of the pads' length along x that an entity has to span to be pinched."""
     opening_m: float
     """Largest distance between its fingers."""
     length_m: float
@@ -77,6 +79,8 @@ class Tool(ABC):
     """How far behind the entity's nearest point it may hold, the best first; empty if it does not pinch."""
     touches: bool
     """Whether it may touch from outside."""
+    touch_open_m: float
+    """Distance between its fingers as it comes to touch and goes, at its own scale."""
     turns: tuple[float, ...]
     """Angles about z that it may hold at, radians; the first ones of half a turn if its sides are alike."""
     touch_turns: int
@@ -301,7 +305,7 @@ class _Search:
         half_x, _, half_z = (s * v for v in self._tool.pad_half_m)
         near = (np.abs(local[:, 0]) < half_x) & (np.abs(local[:, 1]) < 0.6 * s * self._tool.opening_m)
         local = local[near & (np.abs(local[:, 2]) < 0.6 * s * self._tool.opening_m)]
-        if len(local) < 4:
+        if len(local) < 4 or np.ptp(local[:, 0]) < 2 * half_x * self._tool.span_share:
             return
         top = local[:, 2].max()
         for reach in self._tool.reaches_m:
@@ -323,7 +327,7 @@ class _Search:
         pose = np.eye(4)
         pose[:3, :3] = np.stack((np.cross(finger, outward), finger, outward), axis=1)
         pose[:3, 3] = self._point + (self._scale * self._tool.pad_half_m[2] + 0.0005) * outward
-        return _Candidate(pose, 0.0, 0.0, 0.0, touches=True)
+        return _Candidate(pose, 0.0, self._tool.touch_open_m, 0.0, touches=True)
 
     def least_cost(self, candidate: _Candidate) -> float:
         """What speaks against a candidate, if nothing is in its way."""
