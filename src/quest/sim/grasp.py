@@ -101,8 +101,11 @@ class Tool(ABC):
         ``width_m`` is the distance between its fingers when it holds, ``opening_m`` the distance now.
         """
 
-    def aversion(self, world_from_gripper: Float[np.ndarray, "4 4"], entity: SimEntity) -> float:
-        """What speaks against holding an entity so, beside all that holds for every tool; 0 for no matter."""
+    def aversion(self, world_from_gripper: Float[np.ndarray, "M 4 4"], entity: SimEntity) -> float:
+        """What speaks against holding an entity so, beside all that holds for every tool; 0 for no matter.
+
+        Where the tool is at some moments tells how the entity takes it along.
+        """
         return 0.0
 
 
@@ -227,6 +230,7 @@ class _Search:
         start, body = motion[0], entity.body
         self._point = apply(start[body], entity.point)
         path = np.array([apply(pose[body], entity.point) for pose in motion])
+        self._taken = motion[:, body] @ np.linalg.inv(start[body])
         self._pull = unit(path[1:] - path[0])
         self._own = apply(start[body], samples.of(entity)) - self._point
         joint = sim_object.articulation.joints[entity.joint]
@@ -334,7 +338,7 @@ class _Search:
         outward = candidate.world_from_gripper[:3, 2]
         aligned = max(float(outward @ wanted) for wanted in self._wanted)
         cost = 1.0 * (1 - aligned) + 0.25 * (1 - outward[0]) - 0.3 * candidate.reach
-        cost += self._tool.aversion(candidate.world_from_gripper, self._entity)
+        cost += self._tool.aversion(self._taken @ candidate.world_from_gripper, self._entity)
         if not candidate.touches:
             return cost + candidate.width_m / (self._scale * self._tool.opening_m)
         return cost if self._entity.label == "front" else cost + _TOUCH_COST

@@ -7,6 +7,7 @@ object. Wrist and elbow bend as it moves.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -18,14 +19,18 @@ from quest.sim.articulation import apply
 from quest.sim.entities import SimEntity
 from quest.sim.grasp import CLEARANCE_M, Boxes, Grasp, ObjectSamples, Tool, search_grasp
 from quest.sim.hand_mesh import (
+    ELBOW_BALL_M,
     FOREARM_SECTIONS_M,
+    UPPER_ARM_SECTIONS_M,
     bone_balls,
     folds,
     nail_balls,
     palm_balls,
     rounded,
+    shoulder_ball,
     sleeve_sections,
     tube_of_sections,
+    upper_sleeve_sections,
     web_balls,
 )
 from quest.sim.hand_pose import (
@@ -34,7 +39,6 @@ from quest.sim.hand_pose import (
     GRIPS,
     HAND_M,
     TIP_RADIUS_M,
-    UPPER_ARM_M,
     Grip,
     HandBuild,
     HandPose,
@@ -59,8 +63,10 @@ _FULL_SIZE_M = 0.15
 """Objects with at least this half diagonal meet a hand of its own size, smaller ones a smaller one."""
 _SMALLEST = 0.6
 _STANDING_DRAWS = 16
-_CLEAR = 0.4
-"""How far an arm stays away from a camera, for each metre between the camera and the hand."""
+_STEP = 0.7
+"""How far the person steps up and back, for each metre that the hand comes and goes."""
+_CLEAR_RAD = np.deg2rad(35.0)
+"""Angle that is wanted between an arm and the way from the hand to a camera."""
 
 _USUAL: dict[Grip, tuple[str, ...]] = {"hook": ("handle",), "pinch": ("handle", "knob", "rim"), "touch": ("front",)}
 _UNUSUAL_COST = 0.25
@@ -68,6 +74,9 @@ _HOOK_BONUS = 0.2
 """How much better than a pinch it is to reach around a handle."""
 _WRIST_COST = 0.45
 _THUMB_COST = 0.25
+_FLOOR_COST = 1.0
+_LOWEST_M = 0.05
+"""A wrist that comes closer to the floor at scale 1 is in it."""
 
 
 @dataclass(frozen=True)
@@ -90,13 +99,12 @@ class Person:
         x, (y, z) = path[:, 0].max() + self.ahead_m, path[:, 1:].mean(axis=0)
         return np.array([x, y + self.build.side * self.aside_m, min(z + self.above_m, max(self.top_m, z))])
 
-    def clearance(self, path: Float[np.ndarray, "M 3"], eyes: Float[np.ndarray, "N 3"]) -> float:
-        """How far cameras are from the arm at the least, for each metre between them and the hand."""
-        start, end = path.mean(axis=0), self.shoulder(path)
-        line = end - start
-        share = np.clip((eyes - start) @ line / (line @ line), 0.0, 1.0)
-        apart = np.linalg.norm(eyes - start - share[:, None] * line, axis=1)
-        return float((apart / np.maximum(np.linalg.norm(eyes - start, axis=1), 1e-6)).min(initial=np.inf))
+    def clearance_rad(self, path: Float[np.ndarray, "M 3"], eyes: Float[np.ndarray, "N 3"]) -> float:
+        """Smallest angle, seen from what is pulled, between the shoulder and a camera at one of some world points."""
+        to_shoulder, to_eyes = self.shoulder(path) - path[:, None], eyes - path[:, None]
+        lengths = np.linalg.norm(to_shoulder, axis=-1) * np.linalg.norm(to_eyes, axis=-1)
+        level = np.sum(to_shoulder * to_eyes, axis=-1) / np.maximum(lengths, 1e-9)
+        return float(np.arccos(np.clip(level, -1.0, 1.0)).min(initial=np.pi))
 
 
 @dataclass(frozen=True)
@@ -113,10 +121,13 @@ class HandTool(Tool):
     ) -> Boxes:
         """Cubes along its bones, in its palm and in the forearm, each smaller by ``shrink_m`` on all sides."""
         balls = hand_balls(self.build, self.pose(width_m, opening_m))
-        _, wrist, elbow = self._arm(world_from_gripper, width_m)
+        palm = self.pose(width_m, width_m).hand_from_palm
+        world = world_from_gripper @ palm
+        towards = elbow_direction(world[:, :3, 3], world[:, :3, 2], self.shoulder[None], self.build)
+        elbow = towards[0] @ world_from_gripper[:3, :3]
         along = np.array([0.06, 0.12, 0.18])
         radii = np.interp(along, FOREARM_SECTIONS_M[:, 0], FOREARM_SECTIONS_M[:, 2])
-        arm = np.column_stack((wrist + self.build.scale * along[:, None] * elbow, self.build.scale * radii))
+        arm = np.column_stack((palm[0, :3, 3] + self.build.scale * along[:, None] * elbow, self.build.scale * radii))
         balls = np.concatenate((balls, arm))
         half = 0.75 * balls[:, 3:] - shrink_m
         return Boxes(balls[:, :3] - half, balls[:, :3] + half)
@@ -125,26 +136,25 @@ class HandTool(Tool):
         """Its bones at a single moment."""
         return pose_hand(self.build, hand_targets(self.build, self.grip, width_m, np.array([opening_m])))
 
-    def aversion(self, world_from_gripper: Float[np.ndarray, "4 4"], entity: SimEntity) -> float:
-        """What a bent wrist, a thumb that points away from the head and an odd grip cost."""
-        straight, wrist, _ = self._arm(world_from_gripper, 0.02)
-        away = apply(np.linalg.inv(world_from_gripper), self.shoulder) - wrist
-        bent = 1 - float(straight @ away) / max(float(np.linalg.norm(away)), 1e-6)
-        thumb = -self.build.side * world_from_gripper[:3, 0]
-        natural = np.array([0.2, -0.6 * self.build.side, 0.75])
-        cost = _WRIST_COST * bent + _THUMB_COST * (1 - float(thumb @ natural) / float(np.linalg.norm(natural)))
+    def aversion(self, world_from_gripper: Float[np.ndarray, "M 4 4"], entity: SimEntity) -> float:
+        """What a bent wrist, a thumb that points away from the head, the floor and an odd grip cost."""
+        palm = world_from_gripper @ self._usual_palm
+        wrist, straight = palm[:, :3, 3], palm[:, :3, 2]
+        away = self.shoulder - wrist
+        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
+        thumb = -self.build.side * world_from_gripper[:, :3, 0]
+        natural = np.array([0.2, -0.6 * self.build.side, 0.75]) / np.linalg.norm([0.2, 0.6, 0.75])
+        cost = _WRIST_COST * float(np.mean(1 - np.sum(straight * away, axis=1)))
+        cost += _THUMB_COST * float(np.mean(1 - thumb @ natural))
+        cost += _FLOOR_COST * float(np.mean(wrist[:, 2] < _LOWEST_M * self.build.scale))
         if entity.label not in _USUAL[self.grip]:
             return cost + _UNUSUAL_COST
         return cost - _HOOK_BONUS * (self.grip == "hook")
 
-    def _arm(
-        self, world_from_gripper: Float[np.ndarray, "4 4"], width_m: float
-    ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-        """Direction of a straight wrist, place of the wrist and direction of the elbow, in the hand's frame."""
-        palm = self.pose(width_m, width_m).hand_from_palm
-        world = world_from_gripper @ palm
-        elbow = elbow_direction(world[:, :3, 3], world[:, :3, 2], self.shoulder[None], self.build)
-        return palm[0, :3, 2], palm[0, :3, 3], elbow[0] @ world_from_gripper[:3, :3]
+    @cached_property
+    def _usual_palm(self) -> Float[np.ndarray, "4 4"]:
+        """Pose of the palm when it holds something of usual width."""
+        return self.pose(0.02, 0.02).hand_from_palm[0]
 
 
 def hand_balls(build: HandBuild, pose: HandPose) -> Float[np.ndarray, "N 4"]:
@@ -279,8 +289,8 @@ def hand_tool(grip: Grip, build: HandBuild, shoulder: Float[np.ndarray, "3"]) ->
         turns=tuple(2 * np.pi * np.arange(16) / 16),
         touch_turns=16,
         sides_alike=False,
-        exits=((1, build.side), (2, 1)),
-        exit_back=0.7,
+        exits=((1, build.side), (1, -build.side)),
+        exit_back=0.5,
         build=build,
         grip=grip,
         shoulder=shoulder,
@@ -341,9 +351,6 @@ def plan_hand(
     )
     person = _standing(sim_object, script, moved_joints, build, eyes, rng)
 
-    def find(sim_object: SimObject, entity: SimEntity, samples: ObjectSamples, motion: np.ndarray) -> Any:
-        return find_hand_grasp(person, sim_object, entity, samples, motion)
-
     pull = plan_pull(
         sim_object,
         script,
@@ -352,11 +359,9 @@ def plan_hand(
         frames_per_joint=frames_per_joint,
         rng=rng,
         noun="hand",
-        find=find,
+        find=partial(find_hand_grasp, person),
     )
-    tools = [g.tool for g in pull.grasps]
-    assert all(isinstance(tool, HandTool) for tool in tools)
-    grips: tuple[Grip, ...] = tuple(tool.grip for tool in tools if isinstance(tool, HandTool))
+    grips: tuple[Grip, ...] = tuple(_tool(grasp).grip for grasp in pull.grasps)
     return Hand(_parts(build, look, pull, rng), pull.held, grips, build)
 
 
@@ -374,13 +379,13 @@ def _standing(
     paths = [_path(poses, e) for e in moved]
     best: tuple[float, Person] | None = None
     for _ in range(_STANDING_DRAWS):
-        ahead, aside = float(rng.uniform(0.28, 0.45)), float(rng.uniform(-0.15, 0.4))
+        ahead, aside = float(rng.uniform(0.28, 0.45)), float(rng.uniform(-0.2, 0.45))
         above, top = float(rng.uniform(0.2, 0.5)), float(rng.uniform(1.2, 1.5))
         person = Person(build, build.scale * ahead, build.scale * aside, build.scale * above, top)
-        clear = min((person.clearance(path, eyes) for path in paths), default=np.inf)
+        clear = min((person.clearance_rad(path, eyes) for path in paths), default=np.pi)
         if best is None or clear > best[0]:
             best = (clear, person)
-        if clear >= _CLEAR:
+        if clear >= _CLEAR_RAD:
             break
     assert best is not None
     return best[1]
@@ -392,21 +397,31 @@ def _path(poses: Float[np.ndarray, "M B 4 4"], entity: SimEntity) -> Float[np.nd
 
 def _parts(build: HandBuild, look: HandLook, pull: Pull, rng: np.random.Generator) -> tuple[MeshPart, ...]:
     """Everything that is seen of a hand that goes its way."""
-    tools = [grasp.tool for grasp in pull.grasps]
-    targets, shoulder = None, np.zeros((len(pull.turn), 3))
-    for n, (tool, grasp) in enumerate(zip(tools, pull.grasps, strict=True)):
-        assert isinstance(tool, HandTool)
-        own = hand_targets(build, tool.grip, grasp.width_m, pull.opening_m)
-        share = np.clip(pull.turn - (n - 1), 0.0, 1.0)
-        targets = own if targets is None else targets.mixed(own, share)
-        shoulder = tool.shoulder if n == 0 else shoulder + share[:, None] * (tool.shoulder - shoulder)
-    assert targets is not None
+    first, *later = pull.grasps
+    targets = hand_targets(build, _tool(first).grip, first.width_m, pull.opening_m)
+    shoulder = np.tile(_tool(first).shoulder, (len(pull.turn), 1))
+    for n, grasp in enumerate(later):
+        share = np.clip(pull.turn - n, 0.0, 1.0)
+        targets = targets.mixed(hand_targets(build, _tool(grasp).grip, grasp.width_m, pull.opening_m), share)
+        shoulder += share[:, None] * (_tool(grasp).shoulder - shoulder)
     pose = pose_hand(build, targets)
-    shoulder = np.broadcast_to(shoulder, (len(pull.turn), 3))
     return (
         *_hand_parts(build, look, pose, pull.world_from_gripper),
-        *_arm_parts(build, look, pull.world_from_gripper @ pose.hand_from_palm, shoulder, rng),
+        *_arm_parts(build, look, pull.world_from_gripper @ pose.hand_from_palm, shoulder + _STEP * _steps(pull), rng),
     )
+
+
+def _tool(grasp: Grasp) -> HandTool:
+    assert isinstance(grasp.tool, HandTool)
+    return grasp.tool
+
+
+def _steps(pull: Pull) -> Float[np.ndarray, "S 3"]:
+    """Ways over the floor that the hand has to go until it holds something for the first time, and since the last."""
+    hand, (first, last) = pull.world_from_gripper[:, :3, 3], (pull.held[0][1], pull.held[-1][2] - 1)
+    steps = np.zeros_like(hand)
+    steps[:first], steps[last:] = hand[:first] - hand[first], hand[last:] - hand[last]
+    return steps * [1.0, 1.0, 0.0]
 
 
 def _hand_parts(
@@ -437,31 +452,20 @@ def _arm_parts(
     shoulder: Float[np.ndarray, "S 3"],
     rng: np.random.Generator,
 ) -> list[MeshPart]:
-    wrist = world_from_palm[:, :3, 3]
+    wrist, across = world_from_palm[:, :3, 3], world_from_palm[:, :3, 0]
     towards = elbow_direction(wrist, world_from_palm[:, :3, 2], shoulder, build)
     elbow = wrist + build.scale * FOREARM_M * towards
-    lower = _frames(wrist, towards, across=world_from_palm[:, :3, 0])
-    upper = _frames(elbow, shoulder - elbow, across=world_from_palm[:, :3, 0])
-    parts = [MeshPart(_sized(tube_of_sections(FOREARM_SECTIONS_M), build), look.skin, lower)]
-    joint = rounded(np.array([[0.0, 0.0, 0.0, 0.0400]]))
-    parts.append(MeshPart(_sized(joint, build), look.skin, upper))
-    biceps = np.column_stack((np.linspace(0, UPPER_ARM_M, 12), *[0.040 + 0.014 * np.sin(np.linspace(0, 2.2, 12))] * 2))
-    parts.append(MeshPart(_sized(tube_of_sections(biceps), build), look.skin, upper))
-    depth = look.folds_m
+    lower, upper = _frames(wrist, towards, across=across), _frames(elbow, shoulder - elbow, across=across)
+    pieces = [(tube_of_sections(FOREARM_SECTIONS_M), look.skin, lower)]
+    pieces += [(mesh, look.skin, upper) for mesh in (rounded(ELBOW_BALL_M), tube_of_sections(UPPER_ARM_SECTIONS_M))]
     if look.sleeve_start_m < FOREARM_M:
         sections = sleeve_sections(look.sleeve_start_m, FOREARM_M, look.loose_m, cuff_m=look.cuff_m)
-        mesh = tube_of_sections(sections, folds(len(sections), depth, rng))
-        parts.append(MeshPart(_sized(mesh, build), look.sleeve, lower))
-        ball = rounded(np.array([[0.0, 0.0, 0.0, 0.0405 + 0.5 * look.loose_m]]))
-        parts.append(MeshPart(_sized(ball, build), look.sleeve, upper))
-    start = max(0.0, look.sleeve_start_m - FOREARM_M)
-    z = np.linspace(start, UPPER_ARM_M + 0.02, 40)
-    wide = 0.0405 + 0.5 * look.loose_m + 0.018 * np.sin(np.clip(z / UPPER_ARM_M, 0, 1) * 1.6)
-    if start > 0:
-        wide = wide + 0.5 * look.loose_m + 0.006
-    mesh = tube_of_sections(np.column_stack((z, wide, wide)), folds(len(z), depth, rng))
-    parts.append(MeshPart(_sized(mesh, build), look.sleeve, upper))
-    return parts
+        pieces.append((tube_of_sections(sections, folds(len(sections), look.folds_m, rng)), look.sleeve, lower))
+        pieces.append((rounded(ELBOW_BALL_M + np.array([0.0, 0.0, 0.0, 0.5 * look.loose_m])), look.sleeve, upper))
+    sections = upper_sleeve_sections(max(0.0, look.sleeve_start_m - FOREARM_M), look.loose_m)
+    pieces.append((tube_of_sections(sections, folds(len(sections), look.folds_m, rng)), look.sleeve, upper))
+    pieces.append((rounded(shoulder_ball(sections)), look.sleeve, upper))
+    return [MeshPart(_sized(mesh, build), surface, frames) for mesh, surface, frames in pieces]
 
 
 def _frames(

@@ -9,9 +9,10 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
+from quest.sim.hand_pose import UPPER_ARM_M
 from quest.sim.procedural.model import Mesh
+from quest.sim.surfaces import TILE_M
 
-TILE_M = 0.5
 _SIDES = 28
 
 Balls = Float[np.ndarray, "N 4"]
@@ -145,6 +146,13 @@ FOREARM_SECTIONS_M = np.array(
 """Of a bare forearm at scale 1: along z from the wrist to the elbow, half axes across and along the back of the
 hand."""
 
+ELBOW_BALL_M = np.array([[0.0, 0.0, 0.0, 0.0400]])
+"""The elbow at scale 1."""
+UPPER_ARM_SECTIONS_M = np.column_stack(
+    (np.linspace(0, UPPER_ARM_M, 12), *[0.040 + 0.014 * np.sin(np.linspace(0, 2.2, 12))] * 2)
+)
+"""Of a bare upper arm at scale 1, along z from the elbow to the shoulder."""
+
 
 def sleeve_sections(start_m: float, end_m: float, loose_m: float, *, cuff_m: float = 0.0) -> Float[np.ndarray, "N 3"]:
     """Of a sleeve around the forearm from ``start_m`` behind the wrist, ``loose_m`` wider than the arm."""
@@ -154,6 +162,19 @@ def sleeve_sections(start_m: float, end_m: float, loose_m: float, *, cuff_m: flo
     # Cloth does not follow the arm: rounder than it, and tightest at the elbow.
     size = arm + (loose * (1 - 0.5 * (z - start_m) / max(end_m - start_m, 1e-6)))[:, None]
     return np.column_stack((z, size[:, 0], np.maximum(size[:, 1], 0.85 * size[:, 0])))
+
+
+def upper_sleeve_sections(start_m: float, loose_m: float) -> Float[np.ndarray, "N 3"]:
+    """Of a sleeve around the upper arm, from ``start_m`` behind the elbow to the shoulder."""
+    z = np.linspace(start_m, UPPER_ARM_M + 0.02, 40)
+    arm = ELBOW_BALL_M[0, 3] + 0.018 * np.sin(np.clip(z / UPPER_ARM_M, 0, 1) * 1.6)
+    wide = arm + (0.5 * loose_m if start_m == 0 else loose_m + 0.006)
+    return np.column_stack((z, wide, wide))
+
+
+def shoulder_ball(sections: Float[np.ndarray, "N 3"]) -> Balls:
+    """What closes a sleeve at the shoulder."""
+    return np.array([[0.0, 0.0, sections[-1, 0] - 0.01, sections[-1, 1] + 0.004]])
 
 
 def folds(count: int, depth_m: float, rng: np.random.Generator) -> Float[np.ndarray, "N S"]:

@@ -61,6 +61,8 @@ _END_SHARE = np.array([0.9, 0.65, 0.65, 0.65, 0.65])
 """How much the last joint bends for the middle one."""
 _BENDS = np.deg2rad(np.linspace(0.0, 118.0, 60))
 _WRIST_RAD = np.deg2rad(62.0)
+_ELBOW_M = 0.06
+"""Half the thickness of the elbow, and a little."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +127,7 @@ def hand_targets(build: HandBuild, grip: Grip, width_m: float, opening_m: Float[
     if grip == "hook":
         knuckles = _rows(zero, half + radius + 0.008, 0.031 + 0.004 * opened)
         over = opened * (half + radius + 0.001) + (1 - opened) * (width / 2 - 0.008)
-        fingers = [_rows(zero + x, over, z) for x, z in ((-0.027, -0.014), (-0.009, -0.015), (0.009, -0.014))]
+        fingers = [_rows(zero + x, over, zero + z) for x, z in ((-0.027, -0.014), (-0.009, -0.015), (0.009, -0.014))]
         tips = [
             _rows(-0.014 - 0.010 * opened, -half - 1.2 * radius - 0.016 * opened, zero + 0.004),
             *fingers,
@@ -145,7 +147,7 @@ def hand_targets(build: HandBuild, grip: Grip, width_m: float, opening_m: Float[
         knuckles = _rows(zero, 0.034 + 0.2 * half, zero + 0.064)
         spread = 0.8 + 4 * half
         tips = [
-            _rows(-0.034 - half, -0.016 - half, zero + 0.030),
+            _rows(-0.042 - half, 0.002 - half, zero + 0.042),
             _rows(-0.026 * spread, zero, zero),
             _rows(-0.009 * spread, zero, zero),
             _rows(0.010 * spread, zero, zero + 0.001),
@@ -189,7 +191,7 @@ def _bend(
         steps = np.stack((first + 0j * bend, second * np.exp(-1j * bend), third * np.exp(-1j * ends * bend)), axis=1)
         way = np.cumsum(steps, axis=1)
         way = way * np.exp(-1j * np.angle(way[:, -1:]))
-        flat[:, f, 1:] = np.stack((way.real, way.imag), axis=-1)
+        flat[:, f, 1:] = np.stack((np.real(way), np.imag(way)), axis=-1)
     joints = roots[:, :, None] + flat[..., :1] * along[:, :, None] + flat[..., 1:] * up[:, :, None]
     return joints, np.cross(along, up)
 
@@ -200,9 +202,10 @@ def elbow_direction(
     shoulder: Float[np.ndarray, "S 3"],
     build: HandBuild,
 ) -> Float[np.ndarray, "S 3"]:
-    """Unit directions from the wrist to the elbow, in the world.
+    """Unit directions from the wrist to the elbow, in the world, whose floor is z = 0.
 
-    The arm bends in the elbow, downwards and outwards, and in the wrist by 62 degrees at most.
+    The arm bends in the elbow, downwards and outwards, and in the wrist by 62 degrees at most, unless the elbow would
+    meet the floor.
 
     Args:
         wrist: where the wrist is.
@@ -224,7 +227,9 @@ def elbow_direction(
     angle = np.minimum(np.arccos(level), _WRIST_RAD)
     side = wanted - level * straight
     side /= np.maximum(np.linalg.norm(side, axis=1, keepdims=True), 1e-6)
-    return np.cos(angle) * straight + np.sin(angle) * side
+    found = np.cos(angle) * straight + np.sin(angle) * side
+    found[:, 2] = np.maximum(found[:, 2], np.minimum((_ELBOW_M * build.scale - wrist[:, 2]) / near, 0.9))
+    return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
 def _rows(*columns: Float[np.ndarray, " S"]) -> Float[np.ndarray, "S 3"]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -30,6 +30,7 @@ _STRAYS = 0.03
 """Share of its travel by which a joint may move while nothing holds it (an engine lags behind its script)."""
 
 
+@runtime_checkable
 class MovingPart(Protocol):
     """A part of what pulls; it is put into a scene and placed as a prop is."""
 
