@@ -15,7 +15,7 @@ from quest.sim.surfaces import TILE_M
 
 _SIDES = 28
 
-Balls = Float[np.ndarray, "N 4"]
+Balls = Float[np.ndarray, "K 4"]
 """Balls, a row each: centre and radius, metres."""
 
 _RADII_M = np.array(
