@@ -94,6 +94,11 @@ class Person:
     top_m: float
     """Its height above the ground at most, when the person stands upright."""
 
+    @property
+    def leaves_to(self) -> int:
+        """Sign of the side of the object, along y, that the shoulder is on: there the hand comes from and goes to."""
+        return self.build.side if self.aside_m >= 0 else -self.build.side
+
     def shoulder(self, path: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "3"]:
         """Where it is in the world while an entity takes a path."""
         x, (y, z) = path[:, 0].max() + self.ahead_m, path[:, 1:].mean(axis=0)
@@ -269,8 +274,9 @@ def hand_scale(half_diagonal_m: float, length_m: float = HAND_M) -> float:
     return length_m / HAND_M * float(np.clip(half_diagonal_m / _FULL_SIZE_M, _SMALLEST, 1.0))
 
 
-def hand_tool(grip: Grip, build: HandBuild, shoulder: Float[np.ndarray, "3"]) -> HandTool:
-    """A hand in a grip, with its shoulder somewhere in the world."""
+def hand_tool(grip: Grip, person: Person, shoulder: Float[np.ndarray, "3"]) -> HandTool:
+    """A person's hand in a grip, with the shoulder somewhere in the world."""
+    build = person.build
     half_x, span, opening, reaches = {
         "hook": (0.036, 0.85, 0.058, (0.009, 0.014)),
         "pinch": (0.012, 0.0, 0.075, (0.011, 0.006, 0.002)),
@@ -289,7 +295,7 @@ def hand_tool(grip: Grip, build: HandBuild, shoulder: Float[np.ndarray, "3"]) ->
         turns=tuple(2 * np.pi * np.arange(16) / 16),
         touch_turns=16,
         sides_alike=False,
-        exits=((1, build.side), (1, -build.side)),
+        exits=((1, person.leaves_to),),
         exit_back=0.5,
         build=build,
         grip=grip,
@@ -313,7 +319,7 @@ def find_hand_grasp(
     found: list[tuple[float, int, Grasp]] = []
     problem: ObjectError | None = None
     for n, grip in enumerate(GRIPS):
-        tool = hand_tool(grip, person.build, shoulder)
+        tool = hand_tool(grip, person, shoulder)
         try:
             grasp, cost = search_grasp(tool, sim_object, entity, samples, motion)
         except ObjectError as error:
