@@ -131,6 +131,15 @@ def test_it_stays_out_of_the_object_and_above_the_floor(chest: SimObject, seed: 
         assert min(apply(part.world_from_shape[t], part.mesh.vertices)[:, 2].min() for part in hand.parts) > -0.01
 
 
+def test_nothing_jumps_on_the_way_from_one_handle_to_the_next() -> None:
+    cabinet = make_object("cabinet", 3)
+    hand, _ = plan(cabinet, *cabinet.movable[:2], seed=1)
+    for part in hand.parts:
+        turns = np.einsum("tij,tij->t", part.world_from_shape[1:, :3, :3], part.world_from_shape[:-1, :3, :3])
+        assert turns.min() > 1 + 2 * np.cos(np.deg2rad(60))
+        assert np.linalg.norm(np.diff(part.world_from_shape[:, :3, 3], axis=0), axis=1).max() < 0.3
+
+
 def test_grips_by_label(tmp_path: Path) -> None:
     bar = replace(HANDLE, size=(0.012, 0.2, 0.012), centre=(0.265, 0, 0))
     long = load_object(write_object(tmp_path / "bar", CARCASS, replace(DRAWER, boxes=(DRAWER.boxes[0], bar))))

@@ -461,7 +461,11 @@ def _arm_parts(
     wrist, across = world_from_palm[:, :3, 3], world_from_palm[:, :3, 0]
     towards = elbow_direction(wrist, world_from_palm[:, :3, 2], shoulder, build)
     elbow = wrist + build.scale * FOREARM_M * towards
-    lower, upper = _frames(wrist, towards, across=across), _frames(elbow, shoulder - elbow, across=across)
+    lower = _frames(wrist, towards, across=across)
+    # The upper arm does not turn about itself: from the forearm's frame by the shortest way.
+    onwards = (shoulder - elbow) / np.maximum(np.linalg.norm(shoulder - elbow, axis=1, keepdims=True), 1e-9)
+    level = np.sum(lower[:, :3, 0] * onwards, axis=1) / np.maximum(1 + np.sum(towards * onwards, axis=1), 1e-6)
+    upper = _frames(elbow, onwards, across=lower[:, :3, 0] - level[:, None] * (towards + onwards))
     pieces = [(tube_of_sections(FOREARM_SECTIONS_M), look.skin, lower)]
     pieces += [(mesh, look.skin, upper) for mesh in (rounded(ELBOW_BALL_M), tube_of_sections(UPPER_ARM_SECTIONS_M))]
     if look.sleeve_start_m < FOREARM_M:
