@@ -29,8 +29,8 @@ else:
 
 _LEAST_S = 5.0
 """Less says nothing of the speed: takes are written while the next ones are rendered, so two may end together."""
-FRAMES_WITH_GRIPPER = 90
-"""Frames that each joint gets if a gripper has to come and go."""
+FRAMES_WITH_PULLER = 90
+"""Frames that each joint gets if a gripper or a hand has to come and go."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,8 @@ class Generate:
     mix: Literal["usual", "broad"] = "usual"
     """Kinds of procedural objects, and materials of all: the usual furniture and appliances, or everything there is."""
     suite: (
-        Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "kitchen", "long", "published"] | None
+        Literal["occlusion", "lockers", "noise", "shift", "moving", "gripper", "hands", "kitchen", "long", "published"]
+        | None
     ) = None
     """Takes that are hard in one way: a named preset of the options below. docs/simulator.md describes each."""
     variant: tuple[str, ...] = ()
@@ -76,7 +77,7 @@ class Generate:
     size: tuple[int, ...] = ()
     """Width and height of the images, pixels, or one number for square ones; default: 224."""
     frames_per_joint: int | None = None
-    """Frames of the motion script that each joint gets; default: 60, with a gripper 90."""
+    """Frames of the motion script that each joint gets; default: 60, with a gripper or a hand 90."""
     frames: int | None = None
     """Frames in which the joints open and close again and again; default: each once, in suite long 10000."""
     camera: CameraMotion | None = None
@@ -95,6 +96,8 @@ class Generate:
     """Drive the joints through a physics engine: friction, damping, inertia."""
     gripper: bool = False
     """A gripper comes and pulls the parts that move."""
+    hand: bool = False
+    """A person's hand comes and pulls the parts that move."""
     room: bool = False
     """Put the object into a room, among other furniture."""
     randomize_materials: bool = True
@@ -192,12 +195,13 @@ class Generate:
             given["motion"] = dataclasses.replace(preset.motion, kind=kind, overlap=overlap)
         if self.sensor is not None:
             given["sensor"] = SENSORS[self.sensor]
-        if self.gripper and not preset.gripper and self.frames_per_joint is None:
-            given["frames_per_joint"] = FRAMES_WITH_GRIPPER
+        if (self.gripper or self.hand) and not preset.pulled and self.frames_per_joint is None:
+            given["frames_per_joint"] = FRAMES_WITH_PULLER
         return dataclasses.replace(
             preset,
             physics=preset.physics or self.physics,
             gripper=preset.gripper or self.gripper,
+            hand=preset.hand or self.hand,
             room=preset.room or self.room,
             randomize_materials=preset.randomize_materials and self.randomize_materials,
             stretch=self.stretch,

@@ -166,7 +166,7 @@ def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     for what in ("cameras", "motion", "sensor"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = asdict(getattr(settings, what))
-    for what in ("physics", "gripper", "disturbance", "broad_materials", "fixed_scene", "room"):
+    for what in ("physics", "gripper", "hand", "disturbance", "broad_materials", "fixed_scene", "room"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = getattr(settings, what)
     variant = {"variant": suite.variant} if suite is not None and suite.variant else {}

@@ -43,6 +43,8 @@ class TakeSettings:
     """Whether joints are driven through a physics engine along their script, or play it as it is."""
     gripper: bool = False
     """Whether a gripper pulls what moves."""
+    hand: bool = False
+    """Whether a person's hand does."""
     sensor: SensorModel = SensorModel()
     """What the sensor makes of colours and depth; the ground truth knows nothing of it."""
     disturbance: Disturbance = "none"
@@ -64,9 +66,12 @@ class TakeSettings:
             raise ConfigError(
                 f"take: expected more frames than one joint's share ({self.frames_per_joint}), got {self.frames}"
             )
-        if self.gripper and (self.frames is not None or self.motion.overlap > 0 or self.motion.cycles > 1):
+        if self.gripper and self.hand:
+            raise ConfigError("take: expected a gripper or a hand that pulls, got both; leave one away")
+        if self.pulled and (self.frames is not None or self.motion.overlap > 0 or self.motion.cycles > 1):
+            puller = "gripper" if self.gripper else "hand"
             raise ConfigError(
-                "take: a gripper pulls one joint after the other, each once; leave overlap, cycles and frames away"
+                f"take: a {puller} pulls one joint after the other, each once; leave overlap, cycles and frames away"
             )
         if self.fixed_scene and self.stretch != 1:
             raise ConfigError("take: in a fixed scene only the motion is of the take; leave stretch away")
@@ -76,6 +81,11 @@ class TakeSettings:
             raise ConfigError(
                 f"take: unknown disturbance {self.disturbance!r}; expected one of {', '.join(DISTURBANCES)}"
             )
+
+    @property
+    def pulled(self) -> bool:
+        """Whether something that is seen pulls what moves."""
+        return self.gripper or self.hand
 
     @property
     def width(self) -> int:

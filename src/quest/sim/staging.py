@@ -15,15 +15,17 @@ from quest.sim.annotate import project_points, visible_entities
 from quest.sim.articulation import apply
 from quest.sim.cameras import CameraPath, PosedCamera, bump, sample_camera_paths
 from quest.sim.gripper import plan_gripper
+from quest.sim.hand import plan_hand
 from quest.sim.motion import FRAMES_PER_S, MotionStyle, long_script, motion_script
 from quest.sim.objects import SimObject
 from quest.sim.physics import play_physically
 from quest.sim.props import Prop, change_light, disturbed_at
+from quest.sim.pull import Puller
 from quest.sim.renderer import Picture, Renderer, Stage
 from quest.sim.settings import TakeSettings
 
-GRIPPER_MARGIN = (20, 12)
-"""Frames of a joint's share in which a gripper comes, and goes."""
+PULL_MARGIN = (20, 12)
+"""Frames of a joint's share in which a gripper or a hand comes, and goes."""
 
 _CAMERA_ATTEMPTS = 12
 
@@ -82,11 +84,11 @@ def stage_plain(
     renderer: Renderer,
     settings: TakeSettings,
 ) -> Staging:
-    """A take in which nothing is hidden on purpose: the object, and a gripper or a disturbance if the settings say so.
+    """A take in which nothing is hidden on purpose: the object, and what pulls or disturbs if the settings say so.
 
     Raises:
-        ObjectError: the object has fewer than ``level`` joints that carry an entity that moves, or a gripper finds
-            nothing to grasp.
+        ObjectError: the object has fewer than ``level`` joints that carry an entity that moves, or a gripper or
+            a hand finds nothing to grasp.
     """
     joints = choose_joints(sim_object, level, motion_rng)
     script = _script(sim_object, joints, motion_rng, settings)
@@ -96,17 +98,10 @@ def stage_plain(
     cameras, stage = _cameras(sim_object, playback, len(script), camera_rng, renderer, settings)
     props: list[Prop] = []
     about: dict[str, Any] = {}
-    if settings.gripper:
-        gripper = plan_gripper(
-            sim_object,
-            script,
-            joints,
-            margin=_motion_style(settings).margin,
-            frames_per_joint=settings.frames_per_joint,
-            rng=props_rng,
-        )
-        props.append(gripper)
-        about["grasped"] = [[name, *played_frames(playback.kept, first, end)] for name, first, end in gripper.grasps]
+    puller = _puller(sim_object, script, joints, cameras, props_rng, settings)
+    if puller is not None:
+        props.append(puller)
+        about["grasped"] = [[name, *played_frames(playback.kept, first, end)] for name, first, end in puller.grasps]
     if settings.disturbance == "light":
         props.append(change_light(len(script), props_rng))
     if settings.disturbance == "bump":
@@ -116,9 +111,27 @@ def stage_plain(
     return Staging(joints, playback, cameras, stage, tuple(props), about)
 
 
+def _puller(
+    sim_object: SimObject,
+    script: Float[np.ndarray, "S J"],
+    joints: tuple[int, ...],
+    cameras: tuple[CameraPath, ...],
+    rng: np.random.Generator,
+    settings: TakeSettings,
+) -> Puller | None:
+    """The gripper or the hand that pulls, if the settings say so."""
+    timing = {"margin": _motion_style(settings).margin, "frames_per_joint": settings.frames_per_joint}
+    if settings.gripper:
+        return plan_gripper(sim_object, script, joints, **timing, rng=rng)
+    if settings.hand:
+        seen_from = np.concatenate([np.linalg.inv(path.cam_from_world[::8])[:, :3, 3] for path in cameras])
+        return plan_hand(sim_object, script, joints, **timing, eyes=seen_from, rng=rng)
+    return None
+
+
 def _motion_style(settings: TakeSettings) -> MotionStyle:
     wanted = settings.motion
-    return replace(wanted, margin=GRIPPER_MARGIN) if settings.gripper and wanted.margin == (0, 0) else wanted
+    return replace(wanted, margin=PULL_MARGIN) if settings.pulled and wanted.margin == (0, 0) else wanted
 
 
 def _script(

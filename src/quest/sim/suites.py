@@ -41,7 +41,7 @@ class Hiding:
             )
         if settings.cameras.motion != "static" or settings.disturbance == "bump":
             raise ConfigError("hidden entities: expected a camera that stands still, an occluder hides from one place")
-        if settings.motion != MotionStyle() or settings.frames or settings.physics or settings.gripper:
+        if settings.motion != MotionStyle() or settings.frames or settings.physics or settings.pulled:
             raise ConfigError("hidden entities: joints move by a script of their own; leave other motions away")
 
 
@@ -129,6 +129,7 @@ SUITES: dict[str, tuple[Suite, ...]] = {
         if motion != "static"
     ),
     "gripper": (Suite("gripper", settings=_with(gripper=True, frames_per_joint=90)),),
+    "hands": (Suite("hands", settings=_with(hand=True, frames_per_joint=90, cameras=CameraStyle(motion="handheld"))),),
     "kitchen": (Suite("kitchen", settings=_with(room=True, size=(640, 480), cameras=_IN_A_ROOM)),),
     "long": (Suite("long", settings=_with(frames=10_000), level=2),),
     "published": (Suite("published", settings=_with(views=3, randomize_materials=False, fixed_scene=True)),),
@@ -141,6 +142,7 @@ SUITES: dict[str, tuple[Suite, ...]] = {
 - ``shift``: light that changes, odd materials, blur, JPEG, a bumped camera, a camera high above or far to the side;
 - ``moving``: a camera that orbits, is held by hand, or sits on a robot's head;
 - ``gripper``: a gripper comes, pulls, and goes;
+- ``hands``: a person's hand does, seen by a camera that is held by hand;
 - ``kitchen``: the object in a row of other furniture, with things on top and cupboards above, before a hand-held
   camera that is near or far;
 - ``long``: 10,000 frames in which two joints open and close again and again;
