@@ -38,6 +38,8 @@ _FORMAT = 1
 _PARTIAL = ".partial"
 _MOST_PIXELS = 8192**2
 _GRIP_GAP_M = 0.01
+_MOST_PIECES = 1000
+"""Of handles of a link, beyond which they are not told apart."""
 _MATERIALS = "materials.mtl"
 _TRAY_RGBA = "0.72 0.62 0.48 1"
 _TRAY_WALL_M = 0.012
@@ -119,7 +121,8 @@ def _import_model(library: Library, model: Model, out: Path, names: dict[str | N
     note = notes().get(model.path, Note())
     if note.skip:
         return Imported(model.path, None, False, False, (f"{model.path}: left out, {note.skip}",))
-    told = [*library.sums(model.path), repr(model), json.dumps(asdict(note)), str(_FORMAT)]
+    entry = asdict(model) | {"upright": model.upright.tolist()}
+    told = [*library.sums(model.path), json.dumps([entry, asdict(note), _FORMAT])]
     digest = hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
     known = names.get(model.path)
     if known is not None:
@@ -161,7 +164,8 @@ def _ends(path: str) -> tuple[str, str]:
 
 
 def _category(model: Model) -> str:
-    return next((word for key, word in _WORD_OF_CATEGORY.items() if key in model.name.lower()), "StorageFurniture")
+    known = (word for key, word in _WORD_OF_CATEGORY.items() if key in model.name.lower())
+    return next(known, "".join(re.findall("[A-Za-z]+", model.name.title())) or "Unknown")
 
 
 def _standing(shape: Wavefront, model: Model, note: Note) -> Wavefront:
@@ -187,7 +191,7 @@ def _write_materials(
     """Writes the materials and their pictures; returns the names that the materials got."""
     said: dict[str, dict[str, str]] = {}
     for name in shape.libraries:
-        found = library.beside(model.path, name)
+        found = library.beside(model.path, name) or library.beside(model.path, f"{Path(model.path).stem}.mtl")
         if found is None:
             warnings.append(f"material file {name[:80]!r} is missing")
         else:
@@ -220,7 +224,8 @@ def _numbers(text: str, usual: str) -> str:
 def _write_picture(
     library: Library, model: Model, name: str, folder: Path, number: int, warnings: list[str]
 ) -> str | None:
-    found = library.beside(model.path, name) or library.beside(model.path, re.split(r"[/\\]", name)[-1])
+    tried = (name, re.split(r"[/\\]", name)[-1], name.split()[-1])  # with a path of the author's machine, or options
+    found = next((found for each in tried if (found := library.beside(model.path, each))), None)
     if found is None:
         warnings.append(f"picture {name[:80]!r} is missing")
         return None
@@ -308,6 +313,9 @@ def _parts(
 def _apart(shape: Wavefront, faces: Bool[np.ndarray, " F"]) -> Iterator[Bool[np.ndarray, " F"]]:
     """Faces whose connected pieces come near each other, together."""
     piece, bounds = shape.pieces
+    if len(np.unique(piece[faces])) > _MOST_PIECES:
+        yield faces
+        return
     clusters: list[tuple[list[int], np.ndarray]] = []
     for each in np.unique(piece[faces]):
         members, box = [int(each)], bounds[each]

@@ -25,15 +25,15 @@ from quest.untrusted import build, read_json
 NOTES = Path(__file__).parents[2] / "assets" / "objects" / "sweethome3d.json"
 
 _TAG = re.compile(r"sweethome3d_(opening_on_|window_pane_on_|window_mirror_on_|unique_|)(hinge|rail)(?:_(\d+))?")
-_GRIP = {
+_WORDS = {
     "handle": re.compile(r"handle(?!r)|maneta|poignee|latch|tirador|lever", re.IGNORECASE),
     "knob": re.compile(r"knob|pomo\b", re.IGNORECASE),
-    "glass": re.compile(r"glass|window_pane|vidrio|cristal", re.IGNORECASE),
+    "glass": re.compile(r"glass|pane(?![ls])|vidr|pyrex", re.IGNORECASE),
 }
 _QUARTER_DEG = 90.0
 _OPENS_BY = 0.75
 """How far a drawer opens, as a share of the model's depth, where nothing else is noted."""
-_TOLERANCE = 0.004
+_TOLERANCE = 0.008
 
 
 @dataclass(frozen=True)
@@ -64,13 +64,15 @@ class LinkNote:
     """A part that opens."""
 
     name: str
-    opens: Literal["left", "right", "top", "bottom", "lid", "slide"]
-    """The edge of its front on which it turns as seen from the front; ``lid``: its lower edge at the back."""
+    opens: Literal["left", "right", "top", "bottom", "lid", "slide", "slide-left", "slide-right"]
+    """The edge of its front on which it turns, as seen from the front; ``lid``: its lower edge at the back."""
     pick: tuple[Pick, ...]
     by: float | None = None
     """Degrees, or metres, that it opens by."""
     ajar: float = 0.0
     """Degrees, or metres, that it is open in the model."""
+    axis: tuple[float, float, float] | None = None
+    """A point on the axis, as shares like those of a box, where it is not at that edge."""
     tray: bool = False
     """A drawer that is modelled as its front alone gets a bottom and sides."""
 
@@ -133,7 +135,7 @@ def grips(shape: Wavefront, note: Note) -> dict[str, Bool[np.ndarray, " F"]]:
     """Faces of handles, knobs and panes, by groups, materials and notes; no face is in two."""
     found, taken = {}, np.zeros(len(shape.group), dtype=bool)
     noted = {"handle": note.handles, "knob": note.knobs}
-    for label, named in _GRIP.items():
+    for label, named in _WORDS.items():
         faces = _any(shape, noted.get(label, ()))
         if not (note.handles or note.knobs) or label == "glass":
             of_group, of_material = (
@@ -162,23 +164,27 @@ def find_links(shape: Wavefront, note: Note) -> list[Link]:
     if note.thing:
         return []
     if note.links:
-        return [_noted(shape, link, note) for link in note.links]
+        labelled = grips(shape, note)
+        grip = labelled["handle"] | labelled["knob"]
+        return [_noted(shape, link, grip) for link in note.links]
     return _tagged(shape, note)
 
 
-def _noted(shape: Wavefront, note: LinkNote, of_model: Note) -> Link:
+def _noted(shape: Wavefront, note: LinkNote, grip: Bool[np.ndarray, " F"]) -> Link:
     faces = _any(shape, note.pick)
     if not faces.any():
         raise ValueError(f"{note.name}: nothing of it is in the model")
-    grip = _any(shape, (*of_model.handles, *of_model.knobs))
-    points = shape.points(faces & ~grip if (faces & ~grip).any() else faces)
+    points, whole = shape.points(faces & ~grip if (faces & ~grip).any() else faces), shape.vertices
     low, high = points.min(axis=0), points.max(axis=0)
-    middle, back = (low + high) / 2, float(shape.vertices[:, 0].min())
-    if note.opens == "slide":
+    middle, back = (low + high) / 2, float(whole[:, 0].min())
+    if note.opens.startswith("slide"):
         room = float(high[0]) - back
         tray = np.array([[back + 0.1 * room, *low[1:]], [low[0], *high[1:]]]) if note.tray else None
-        by = _OPENS_BY * room if note.by is None else note.by
-        return Link(note.name, "prismatic", faces, middle, np.array([1.0, 0, 0]), by, note.ajar, tray)
+        side = {"slide": 0, "slide-left": -1, "slide-right": 1}[note.opens]
+        usual = _OPENS_BY * room if side == 0 else 0.9 * float(high[1] - low[1])
+        axis = np.array([float(side == 0), side, 0])
+        by = usual if note.by is None else note.by
+        return Link(note.name, "prismatic", faces, middle, axis, by, note.ajar, tray)
     origin, axis = {
         "left": ((high[0], low[1], middle[2]), (0, 0, -1)),
         "right": ((high[0], high[1], middle[2]), (0, 0, 1)),
@@ -186,10 +192,10 @@ def _noted(shape: Wavefront, note: LinkNote, of_model: Note) -> Link:
         "bottom": ((high[0], middle[1], low[2]), (0, 1, 0)),
         "lid": ((low[0], middle[1], low[2]), (0, -1, 0)),
     }[note.opens]
-    by = np.deg2rad(_QUARTER_DEG if note.by is None else note.by)
-    return Link(
-        note.name, "revolute", faces, np.array(origin), np.array(axis, float), float(by), float(np.deg2rad(note.ajar))
-    )
+    if note.axis is not None:
+        origin = whole.min(axis=0) + np.array(note.axis) * np.ptp(whole, axis=0)
+    by, ajar = np.deg2rad([_QUARTER_DEG if note.by is None else note.by, note.ajar]).tolist()
+    return Link(note.name, "revolute", faces, np.array(origin), np.array(axis, float), by, ajar)
 
 
 def _tagged(shape: Wavefront, note: Note) -> list[Link]:

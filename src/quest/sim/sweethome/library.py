@@ -96,18 +96,19 @@ class Library:
 
     def sums(self, path: str) -> list[str]:
         """Checksums of a member and of all that lies in its folder."""
-        folder = posixpath.dirname(path) + "/"
-        return sorted(f"{i.filename} {i.CRC} {i.file_size}" for i in self._members.values() if folder in i.filename)
+        folder = posixpath.dirname(path)
+        beside = (info for name, info in self._members.items() if posixpath.dirname(name) == folder)
+        return sorted(f"{info.filename} {info.CRC} {info.file_size}" for info in beside)
 
     def models(self) -> Iterator[Model | ObjectError]:
         """Every entry of the catalogue, or what is wrong with it."""
-        numbers = [key.partition("#")[2] for key in self._properties if key.startswith("model#")]
-        for number in numbers:
-            of_model = {
-                key.partition("#")[0]: value
-                for key, value in self._properties.items()
-                if key.partition("#")[2] == number
-            }
+        entries: dict[str, dict[str, str]] = {}
+        for key, value in self._properties.items():
+            word, _, number = key.partition("#")
+            entries.setdefault(number, {})[word] = value
+        for number, of_model in entries.items():
+            if "model" not in of_model:
+                continue
             try:
                 with reading(f"{self.path}: model {number}", ObjectError, "it is left out"):
                     yield self._model(of_model)

@@ -132,9 +132,7 @@ def _array(rows: Iterable[list[str]], width: int) -> Float[np.ndarray, "N W"]:
 
 def _corner(word: str, size: Sequence[int]) -> tuple[int, int, int]:
     indices = [int(i) if i else 0 for i in word.split("/")[:3]]
-    found = [
-        i - 1 if i > 0 else i + n if i < 0 else -1 for i, n in zip([*indices, 0, 0][:3], size, strict=True)
-    ]
+    found = [i - 1 if i > 0 else i + n if i < 0 else -1 for i, n in zip([*indices, 0, 0][:3], size, strict=True)]
     v, vt, vn = (i if 0 <= i < n else -1 for i, n in zip(found, size, strict=True))
     if v < 0:
         raise ValueError(f"a face names corner {word!r} of {size[0]} vertices")
