@@ -17,7 +17,7 @@ from quest.untrusted import is_inside, reading, require_file
 
 _CATALOGUE = "PluginFurnitureCatalog.properties"
 _MOST_MEMBERS = 50_000
-_MOST_BYTES = 64 * 2**20
+_MOST_BYTES = 32 * 2**20
 """Of one member, unpacked."""
 _MOST_BYTES_IN_ALL = 4 * 2**30
 _MOST_M = 100.0

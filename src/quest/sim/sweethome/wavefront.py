@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-_MOST_CORNERS = 6_000_000
+_MOST = 3_000_000
+"""Corners of faces, or vertices."""
 _FARTHEST = 1e9
 
 
@@ -24,7 +25,7 @@ class Wavefront:
     normals: Float[np.ndarray, "K 3"]
     corners: Int[np.ndarray, "C 3"]
     """Vertex, texture coordinate and normal of every corner; -1 is none."""
-    starts: Int[np.ndarray, " F+1"]
+    starts: Int[np.ndarray, " S"]
     group: Int[np.ndarray, " F"]
     material: Int[np.ndarray, " F"]
     groups: tuple[str, ...]
@@ -106,14 +107,14 @@ def read_wavefront(text: str) -> Wavefront:
                 starts.append(len(corners))
                 group.append(current_group)
                 material.append(current_material)
-            if len(corners) > _MOST_CORNERS:
-                raise ValueError(f"more than {_MOST_CORNERS} corners of faces")
         elif word in ("g", "o"):
             current_group = groups.setdefault(rest.strip(), len(groups))
         elif word == "usemtl":
             current_material = materials.setdefault(rest.strip(), len(materials))
         elif word == "mtllib":
             libraries.append(rest.strip())
+        if len(corners) > _MOST or any(len(rows) > _MOST for rows in values.values()):
+            raise ValueError(f"it has more than {_MOST} vertices or corners of faces")
     if not group:
         raise ValueError("it has no face")
     v, vt, vn = (_array(rows, 2 if key == "vt" else 3) for key, rows in values.items())
