@@ -10,6 +10,7 @@ from PIL import Image
 
 from quest.cli.main import main
 from quest.sim.objects import SimObject, load_object
+from tests.sim.small_library import BODY, CUPBOARD, PROPERTIES, SIZES, wavefront, write_library
 from tests.sim.small_objects import CARCASS, DRAWER, write_cabinet, write_object
 
 
@@ -78,3 +79,20 @@ def test_show_draws_own_and_procedural_objects(tmp_path: Path, capsys: pytest.Ca
     sheet = np.asarray(Image.open(out))
     assert sheet.shape[2] == 3
     assert sheet.std() > 20  # not an empty page
+
+
+def test_import_says_what_came_out_and_list_finds_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = PROPERTIES + "model#2=/lib/table/table.obj\n" + SIZES.format(2) + "model#3=/lib/\\u001b[31m.obj\n"
+    models = {"cupboard": CUPBOARD, "table": wavefront(BODY)}
+    library = write_library(tmp_path / "a.sh3f", models, text + SIZES.format(3))
+    out = tmp_path / "mine"
+    assert main(["objects", "import", str(library), "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert "a.sh3f: 1 object that opens, 1 thing, 1 left out; 0 were there" in said.out
+    assert "\\x1b[31m" in said.err
+    assert "\x1b" not in said.err
+    assert main(["objects", "import", str(library), "--out", str(out)]) == 0
+    assert "2 were there" in capsys.readouterr().out
+    assert main(["objects", "list", "--objects-root", str(out)]) == 0
+    assert "1 handle" in capsys.readouterr().out
+    assert main(["objects", "import", str(tmp_path / "none.sh3f"), "--out", str(out)]) == 2

@@ -120,6 +120,7 @@ COMMANDS: dict[str, Entry | Group] = {
         {
             "list": Entry("objects", "ObjectsList", "List objects with their joints, entities and sizes."),
             "show": Entry("objects", "ObjectsShow", "Draw objects with their entities."),
+            "import": Entry("objects", "ObjectsImport", "Make objects of furniture libraries of Sweet Home 3D."),
         },
     ),
     "export": Entry("export", "Export", "Write the tracker's networks as ONNX."),

@@ -1,4 +1,4 @@
-"""``quest objects``: which objects there are, and how they look with their entities."""
+"""``quest objects``: which objects there are, how they look with their entities, and more of them."""
 
 from __future__ import annotations
 
@@ -122,6 +122,45 @@ class ObjectsShow:
             if source == "procedural" and rest == mix:
                 return [shelf.load(source, f"{category_for_seed(seed, mix=mix)}-{seed}") for seed in seeds]
         return [shelf.load(*found) for found in parse_object(name)]
+
+
+@dataclass(frozen=True)
+class ObjectsImport:
+    """Make folders of objects of furniture libraries of Sweet Home 3D: what opens, and things that do not.
+
+    What is there already is kept, so that an import that was stopped goes on.
+    """
+
+    libraries: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    """Libraries, such as those of Debian's package sweethome3d-furniture (.sh3f)."""
+
+    out: Path
+    """Folder that gets an object folder per model that opens, things/ with the others, and CREDITS.md."""
+
+    def run(self) -> int:
+        """Print what came out of each library, and what was left out; returns 1 if nothing came out of one."""
+        from quest.cli.console import Console
+        from quest.cli.progress import counting
+        from quest.sim.sweethome import import_library
+
+        if not self.libraries:
+            raise ConfigError("objects import: no library is named; name an .sh3f file")
+        out, errors = (Console(stderr=e, highlight=False, markup=False, soft_wrap=True) for e in (False, True))
+        empty = 0
+        for path in self.libraries:
+            with counting(errors, f"importing {path.name}", None, "models") as tell:
+                results = list(import_library(path, self.out, tell))
+            for warning in (warning for result in results for warning in result.warnings):
+                errors.print(warning, style="yellow")
+            there = [result for result in results if result.folder is not None]
+            opens, kept = sum(r.opens for r in there), sum(r.kept for r in there)
+            out.print(
+                f"{path.name}: {counted(opens, 'object')} that {'opens' if opens == 1 else 'open'}, "
+                f"{counted(len(there) - opens, 'thing')}, {len(results) - len(there)} left out; {kept} were there"
+            )
+            empty += not there
+        out.print(f"{self.out}: see CREDITS.md for authors and licences")
+        return 1 if empty else 0
 
 
 def _every_folder(root: Path | None) -> Iterator[SimObject | ObjectError]:
