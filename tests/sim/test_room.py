@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+import trimesh
 
-from quest.errors import ObjectError
+from quest.errors import ConfigError, ObjectError
 from quest.sim.articulation import apply
 from quest.sim.objects import SimObject
 from quest.sim.procedural import make_object
 from quest.sim.procedural.model import Dice
 from quest.sim.room import furnished
+from quest.sim.settings import TakeSettings
 
 TEST_SEED = 110_000
 
 
-def in_a_room(sim_object: SimObject, seed: int = 0) -> tuple[SimObject, tuple[str, ...]]:
-    return furnished(sim_object, Dice(np.random.PCG64(seed)))
+def in_a_room(sim_object: SimObject, seed: int = 0, *, things: str | None = None) -> tuple[SimObject, tuple[str, ...]]:
+    return furnished(sim_object, Dice(np.random.PCG64(seed)), things=things)
 
 
 def entity_points(sim_object: SimObject) -> np.ndarray:
@@ -89,3 +93,31 @@ def test_a_seed_is_a_room() -> None:
 def test_small_things_have_no_room() -> None:
     with pytest.raises(ObjectError, match="for a room"):
         in_a_room(make_object("stapler", TEST_SEED))
+
+
+def test_things_of_a_folder_stand_on_the_furniture(tmp_path: Path) -> None:
+    for name, size in (("cup", 0.1), ("tower", 3.0)):
+        folder = tmp_path / name
+        folder.mkdir()
+        trimesh.creation.box((0.1, 0.1, size)).apply_translation((0, 0, size / 2)).export(folder / "body.obj")
+        (folder / f"{name}.urdf").write_text(
+            f'<robot name="{name}"><link name="{name}"><visual name="{name}"><geometry><mesh filename="body.obj"/>'
+            "</geometry></visual></link></robot>"
+        )
+    rooms = [in_a_room(make_object("chest", TEST_SEED), seed, things=str(tmp_path))[0] for seed in range(3)]
+    placed = [part for room in rooms for part in room.articulation.parts if part.name.startswith("things/")]
+    assert {part.name for part in placed} == {"things/cup"}, "a tower of three metres does not stand on a chest"
+    assert not any(part.name.startswith("room/thing") for room in rooms for part in room.articulation.parts)
+    for room in rooms:
+        world = room.articulation.world_from_root
+        for part in room.articulation.parts:
+            if part.name == "things/cup":
+                assert part.body == 0
+                assert apply(world, np.asarray(part.surface.vertices))[:, 2].min() > 0.3
+
+
+def test_a_folder_without_things(tmp_path: Path) -> None:
+    with pytest.raises(ObjectError, match="import"):
+        in_a_room(make_object("chest", TEST_SEED), things=str(tmp_path))
+    with pytest.raises(ConfigError, match="room"):
+        TakeSettings(things=str(tmp_path))

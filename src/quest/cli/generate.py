@@ -100,6 +100,8 @@ class Generate:
     """A person's hand comes and pulls the parts that move."""
     room: bool = False
     """Put the object into a room, among other furniture."""
+    things: str | None = None
+    """Folder of things to put on the furniture of rooms, as quest objects import makes them; default: plain ones."""
     randomize_materials: bool = True
     """Give objects random materials: procedural ones always, others now and then."""
     stretch: float = 1.0
@@ -131,7 +133,7 @@ class Generate:
             levels=levels,
             takes_per_object=self.takes_per_object,
             first_seed=self.seed,
-            settings=self._settings(TakeSettings()),
+            settings=TakeSettings() if suites else self._settings(TakeSettings()),
             suites=suites,
         )
         console = Console(stderr=True, highlight=False)
@@ -203,6 +205,7 @@ class Generate:
             gripper=preset.gripper or self.gripper,
             hand=preset.hand or self.hand,
             room=preset.room or self.room,
+            things=self.things,
             randomize_materials=preset.randomize_materials and self.randomize_materials,
             stretch=self.stretch,
             broad_materials=self.mix == "broad",

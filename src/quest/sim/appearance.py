@@ -36,6 +36,8 @@ from quest.sim.surfaces import (
 
 ROOM = "room"
 """First word of the names of parts that belong to no piece of furniture, such as ``room/wall-0``."""
+THINGS = "things"
+"""The same of things that keep their own materials."""
 _FLOORS: tuple[TextureKind, ...] = ("noise", "checker", "planks", "tiles", "speckle", "stripes")
 _WALLS: tuple[TextureKind, ...] = ("noise", "stripes", "tiles", "planks", "speckle")
 _MORE_FOR_ROOMS: tuple[TextureKind, ...] = ("bricks", "concrete", "marble", "weave")
@@ -352,6 +354,8 @@ def _paint(look: ObjectLook, bodies: Sequence[Any], *, own: bool) -> None:
     for index, body in enumerate(bodies):
         for shape in body.render_shapes:
             piece, _, name = shape.name.rpartition("/")
+            if piece == THINGS:
+                continue
             if piece == ROOM:
                 surface = _room_surface(look.seed, name)
             elif piece or own:

@@ -70,7 +70,7 @@ def generate_take(
     )
     sim_object, shape = _shaped(sim_object, np.random.default_rng([*key, 5]), settings)
     if settings.room:
-        sim_object, beside = furnished(sim_object, Dice(np.random.PCG64([*scene, 6])))
+        sim_object, beside = furnished(sim_object, Dice(np.random.PCG64([*scene, 6])), things=settings.things)
         shape = {**shape, "beside": beside}
     if hiding is None:
         staging = stage_plain(
@@ -166,7 +166,7 @@ def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     for what in ("cameras", "motion", "sensor"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = asdict(getattr(settings, what))
-    for what in ("physics", "gripper", "hand", "disturbance", "broad_materials", "fixed_scene", "room"):
+    for what in ("physics", "gripper", "hand", "disturbance", "broad_materials", "fixed_scene", "room", "things"):
         if getattr(settings, what) != getattr(ordinary, what):
             found[what] = getattr(settings, what)
     variant = {"variant": suite.variant} if suite is not None and suite.variant else {}

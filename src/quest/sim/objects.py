@@ -107,6 +107,37 @@ def find_objects(root: Path | None = None) -> list[Path]:
     return folders
 
 
+def find_things(root: Path) -> list[Path]:
+    """URDFs of things that do not open, one in each folder below ``root``, sorted.
+
+    Raises:
+        ObjectError: there is none.
+    """
+    found = sorted(root.glob("*/*.urdf"))
+    if not found:
+        raise ObjectError(
+            f"{root}: expected folders that each hold a thing's URDF, found none; quest objects import makes them "
+            "(things/ in its folder)"
+        )
+    return found
+
+
+def load_thing(path: Path) -> tuple[Part, ...]:
+    """The parts of a thing that does not open, as it stands on the floor about the origin, metres.
+
+    Args:
+        path: its URDF, of one link.
+
+    Raises:
+        ObjectError: the URDF is broken or has joints, or its meshes are missing.
+    """
+    with reading(path, ObjectError, "use another thing"):
+        urdf = read_urdf(path)
+        if urdf.joints:
+            raise ObjectError(f"{path}: expected a thing of one link, got joints; use it as an object")
+        return _parts(urdf, {link: (0, np.eye(4)) for link in urdf.links}, path, MappingProxyType({}), [])
+
+
 def find_urdf(path: Path) -> Path:
     """The URDF of an object: the path itself, or the folder's ``mobility.urdf``, or its only URDF.
 
@@ -338,6 +369,19 @@ def _articulation(
         if j.mimics is not None:
             warnings.append(f"joint {j.name} mimics {j.mimics}: here it moves on its own")
     names = ("base", *(j.child for j in moving))
+    body_of_link = {link: (body[link], body_from_link[link]) for link in urdf.links}
+    parts = _parts(urdf, body_of_link, where, part_names, warnings)
+    return Articulation(names, parts, tuple(joints), np.eye(4)), body_of_link
+
+
+def _parts(
+    urdf: Urdf,
+    body_of_link: Mapping[str, tuple[int, Float[np.ndarray, "4 4"]]],
+    where: Path | str,
+    part_names: Mapping[str, str],
+    warnings: list[str],
+) -> tuple[Part, ...]:
+    """The visuals of all links that have a mesh."""
     parts, missing = [], []
     for link, visuals in urdf.links.items():
         for visual in visuals:
@@ -345,12 +389,12 @@ def _articulation(
             if surface is None:
                 missing.append(visual.mesh.name if isinstance(visual.mesh, Path) else visual.shape)
                 continue
-            name = _part_name(visual, link, part_names)
-            body_from_part = body_from_link[link] @ visual.link_from_visual
+            name, (body, body_from_link) = _part_name(visual, link, part_names), body_of_link[link]
+            body_from_part = body_from_link @ visual.link_from_visual
             in_body = surface.copy().apply_transform(body_from_part)
             parts.append(
                 Part(
-                    name=name, visual=visual.name, body=body[link], body_from_part=body_from_part, mesh=visual.mesh,
+                    name=name, visual=visual.name, body=body, body_from_part=body_from_part, mesh=visual.mesh,
                     scale=visual.scale, uv_scale=visual.scale, shape=visual.shape, rgba=visual.rgba, surface=in_body,
                 )
             )  # fmt: skip
@@ -363,8 +407,7 @@ def _articulation(
         warnings.append(
             f"{len(missing)} meshes are missing or have no faces and were left out: {', '.join(missing[:5])}"
         )
-    body_of_link = {link: (body[link], body_from_link[link]) for link in urdf.links}
-    return Articulation(names, tuple(parts), tuple(joints), np.eye(4)), body_of_link
+    return tuple(parts)
 
 
 def _part_name(visual: UrdfVisual, link: str, part_names: Mapping[str, str]) -> str:

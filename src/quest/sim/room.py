@@ -7,7 +7,9 @@ repeat one piece of furniture, or the object itself, so that a neighbour's handl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -15,10 +17,10 @@ from jaxtyping import Float
 
 from quest.data.split import object_split, part_of_object
 from quest.errors import ObjectError
-from quest.sim.appearance import ROOM
+from quest.sim.appearance import ROOM, THINGS
 from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.entities import SimEntity
-from quest.sim.objects import SimObject
+from quest.sim.objects import SimObject, find_things, load_thing
 from quest.sim.procedural.catalogue import make_object
 from quest.sim.procedural.clutter import things_on
 from quest.sim.procedural.model import Dice, Mesh, as_visual, box
@@ -32,6 +34,8 @@ _LOW_M = 1.1
 """Furniture up to this height has cupboards above and things on top."""
 _COUNTER_M = (0.7, 1.0)
 """Heights of furniture that goes below a counter."""
+_TALLEST_M = 0.6
+"""Of things on top."""
 _HUNG_FROM_M = (1.35, 1.55)
 _WALL_M = (3.0, 4.0)
 """Height of the wall, and how far it goes beyond the furniture."""
@@ -71,34 +75,36 @@ class _Piece:
         return matrix
 
 
-def furnished(sim_object: SimObject, rng: Dice) -> tuple[SimObject, tuple[str, ...]]:
+def furnished(sim_object: SimObject, rng: Dice, *, things: str | None = None) -> tuple[SimObject, tuple[str, ...]]:
     """The object in a room of its own, and the ids of the furniture around it.
 
-    It stands about the origin as before; what would stand on a table stands on a piece of furniture.
+    It stands about the origin as before; what would stand on a table stands on a piece of furniture. ``things`` is a
+    folder of things that stand on the furniture; without it these are plain bottles and boxes.
 
     Raises:
-        ObjectError: it is too small for a room.
+        ObjectError: it is too small for a room, or there are no things in the folder.
     """
     if sim_object.half_diagonal_m < _SMALLEST_M:
         raise ObjectError(
             f"{sim_object.object_id}: expected half a diagonal of at least {_SMALLEST_M} m for a room, got "
             f"{sim_object.half_diagonal_m:.2f} m; make it without a room"
         )
-    room = _Room(sim_object, rng)
-    joined = _joined(room.own, room.pieces, room.still, room.view_m())
+    room = _Room(sim_object, rng, () if things is None else find_things(Path(things)))
+    joined = _joined(room.own, room.pieces, (*room.still, *room.things), room.view_m())
     return joined, tuple(piece.sim_object.object_id for piece in room.pieces)
 
 
 class _Room:
     """Draws what stands where: x to the front, y along the wall, all backs at one x."""
 
-    def __init__(self, sim_object: SimObject, rng: Dice) -> None:
-        self._rng = rng
+    def __init__(self, sim_object: SimObject, rng: Dice, shelf: Sequence[Path]) -> None:
+        self._rng, self._shelf = rng, shelf
         part = part_of_object(sim_object.source, sim_object.object_id) or "train"
         self._seeds = object_split().procedural_seeds[part]
         size = sim_object.articulation.extent_m
         self.pieces: list[_Piece] = []
-        self.still: list[ModelPart] = []
+        self.still: list[Part] = []
+        self.things: list[Part] = []
         self._back = -size[0] / 2
         on_top = bool((size <= _ON_TOP_M).all())
         if on_top:
@@ -202,8 +208,27 @@ class _Room:
             slab = np.array([high[0] + 0.02, high[1] + 0.004, high[2] + 0.035])
             self._add("counter", box((low[0], low[1] - 0.004, high[2]), _triple(slab)))
             high[2] = slab[2]
-        if not bare:
-            self.still += things_on(low, high, self._rng)
+        if not bare and not self._shelf:
+            for part in things_on(low, high, self._rng):
+                self._add(part.role, part.mesh, part.surface)
+        elif not bare:
+            self._put(low, high)
+
+    def _put(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> None:
+        """None to four of the things of the shelf on top of a box, beside each other."""
+        rng, taken = self._rng, float(low[1])
+        for _ in range(rng.whole(0, 5)):
+            parts = load_thing(rng.pick(self._shelf))
+            bounds = np.array([part.surface.bounds for part in parts])
+            least, most = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+            room = np.array([high[0] - low[0], high[1] - taken, _TALLEST_M]) - (most - least)
+            if (room < 0).any():
+                continue
+            place = np.array([low[0] + rng.real(0, 1) * room[0], taken + rng.real(0, 0.5) * room[1], high[2]])
+            shift = np.eye(4)
+            shift[:3, 3] = place - least
+            self.things += [replace(_moved(part, shift), name=f"{THINGS}/{part.name}") for part in parts]
+            taken = float(place[1] + (most - least)[1]) + 0.01
 
     def _wall(self, standing: list[_Piece]) -> None:
         """The wall behind, and pictures or plates on it."""
@@ -217,19 +242,23 @@ class _Room:
             thick = rng.real(0.005, 0.03)
             self._add("picture", box((face, y - half[0], z - half[1]), (face + thick, y + half[0], z + half[1])))
 
-    def _add(self, role: str, mesh: Mesh) -> None:
-        self.still.append(ModelPart(role, mesh))
+    def _add(self, role: str, mesh: Mesh, surface: str = "body") -> None:
+        visual = as_visual(ModelPart(role, mesh, surface), len(self.still))
+        name, one = f"{ROOM}/{visual.name}", (1.0, 1.0, 1.0)
+        geometry = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+        self.still.append(Part(name, name, 0, np.eye(4), visual.mesh, one, one, "mesh", None, geometry))
 
 
-def _joined(own: _Piece, pieces: list[_Piece], still: list[ModelPart], view_m: Float[np.ndarray, "2 3"]) -> SimObject:
+def _joined(
+    own: _Piece, pieces: Sequence[_Piece], still: Sequence[Part], view_m: Float[np.ndarray, "2 3"]
+) -> SimObject:
     """All pieces as one object: the first one's bodies first, everything that never moves in body 0."""
     alone = own.sim_object.articulation
     root = own.shift @ alone.world_from_root
     names, parts, joints = list(alone.body_names), list(alone.parts), list(alone.joints)
     entities = list(own.sim_object.entities)
     from_world = np.linalg.inv(root)
-    for n, model_part in enumerate(still):
-        parts.append(_still_part(model_part, n, from_world))
+    parts += [_moved(part, from_world) for part in still]
     for piece in pieces:
         other = piece.sim_object.articulation
         base = from_world @ piece.shift @ other.world_from_root
@@ -255,14 +284,11 @@ def _part(part: Part, piece: str, base: Float[np.ndarray, "4 4"], first_joint: i
     named = replace(part, name=f"{piece}/{part.name}", visual=f"{piece}/{part.visual}")
     if part.body:
         return replace(named, body=part.body + first_joint)
-    return replace(named, body_from_part=base @ part.body_from_part, surface=part.surface.copy().apply_transform(base))
+    return _moved(named, base)
 
 
-def _still_part(model_part: ModelPart, number: int, from_world: Float[np.ndarray, "4 4"]) -> Part:
-    visual = as_visual(model_part, number)
-    name, one = f"{ROOM}/{visual.name}", (1.0, 1.0, 1.0)
-    surface = trimesh.Trimesh(model_part.mesh.vertices, model_part.mesh.faces, process=False)
-    return Part(name, name, 0, from_world, visual.mesh, one, one, "mesh", None, surface.apply_transform(from_world))
+def _moved(part: Part, pose: Float[np.ndarray, "4 4"]) -> Part:
+    return replace(part, body_from_part=pose @ part.body_from_part, surface=part.surface.copy().apply_transform(pose))
 
 
 def _entity(

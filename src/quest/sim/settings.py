@@ -51,6 +51,9 @@ class TakeSettings:
     """What happens to light, materials or cameras."""
     room: bool = False
     """Whether the object stands in a room, among other furniture that stands still."""
+    things: str | None = None
+    """Folder of things that stand on the furniture of rooms, one folder each (:func:`quest.sim.objects.find_things`);
+    None for plain bottles and boxes."""
     stretch: float = 1.0
     """Up to which factor every take has the object stretched along its depth, width and height; 1 leaves it as it
     is."""
@@ -73,6 +76,8 @@ class TakeSettings:
             raise ConfigError(
                 f"take: a {puller} pulls one joint after the other, each once; leave overlap, cycles and frames away"
             )
+        if self.things is not None and not self.room:
+            raise ConfigError("take: things stand on the furniture of a room; ask for a room as well")
         if self.fixed_scene and self.stretch != 1:
             raise ConfigError("take: in a fixed scene only the motion is of the take; leave stretch away")
         if not 1 <= self.stretch <= 4:
