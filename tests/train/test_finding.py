@@ -12,19 +12,22 @@ from PIL import Image
 
 from quest.data.boxed_pictures import BoxedPicture, may_choose
 from quest.errors import ConfigError
-from quest.model.finder import OPENINGS, PANELS, PLACES, FinderMaps
+from quest.model.finder import FINE_PX, OPENINGS, PANELS, PLACES, FinderMaps
 from quest.model.found import read_off
+from quest.model.second_look import SecondLook
 from quest.train.dataset import UNSTATED
 from quest.train.finding.dataset import FinderData, open_finder_data
 from quest.train.finding.marks import KINDS, UNKNOWN, Marks
 from quest.train.finding.objective import StageFind, _focal, _giou
-from quest.train.finding.sampler import FinderSampler, FinderTruth, targets
+from quest.train.finding.sampler import FinderInputs, FinderSampler, FinderTruth, targets
 from quest.train.finding.settings import VIEW_PX, FinderSamplerConfig
 from quest.train.finding.takes import marks_of
 from quest.train.finding.views import PictureCache, ViewCache, draw_view, of_pictures, read_view, read_whole
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
+BLIND = SecondLook(8, stride=FINE_PX).eval()
+"""Has learned nothing, and changes no box."""
 GRIP, CABINET = KINDS.index("grip"), KINDS.index("cabinet")
 
 
@@ -65,7 +68,7 @@ def test_what_is_cut_off_ends_at_the_cut() -> None:
 def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
     marks = make_marks()
     maps = targets(marks, 256)
-    found = read_off(_perfect(maps), scale=np.array([2.0, 2.0]), size=(128, 128))
+    found = read_off(_perfect(maps), BLIND, scale=np.array([2.0, 2.0]), size=(128, 128))
     likely = found.select(found.logit > 0)
     assert sorted(likely.labels) == ["handle", "rim"]
     grip = likely.labels.index("handle")
@@ -80,7 +83,7 @@ def test_a_bar_that_reaches_far_out_of_the_picture_has_its_label_from_inside() -
     maps = _perfect(targets(make_marks(), 256))
     maps.longest[0, 8, 0], maps.knob[0, :, 1:] = 99.0, 9.0  # what is not at the edge says knob
     maps.longest_extent[0, :, 8, 0] = torch.tensor([400.0, 8, 8, 8])
-    found = read_off(maps, scale=np.ones(2), size=(256, 256))
+    found = read_off(maps, BLIND, scale=np.ones(2), size=(256, 256))
     assert found.labels[0] == "handle"
     assert found.uv_px[0, 0] == 0
 
@@ -95,7 +98,7 @@ def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
     return FinderMaps(
         logit("place"), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
         logit("longer")[:, 0], truth["longer_extent"], logit("longest")[:, 0], truth["longest_extent"],
-        logit("panel"), truth["panel_extent"], 10 * opening,
+        logit("panel"), truth["panel_extent"], 10 * opening, torch.zeros(1, 8, *truth["weight"].shape[1:]),
     )  # fmt: skip
 
 
@@ -212,6 +215,51 @@ def test_pictures_are_kept_no_larger_than_a_view_shows_them(tmp_path: Path) -> N
 def test_a_network_has_only_so_many_blocks_to_learn() -> None:
     with pytest.raises(ConfigError, match="blocks"):
         StageFind(make_finder(), learned_blocks=13)
+
+
+def test_a_second_look_learns_the_edges_of_a_blob() -> None:
+    """Boxes that are moved by chance come back to where the features are 1."""
+    torch.manual_seed(0)
+    look, rng = SecondLook(8, stride=FINE_PX), np.random.default_rng(0)
+    optimizer = torch.optim.AdamW(look.parameters(), lr=2e-3)
+
+    def drawn(count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        low = rng.uniform(40, 120, (count, 2))
+        box = torch.tensor(np.concatenate((low, low + rng.uniform(20, 90, (count, 2))), axis=1)).float()
+        cell = (torch.arange(64) + 0.5) * FINE_PX
+        within = [((cell >= box[:, k, None]) & (cell <= box[:, k + 2, None])).float() for k in (0, 1)]
+        features = (within[1][:, :, None] * within[0][:, None])[:, None].repeat(1, 8, 1, 1)
+        return features, box, box + 8 * torch.randn(count, 4)
+
+    for _ in range(200):
+        features, box, first = drawn(64)
+        loss = (look(features, first, torch.arange(64)) - box).abs().mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    features, box, first = drawn(64)
+    look.eval()
+    with torch.no_grad():
+        second = look(features, first, torch.arange(64))
+        shuffled = torch.randperm(64)
+        again = look(features, first[shuffled], shuffled)
+    assert float((second - box).abs().mean()) < 0.5 * float((first - box).abs().mean())
+    torch.testing.assert_close(again, second[shuffled])
+
+
+def test_the_second_look_learns_alone(tmp_path: Path) -> None:
+    network = make_finder()
+    stage = StageFind(network, second_alone=True)
+    maps = {name: torch.from_numpy(value)[None] for name, value in targets(make_marks(), 256).items()}
+    inputs = FinderInputs(torch.randint(0, 256, (1, 3, 256, 256), dtype=torch.uint8), None)
+    losses = stage.losses(inputs, FinderTruth(**maps))
+    assert list(losses) == list(stage.weights) == ["second"]
+    losses["second"].backward()
+    learned = {name for name, p in network.named_parameters() if p.grad is not None}
+    assert learned == {name for name, _ in network.named_parameters() if name.startswith("second.")}
+    assert len(stage.trained()) == len(learned)
+    with pytest.raises(ConfigError, match="alone"):
+        FinderSamplerConfig(second_alone=True, learned_blocks=2)
 
 
 @pytest.mark.slow

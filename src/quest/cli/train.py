@@ -204,7 +204,12 @@ class Train:
                 config=self.finding,
                 report=viewed,
             )
-            objective = StageFind(start.network, self.losses, learned_blocks=self.finding.learned_blocks)
+            objective = StageFind(
+                start.network,
+                self.losses,
+                learned_blocks=self.finding.learned_blocks,
+                second_alone=self.finding.second_alone,
+            )
             return _Taught(objective, found.training, found.validation, found.about, found.sources)
         from quest.paper.flow import StageTwo
         from quest.paper.objective import PaperStageOne

@@ -2,7 +2,8 @@
 
 Two branches see the picture: a vision transformer, coarsely, knows what things are; EfficientNet-Lite0 sees them at up
 to a quarter of the picture's resolution. They are joined at a stride of 16 pixels, where the doors and drawers are read
-off; going down from there to a stride of 4 pixels, what one takes hold of.
+off; going down from there to a stride of 4 pixels, what one takes hold of. A second look
+(:mod:`quest.model.second_look`) finds its edges.
 
 References: Zhou et al., Objects as Points, 2019, for maps of centres; Lin et al., Feature Pyramid Networks, CVPR 2017.
 """
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 from quest.model.config import NetworkConfig
 from quest.model.efficientnet import WIDTHS, EfficientNet
 from quest.model.encoder import Encoder
+from quest.model.second_look import SecondLook
 
 PLACES = ("grip", "rim", "front", "hinge")
 """What the fine map finds; a grip is a handle or a knob."""
@@ -77,6 +79,8 @@ class FinderMaps:
     """As ``extent``, of the panel."""
     opening: Float[Tensor, "B O H W"]
     """Logits of :data:`OPENINGS`, which exclude each other."""
+    features: Float[Tensor, "B C h w"]
+    """What the second look at grips sees, at a stride of :data:`FINE_PX`."""
 
 
 class _Mix(nn.Module):
@@ -150,6 +154,7 @@ class FinderNetwork(nn.Module):
         self.fine = _Head(width, len(PLACES) + 2, rare=len(PLACES), stride=FINE_PX)
         self.coarse = _Head(deep, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
         self.longer, self.longest = _LongHead(width, stride=MIDDLE_PX), _LongHead(deep, stride=COARSE_PX)
+        self.second = SecondLook(width, stride=FINE_PX)
         self.dropout = nn.Dropout2d(0.1)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on processors
 
@@ -189,5 +194,5 @@ class FinderNetwork(nn.Module):
         panels, opening = panel.split((len(PANELS), len(OPENINGS)), dim=1)
         return FinderMaps(
             places, knob[:, 0], lift[:, 0], extent, longer[:, 0], longer_extent, longest[:, 0], longest_extent, panels,
-            panel_extent, opening,
+            panel_extent, opening, fine.float(),
         )  # fmt: skip

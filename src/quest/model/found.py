@@ -14,6 +14,7 @@ from scipy.special import expit
 from torch import Tensor
 
 from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
+from quest.model.second_look import SecondLook
 from quest.types import LABELS
 
 LABELS_FOUND = (*LABELS, "hinge")
@@ -108,7 +109,8 @@ def find(
     canvas, inside = placed(rgb, size_px)
     with torch.inference_mode():
         maps = network(torch.from_numpy(canvas).to(device).permute(2, 0, 1)[None] / 255)
-    found = read_off(maps, scale=np.array([inside[1] / width, inside[0] / height]), size=(width, height))
+        scale = np.array([inside[1] / width, inside[0] / height])
+        found = read_off(maps, network.second, scale=scale, size=(width, height))
     return replace(found, logit=gain * found.logit + bias)
 
 
@@ -131,11 +133,12 @@ def placed(rgb: UInt8[np.ndarray, "H W 3"], size_px: int) -> tuple[UInt8[np.ndar
     return canvas, (rows, columns)
 
 
-def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int, int]) -> Found:
+def read_off(maps: FinderMaps, second: SecondLook, *, scale: Float[np.ndarray, "2"], size: tuple[int, int]) -> Found:
     """What the maps of one picture (B = 1) show.
 
     Args:
         maps: of the network.
+        second: the network's second look at grips.
         scale: pixels of what the network saw per pixel of the source, along x and y.
         size: width and height of the source.
     """
@@ -163,6 +166,8 @@ def read_off(maps: FinderMaps, *, scale: Float[np.ndarray, "2"], size: tuple[int
         else:
             label_p[own, LABELS_FOUND.index(name)] = 1
     keep = _apart(uv, box, place)
+    box[keep] = _looked_at_again(box[keep], maps, second)
+    uv = _within_grip(uv, box)
     uv, box = np.clip(uv[keep] / scale, 0, end), np.clip(box[keep] / two, 0, np.tile(end, 2))
     return Found(uv, logit[keep], label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
 
@@ -174,12 +179,26 @@ def _level(
     cell, place, logit = _highest(logits, around=1)
     uv = (cell + _within(logits, place, cell)) * stride
     box = _boxes(extent, cell, stride)
-    grip = place == PLACES.index("grip")
-    # A bar may be thinner than a cell: its point lies on the inner half of its box.
+    box[place != PLACES.index("grip")] = np.nan
+    return _within_grip(uv, box), box, place, logit
+
+
+def _within_grip(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, "N 2"]:
+    """Points on the inner half of their boxes, where there are boxes, because a bar may be thinner than a cell."""
     quarter = (box[:, 2:] - box[:, :2]) / 4
-    uv = np.where(grip[:, None], np.clip(uv, box[:, :2] + quarter, box[:, 2:] - quarter), uv)
-    box[~grip] = np.nan
-    return uv, box, place, logit
+    return np.where(np.isnan(box[:, :1]), uv, np.clip(uv, box[:, :2] + quarter, box[:, 2:] - quarter))
+
+
+def _looked_at_again(box: Float[np.ndarray, "N 4"], maps: FinderMaps, second: SecondLook) -> Float[np.ndarray, "N 4"]:
+    """Boxes of grips after a second look, edges in order; NaN where there was none."""
+    box, grip = box.copy(), ~np.isnan(box[:, 0])
+    if not grip.any():
+        return box
+    first = torch.from_numpy(box[grip]).to(maps.features)
+    edges = second(maps.features, first, torch.zeros(len(first), dtype=torch.long, device=first.device))
+    edges = edges.detach().double().cpu().numpy().reshape(-1, 2, 2)
+    box[grip] = np.concatenate((edges.min(axis=1), edges.max(axis=1)), axis=1)
+    return box
 
 
 def _highest(

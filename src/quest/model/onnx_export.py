@@ -31,7 +31,7 @@ from quest.model.found import GREY, SIDE_PX, placed
 from quest.model.weights import LoadedNetwork
 from quest.model.xfeat import PACKAGED, XFeat
 
-FORMAT = "quest-onnx-2"
+FORMAT = "quest-onnx-3"
 """Changes when the graphs or the manifest do, so that none of before is taken for them."""
 MANIFEST = "manifest.json"
 OPSET = 18
@@ -127,6 +127,7 @@ _MAPS = (
     TensorInfo("panel", (1, len(PANELS), *_COARSE), "float32", "log odds", ", ".join(PANELS)),
     TensorInfo("panel_extent", (1, 4, *_COARSE), "float32", "pixels of rgb", _EXTENT),
     TensorInfo("opening", (1, len(OPENINGS), *_COARSE), "float32", "logits of a softmax", ", ".join(OPENINGS)),
+    TensorInfo("features", (1, "C", *_FINE), "float32", "1", "what quest's second look at grips sees"),
 )
 _FEATURES = (
     TensorInfo("descriptors", (1, 64, *_EIGHTH), "float32", "1", "descriptors of length 1"),

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from quest.data.boxed_pictures import in_boxes
 from quest.errors import ConfigError
-from quest.model.finder import CONTEXT_BLOCKS, PLACES, FinderNetwork
-from quest.model.found import read_off
+from quest.model.finder import COARSE_PX, CONTEXT_BLOCKS, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
+from quest.model.found import read_off, shared
 from quest.train.finding.marks import UNKNOWN
 from quest.train.finding.sampler import FinderInputs, FinderSampler, FinderTruth, whole_view
 from quest.train.finding.settings import VIEW_PX
@@ -27,9 +27,15 @@ from quest.train.pooling import pooled
 
 WEIGHTS = {
     "place": 1.0, "longer": 0.5, "longest": 0.5, "panel": 0.5, "extent": 1.0, "longer_extent": 0.5,
-    "longest_extent": 0.5, "panel_extent": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1,
+    "longest_extent": 0.5, "panel_extent": 1.0, "second": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1,
 }  # fmt: skip
 """How much every loss counts."""
+_MOVED, _MOVED_PX = 0.1, 1.5
+"""Standard deviation by which edges are moved before the second look, in sides of the box and in pixels."""
+_LEAST_SIDE_PX = 4.0
+_SAME_BOX = 0.5
+_SHARP = 0.05
+"""Below so many sides of the box an edge is off by the square, above by the amount."""
 _FIRST = ("detail.stem.", *(f"detail.stages.{i}." for i in range(3)))
 """What stays as it was if the transformer does: edges and textures, which ImageNet has taught, and which cost most of a
 step."""
@@ -43,16 +49,21 @@ class FinderScores:
     """Average precision over all answers (see :func:`quest.data.boxed_pictures.in_boxes`)."""
     recall: float
     """Share of the grips that any answer is right about."""
+    boxes: float
+    """Average precision where an answer is right if its box and that of the grip share half of their union."""
     present: int
     """How many grips there are."""
 
     @property
     def score(self) -> float:
-        """What a checkpoint is chosen by; less is better."""
-        return 1 - self.precision
+        """What a checkpoint is chosen by: points and boxes alike; less is better."""
+        return 1 - (self.precision + self.boxes) / 2
 
     def __str__(self) -> str:
-        return f"grips: average precision {self.precision:.3f}, recall {self.recall:.1%} (n = {self.present})"
+        return (
+            f"grips: average precision {self.precision:.3f}, of boxes {self.boxes:.3f}, recall {self.recall:.1%} "
+            f"(n = {self.present})"
+        )
 
 
 class StageFind:
@@ -62,6 +73,7 @@ class StageFind:
         network: the finder.
         changes: weights of losses that are to differ; 0 turns one off.
         learned_blocks: last blocks of the transformer that learn too.
+        second_alone: whether only the second look at grips learns.
 
     Raises:
         ConfigError: the transformer has fewer blocks.
@@ -70,7 +82,12 @@ class StageFind:
     name = "stage-find"
 
     def __init__(
-        self, network: FinderNetwork, changes: Mapping[str, float] | None = None, *, learned_blocks: int = 0
+        self,
+        network: FinderNetwork,
+        changes: Mapping[str, float] | None = None,
+        *,
+        learned_blocks: int = 0,
+        second_alone: bool = False,
     ) -> None:
         self.network = network
         self.weights = changed(WEIGHTS, changes or {})
@@ -78,9 +95,17 @@ class StageFind:
         if learned_blocks > len(read):
             raise ConfigError(f"finding: the transformer has {len(read)} blocks, fewer than {learned_blocks}")
         self._blocks = read[len(read) - learned_blocks :]
+        self._second_alone = second_alone
+        if second_alone:
+            self.weights = {"second": self.weights["second"]}
 
     def trained(self) -> list[nn.Parameter]:
-        """The transformer's last blocks and all outside of it, or all but the first stages of EfficientNet."""
+        """The transformer's last blocks and all outside of it, or all but the first stages of EfficientNet.
+
+        The second look's alone, if it learns alone.
+        """
+        if self._second_alone:
+            return list(self.network.second.parameters())
         frozen = ("encoder.", *(() if len(self._blocks) else _FIRST))
         outside = [p for name, p in self.network.named_parameters() if not name.startswith(frozen)]
         return outside + self.refined()
@@ -90,8 +115,11 @@ class StageFind:
         return list(self._blocks.parameters())
 
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
-        """Every loss, unweighted."""
-        maps = self.network(frames.rgb.float() / 255, context=frames.context)
+        """Every loss, unweighted; that of the second look alone, if it learns alone."""
+        with torch.set_grad_enabled(torch.is_grad_enabled() and not self._second_alone):
+            maps = self.network(frames.rgb.float() / 255, context=frames.context)
+        if self._second_alone:
+            return {"second": self._second(maps, truth)}
         places, grip = len(PLACES), PLACES.index("grip")
         grips = truth.known[:, grip : grip + 1]
         return {
@@ -103,10 +131,38 @@ class StageFind:
             "longer_extent": _giou(maps.longer_extent, truth.longer_extent, truth.longer_share[:, 0]),
             "longest_extent": _giou(maps.longest_extent, truth.longest_extent, truth.longest_share[:, 0]),
             "panel_extent": _giou(maps.panel_extent, truth.panel_extent, truth.panel_weight),
+            "second": self._second(maps, truth),
             "knob": _binary(maps.knob, truth.knob),
             "lift": _binary(maps.lift, truth.lift),
             "opening": _choice(maps.opening, truth.opening),
         }
+
+    def _second(self, maps: FinderMaps, truth: FinderTruth) -> Float[Tensor, ""]:
+        """How far edges are off after the second look, in sides of the box; every grip counts as much.
+
+        It looks at what the first look said in the cells of a grip, moved by chance: the first look is nearer to the
+        truth where it has learned than where it is used.
+        """
+        levels = (
+            (maps.extent, truth.extent, truth.weight, FINE_PX),
+            (maps.longer_extent, truth.longer_extent, truth.longer_share[:, 0], MIDDLE_PX),
+            (maps.longest_extent, truth.longest_extent, truth.longest_share[:, 0], COARSE_PX),
+        )
+        parts: list[tuple[Tensor, ...]] = []
+        for said, true, weight, stride in levels:
+            picture, row, column = weight.nonzero(as_tuple=True)
+            centre = (torch.stack((column, row), dim=1) + 0.5) * stride
+            first, goal = (
+                torch.cat((centre - out[:, :2], centre + out[:, 2:]), dim=1)
+                for out in (each[picture, :, row, column].detach() for each in (said, true))
+            )
+            parts.append((first, goal, weight[picture, row, column], picture))
+        first, goal, share, picture = (torch.cat(part) for part in zip(*parts, strict=True))
+        side = (goal[:, 2:] - goal[:, :2]).clamp(min=_LEAST_SIDE_PX).repeat(1, 2)
+        first = first + torch.randn_like(first) * (_MOVED * side + _MOVED_PX)
+        off = (self.network.second(maps.features.detach(), first, picture) - goal) / side
+        loss = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none", beta=_SHARP).sum(dim=1)
+        return (loss * share).sum() / pooled(share.sum()).clamp(min=1e-6)
 
     def validate(self, sampler: FinderSampler, *, batches: int, device: torch.device) -> FinderScores:
         """Scores on the same whole views at every call, as many as ``batches`` batches have."""
@@ -114,28 +170,35 @@ class StageFind:
         count = min(len(paths), batches * sampler.config.batch)
         self.network.eval()
         scores: list[float] = []
-        first: list[bool] = []
+        first: dict[str, list[bool]] = {"point": [], "box": []}
         present = 0
         with torch.inference_mode():
             for i in np.linspace(0, len(paths) - 1, count).astype(int):
                 view = sampler.view(paths[i], seed=int(i))
                 seen = whole_view(view).to(device)
                 maps = self.network(seen.rgb.float() / 255, context=seen.context)
-                found = read_off(maps, scale=np.ones(2), size=(VIEW_PX, VIEW_PX))
+                found = read_off(maps, self.network.second, scale=np.ones(2), size=(VIEW_PX, VIEW_PX))
                 found = found.select(~np.isnan(found.box_px[:, 0]))
                 box = view.marks.box_px[view.marks.kind == PLACES.index("grip")]
-                taken = np.zeros(len(box), bool)
-                for inside, logit in zip(in_boxes(box, found.uv_px), found.logit, strict=True):
-                    hit = np.flatnonzero(inside & ~taken)
-                    scores.append(float(logit))
-                    first.append(len(hit) > 0)
-                    taken[hit[:1]] = True
+                share = np.array([shared(own, box) for own in found.box_px]).reshape(len(found), len(box))
+                for name, right in (("point", in_boxes(box, found.uv_px)), ("box", share >= _SAME_BOX)):
+                    taken = np.zeros(len(box), bool)
+                    for hits in right:
+                        hit = np.flatnonzero(hits & ~taken)
+                        first[name].append(len(hit) > 0)
+                        taken[hit[:1]] = True
+                scores += found.logit.tolist()
                 present += len(box)
         self.network.train()
-        right = np.array(first, bool)[np.argsort(-np.array(scores), kind="stable")]
-        precision = np.cumsum(right) / np.arange(1, len(right) + 1)
-        area = float(precision[right].sum() / max(present, 1))
-        return FinderScores(area, float(right.sum() / max(present, 1)), present)
+        order = np.argsort(-np.array(scores), kind="stable")
+        point, boxes = (_average_precision(np.array(first[name], bool)[order], present) for name in ("point", "box"))
+        return FinderScores(point, sum(first["point"]) / max(present, 1), boxes, present)
+
+
+def _average_precision(right: Bool[np.ndarray, " N"], present: int) -> float:
+    """Mean precision over the things that are there, of answers, best first."""
+    precision = np.cumsum(right) / np.arange(1, len(right) + 1)
+    return float(precision[right].sum() / max(present, 1))
 
 
 def _focal(
