@@ -134,8 +134,8 @@ RESULTS = Page(
         tracking(
             "suites.json",
             "Test objects in kitchens",
-            "Nothing was trained on kitchens. Seen from metres away, points that rest in the picture within 0.1 px have "
-            "an APE of a quarter, since the simulated sensor's depth is off. Takes: `quest generate --out "
+            "Nothing was trained on kitchens. Seen from metres away, points that rest in the picture within 0.1 px "
+            "have an APE of a quarter, since the simulated sensor's depth is off. Takes: `quest generate --out "
             "runs/takes/suites --suite kitchen --split test --procedural 20 --mix broad --sensor stereo --every 2`.",
             suite="kitchen",
         ),
@@ -143,8 +143,8 @@ RESULTS = Page(
         tracking(
             "suites.json",
             "Test objects that a hand pulls",
-            "Takes: `quest generate --out runs/takes/suites --suite hands --split test --no-partnet --procedural 12 --mix "
-            "broad --sensor stereo --size 480 --every 2`.",
+            "Takes: `quest generate --out runs/takes/suites --suite hands --split test --no-partnet --procedural 12 "
+            "--mix broad --sensor stereo --size 480 --every 2`.",
             suite="hands",
         ),
         Table(
