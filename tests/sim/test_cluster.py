@@ -80,7 +80,7 @@ def test_many_workers_make_the_takes_of_one(cluster: str, tmp_path: Path) -> Non
     specs = plan(10)
     impossible = specs[3]
     produce(specs[:2], store, StubStudio(), report=lambda event: None)
-    studio = StubStudio(impossible=(impossible.name,), notes=tmp_path, seconds=0.1)
+    studio = StubStudio(impossible=(impossible.name,), notes=tmp_path, seconds=1.0)  # both workers have started by then
     produce_on_cluster(missing_takes(specs, store), store, studio, ONE_CORE, report=events.append)
     possible = [spec for spec in specs if spec != impossible]
     assert hashes(store) == expected(possible)
