@@ -1,10 +1,13 @@
 """Appearances: same generator same look, nothing between camera and object, textures that tile."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from quest.sim import appearance
 from quest.sim.appearance import (
     CAMERA_AZIMUTH_DEG,
     Region,
@@ -92,3 +95,20 @@ def test_apply_appearance_renders_something_lit(renderer: Renderer) -> None:
     assert colour.std() > 0.01
     ids = camera.get_picture("Segmentation")[..., 1]
     assert (ids[20:28, 20:28] == box.per_scene_id).all()
+
+
+@pytest.mark.parametrize(("room", "worn"), [(False, 3), (True, 1)])
+def test_a_slash_in_a_name_means_something_in_rooms_only(
+    monkeypatch: pytest.MonkeyPatch, room: bool, worn: int
+) -> None:
+    """Objects of users may call their parts ``things/door``."""
+    dressed: list[str] = []
+    monkeypatch.setattr(appearance, "make_texture", lambda surface: None)
+    monkeypatch.setattr(appearance, "ensure_uv", lambda part, scale: None)
+    monkeypatch.setattr(appearance, "wear", lambda material, surface, texture: dressed.append(material))
+    names = ("things/door", "/things/door", "things/a/b") if room else ("things/door", "room/door", "left-0/door")
+    shapes = [SimpleNamespace(name=name, parts=[SimpleNamespace(material=name)]) for name in names]
+    drawn = sample_appearance(np.random.default_rng(0), randomize_materials=True)
+    assert drawn.look is not None
+    appearance._paint(drawn.look, [SimpleNamespace(render_shapes=shapes)], own=True, room=room)
+    assert len(dressed) == worn

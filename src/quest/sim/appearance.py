@@ -221,7 +221,14 @@ def _odd(rng: np.random.Generator) -> Surface:
 
 
 def apply_appearance(
-    scene: Any, appearance: Appearance, region: Region, bodies: Sequence[Any], *, procedural: bool, wide: bool = False
+    scene: Any,
+    appearance: Appearance,
+    region: Region,
+    bodies: Sequence[Any],
+    *,
+    procedural: bool,
+    wide: bool = False,
+    room: bool = False,
 ) -> None:
     """Puts lights, floor, wall and distractors into a scene, and gives the object its materials.
 
@@ -233,11 +240,13 @@ def apply_appearance(
             URDF's visuals (``handle-3``, ``drawer_front-1``), which tell parts apart.
         procedural: whether the object came without materials worth keeping.
         wide: whether floor and wall reach far, for cameras that turn.
+        room: whether the names begin with the piece of furniture and a slash, as those of a room do
+            (:mod:`quest.sim.room`).
     """
     _light(scene, appearance, region)
     _surround(scene, appearance, region, wide)
     if appearance.look is not None:
-        _paint(appearance.look, bodies, own=procedural or appearance.look.repaint_original)
+        _paint(appearance.look, bodies, own=procedural or appearance.look.repaint_original, room=room)
 
 
 def _light(scene: Any, appearance: Appearance, region: Region) -> None:
@@ -345,7 +354,7 @@ def add_shape(scene: Any, shape: Any, pose: Any = None) -> Any:
     return entity
 
 
-def _paint(look: ObjectLook, bodies: Sequence[Any], *, own: bool) -> None:
+def _paint(look: ObjectLook, bodies: Sequence[Any], *, own: bool, room: bool) -> None:
     """Parts of one kind look alike unless the look says that links differ.
 
     Neighbours have looks of their own, or that of the object; without ``own`` the object itself keeps its materials.
@@ -353,7 +362,7 @@ def _paint(look: ObjectLook, bodies: Sequence[Any], *, own: bool) -> None:
     texture_of = cache(make_texture)
     for index, body in enumerate(bodies):
         for shape in body.render_shapes:
-            piece, _, name = shape.name.rpartition("/")
+            piece, _, name = shape.name.partition("/") if room else ("", "", shape.name)
             if piece == THINGS:
                 continue
             if piece == ROOM:

@@ -432,15 +432,16 @@ def _walk(request: PathRequest) -> CameraPath:
     path = eye + gone + bob[:, :1] * start[0] + bob[:, 1:] * [0.0, 0.0, 1.0]
     centre = points.mean(axis=0)
     aim = centre + (1 - rng.uniform(*_WALK_AIMED)) * (path - eye)
-    towards = path - aim
-    azimuth, elevation = (
-        np.arctan2(towards[:, 1], towards[:, 0]), np.arctan2(towards[:, 2], np.hypot(towards[:, 0], towards[:, 1]))
-    )  # fmt: skip
-    off = eye - centre
-    (level,) = look(np.array([np.arctan2(off[1], off[0])]), np.array([np.arctan2(off[2], np.hypot(*off[:2]))]))[1]
+    (level,) = look(*_angles((eye - centre)[None]))[1]
     shake = np.deg2rad(rng.uniform(*_SHAKE_TURN_DEG)) * hand_shake(request.frames, rng)[:, :3]
-    poses = _poses(start @ level.T @ look(azimuth, elevation)[1], path)
+    poses = _poses(start @ level.T @ look(*_angles(path - aim))[1], path)
     return CameraPath(posed.camera, displaced(poses, shake, np.zeros_like(shake)))
+
+
+def _angles(towards: Float[np.ndarray, "S 3"]) -> tuple[Float[np.ndarray, " S"], Float[np.ndarray, " S"]]:
+    """Azimuth and elevation of directions, radians."""
+    level = np.hypot(towards[:, 0], towards[:, 1])
+    return np.arctan2(towards[:, 1], towards[:, 0]), np.arctan2(towards[:, 2], level)
 
 
 def _distance(points: Float[np.ndarray, "N 3"], posed: PosedCamera) -> float:

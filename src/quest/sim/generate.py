@@ -189,7 +189,8 @@ def _record(
 
     def dress(scene: Any, bodies: list[Any]) -> None:
         procedural = sim_object.source == "procedural"
-        apply_appearance(scene, appearance, region, bodies, procedural=procedural, wide=wide)
+        room = settings.room
+        apply_appearance(scene, appearance, region, bodies, procedural=procedural, wide=wide, room=room)
         actors.extend(prop.add(scene) for prop in props)
 
     stage.dress(dress)

@@ -119,8 +119,8 @@ class _Room:
             self._row(first, side, name)
         standing = [self.own, *self.pieces]
         self._hang(standing)
-        for piece in standing:
-            self._cover(piece, bare=on_top and piece is standing[1])
+        for piece in standing[2:] if on_top else standing:
+            self._cover(piece)
         self._wall(standing)
 
     def view_m(self) -> Float[np.ndarray, "2 3"]:
@@ -139,7 +139,7 @@ class _Room:
         return make_object(category, self._rng.whole(first, last + 1))
 
     def _carrying(self, size: Float[np.ndarray, "3"]) -> SimObject:
-        while True:  # half of them are large enough
+        while True:  # until one is large enough
             found = self._made(self._rng.pick(_CARRYING))
             if (found.articulation.extent_m[:2] >= size[:2]).all():
                 return found
@@ -199,20 +199,20 @@ class _Room:
                 n += 1
             y += width + 0.004
 
-    def _cover(self, piece: _Piece, *, bare: bool) -> None:
+    def _cover(self, piece: _Piece) -> None:
         """A counter on a low piece, and things on top."""
-        if piece.high[2] > _LOW_M or (piece is self.own and piece.low[2] > 0):
+        if piece.high[2] > _LOW_M:
             return
         low, high = piece.low.copy(), piece.high.copy()
-        if piece is not self.own and not bare and abs(high[2] - self._counter) < 1e-6:
+        if piece is not self.own and abs(high[2] - self._counter) < 1e-6:
             slab = np.array([high[0] + 0.02, high[1] + 0.004, high[2] + 0.035])
             self._add("counter", box((low[0], low[1] - 0.004, high[2]), _triple(slab)))
             high[2] = slab[2]
-        if not bare and not self._shelf:
-            for part in things_on(low, high, self._rng):
-                self._add(part.role, part.mesh, part.surface)
-        elif not bare:
+        if self._shelf:
             self._put(low, high)
+            return
+        for part in things_on(low, high, self._rng):
+            self._add(part.role, part.mesh, part.surface)
 
     def _put(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> None:
         """None to four of the things of the shelf on top of a box, beside each other."""
@@ -255,7 +255,9 @@ def _joined(
     """All pieces as one object: the first one's bodies first, everything that never moves in body 0."""
     alone = own.sim_object.articulation
     root = own.shift @ alone.world_from_root
-    names, parts, joints = list(alone.body_names), list(alone.parts), list(alone.joints)
+    names, joints = list(alone.body_names), list(alone.joints)
+    # The first slash of a name ends that of its piece, which is empty for the object itself.
+    parts = [replace(part, name=f"{own.name}/{part.name}") for part in alone.parts]
     entities = list(own.sim_object.entities)
     from_world = np.linalg.inv(root)
     parts += [_moved(part, from_world) for part in still]
