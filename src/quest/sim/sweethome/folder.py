@@ -193,7 +193,7 @@ def _write_materials(
     for name in shape.libraries:
         found = library.beside(model.path, name) or library.beside(model.path, f"{Path(model.path).stem}.mtl")
         if found is None:
-            warnings.append(f"material file {name[:80]!r} is missing")
+            warnings.append(f"material file {name[-80:]!r} is missing")
         else:
             said |= read_materials(library.read(found).decode("utf-8", errors="replace"))
     lines, pictures = [], {}
@@ -227,7 +227,7 @@ def _write_picture(
     tried = (name, re.split(r"[/\\]", name)[-1], name.split()[-1])  # with a path of the author's machine, or options
     found = next((found for each in tried if (found := library.beside(model.path, each))), None)
     if found is None:
-        warnings.append(f"picture {name[:80]!r} is missing")
+        warnings.append(f"picture {name[-80:]!r} is missing")
         return None
     data = library.read(found)
     try:
