@@ -73,6 +73,8 @@ class Release:
     """Procedural validation objects, each seen by one camera for 60 frames, that the monitor is calibrated on."""
     promise_streams: int = 1000
     """Procedural test objects on which the monitor's promise is checked."""
+    imported: Path | None = None
+    """Folder of quest objects import, whose objects teach, choose and test as well."""
     start: str | None = None
     """Trained weights to start from, instead of the initial ones."""
     steps: int = 1350
@@ -121,14 +123,18 @@ class Release:
         default = self._name in DEFAULTS.values()
         return ROOT / "benchmarks" / "results" / ("" if default else self._name)
 
+    @property
+    def _imported(self) -> tuple[object, ...]:
+        return () if self.imported is None else ("--imported", self.imported)
+
     def _takes_of(self, part: str) -> Path:
         return self.work / "takes" / part
 
     def _takes(self) -> None:
         """What teaches and what chooses."""
-        which = "--no-partnet" if self.free else "--partnet"
+        which = ("--no-partnet" if self.free else "--partnet", *self._imported)
         for part, count in (("train", self.procedural), ("validation", self.choosing)):
-            _quest("generate", "--out", self._takes_of(part), "--split", part, which, "--procedural", count,
+            _quest("generate", "--out", self._takes_of(part), "--split", part, *which, "--procedural", count,
                    *FEW.split())  # fmt: skip
 
     def _train(self) -> None:
@@ -183,8 +189,8 @@ class Release:
         if self.real:
             _quest("eval", "--real", *self.real, "--weights", self._weights, "--out", self._results / "real")
         for level, count in ((1, self.evaluation_procedural), (4, self.evaluation_procedural_level_4)):
-            _quest("generate", "--out", self._takes_of("test"), "--split", "test", "--procedural", count, "--views", 1,
-                   "--level", level, *CAMERA.split())  # fmt: skip
+            _quest("generate", "--out", self._takes_of("test"), "--split", "test", *self._imported, "--procedural",
+                   count, "--views", 1, "--level", level, *CAMERA.split())  # fmt: skip
         _quest("eval", "--takes", self._takes_of("test"), "--split", "test", "--protocol", "point", "semantic",
                "--weights", self._weights, "--out", self._results / "test.json")  # fmt: skip
         takes = self._streams("test", first=111_000, count=self.promise_streams)

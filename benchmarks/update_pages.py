@@ -351,7 +351,11 @@ REAL_MEASURES = (
     ("handles not found by itself, %", "!%measures.recall"),
 )
 
-SOURCES = {"partnet-mobility": "simulated, PartNet-Mobility", "procedural": "simulated, procedural"}
+SOURCES = {
+    "partnet-mobility": "simulated, PartNet-Mobility",
+    "procedural": "simulated, procedural",
+    "sweethome3d": "simulated, free furniture",
+}
 
 
 def summary(folder: Path, weights: str = "") -> str:

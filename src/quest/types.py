@@ -438,8 +438,8 @@ class TakeInfo:
 
     name: str
     """Unique in its store."""
-    source: Literal["partnet-mobility", "procedural", "own"]
-    """``partnet-mobility``, ``procedural``, or ``own`` for a user's own object."""
+    source: Literal["partnet-mobility", "sweethome3d", "procedural", "own"]
+    """``sweethome3d`` is an imported object that is in the object split, ``own`` any other of a user."""
     object_id: str
     """Folder name, or ``category-seed`` of a procedural object."""
     category: str

@@ -46,6 +46,9 @@ def test_split_is_disjoint_and_large_enough() -> None:
     named = [o for part in split.partnet_mobility.values() for o in part]
     assert len(named) == len(set(named))
     assert min(len(split.partnet_mobility[part]) for part in ("validation", "test")) >= 8
+    imported = [name for part in split.sweethome3d.values() for name in part]
+    assert len(imported) == len(set(imported))
+    assert [len(split.sweethome3d[part]) for part in ("train", "validation", "test")] == [66, 12, 12]
     ranges = sorted(split.procedural_seeds.values())
     assert all(a[1] < b[0] for a, b in itertools.pairwise(ranges))
 
@@ -59,9 +62,11 @@ def test_split_is_disjoint_and_large_enough() -> None:
         ("partnet-mobility", "44817", "validation"),
         *(("procedural", name, "unlisted") for name in ("laptop", "laptop-5000000")),
         ("partnet-mobility", "99999", "unlisted"),
+        ("sweethome3d", "fridge", "test"),
+        ("sweethome3d", "something", "unlisted"),
     ],
 )
-def test_split_of(source: Literal["procedural", "partnet-mobility"], object_id: str, part: str) -> None:
+def test_split_of(source: Literal["procedural", "partnet-mobility", "sweethome3d"], object_id: str, part: str) -> None:
     info = replace(make_take(frames=1, views=1, size=(8, 8)).info, source=source, object_id=object_id)
     assert part_of(info) == part
     if part == "unlisted":

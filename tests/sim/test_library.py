@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quest.data.split import object_split, part_of_object
 from quest.errors import ObjectError
 from quest.sim.objects import SimObject, find_objects, load_object
+from quest.sim.plan import imported_objects
 from quest.sim.sweethome import Imported, import_library, joints
 from quest.sim.sweethome.folder import CREDITS, THINGS
 from quest.sim.sweethome.joints import LinkNote, Note, Pick
@@ -277,3 +279,29 @@ def test_damaged_notes_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(joints, "NOTES", tmp_path / "notes.json")
     with pytest.raises(ObjectError, match="unknown colour"):
         joints.notes.__wrapped__()
+
+
+def test_the_split_knows_imported_objects_by_name_and_model(tmp_path: Path) -> None:
+    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD}), tmp_path / "out")
+    assert made.folder is not None
+    credit = made.folder / "credit.json"
+    part = object_split().sweethome3d["validation"]
+    named = json.loads(credit.read_text())
+    assert named["model"] != part["cupboard"]  # that of another library
+    assert load_object(made.folder).source == "own"
+    credit.write_text(json.dumps(named | {"model": part["cupboard"]}))
+    cupboard = load_object(made.folder)
+    assert cupboard.source == "sweethome3d"
+    assert part_of_object(cupboard.source, cupboard.object_id) == "validation"
+    np.testing.assert_allclose(cupboard.articulation.extent_m, (0.4, 0.6, 0.8), atol=1e-6)  # metres, as its file says
+
+
+def test_a_part_of_the_split_wants_all_its_imported_objects(tmp_path: Path) -> None:
+    named = object_split().sweethome3d["test"]
+    for name in named:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "credit.json").write_text("{}")
+    assert imported_objects(tmp_path, "test") == [("own", str(tmp_path / name)) for name in named]
+    (tmp_path / "fridge" / "credit.json").unlink()
+    with pytest.raises(ObjectError, match="no fridge"):
+        imported_objects(tmp_path, "test")

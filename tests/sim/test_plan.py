@@ -138,6 +138,7 @@ def test_one_number_is_the_side_of_a_square() -> None:
         ({"objects": ("partnet:1",), "elevation": (50.0, 20.0)}, "elevation"),
         ({"objects": ("partnet:1",), "azimuth": (0.0, 200.0)}, "azimuth"),
         ({"seeds": "5..1"}, "A..B"),
+        ({"imported": Path("free")}, "--imported goes with --split"),
         ({"seeds": "few"}, "A..B"),
         ({"procedural": 5, "seeds": "1..3"}, "do not fit"),
         ({"objects": ("partnet:1",), "hidden": 60}, "--suite"),

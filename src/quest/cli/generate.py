@@ -47,6 +47,8 @@ class Generate:
     """How many procedural objects."""
     seeds: str | None = None
     """Object seeds A..B (both included) of the procedural objects, instead of the first ones of the split's part."""
+    imported: Path | None = None
+    """Folder of quest objects import: --split brings its objects too."""
     partnet: bool = True
     """Whether --split brings PartNet-Mobility objects; --no-partnet for procedural ones only."""
     objects_root: Path | None = None
@@ -222,12 +224,16 @@ class Generate:
     def _chosen(self, category: str | None) -> list[tuple[str, str]]:
         """Source and id of every object that the arguments name; all of a category if that is given."""
         from quest.data.split import object_split
-        from quest.sim.plan import parse_object, procedural_objects
+        from quest.sim.plan import imported_objects, parse_object, procedural_objects
 
         chosen = [pair for text in self.objects for pair in parse_object(text)]
         split = object_split()
         if self.split is not None and self.partnet and category is None:
             chosen += [("partnet", object_id) for object_id in split.partnet_mobility[self.split]]
+        if self.imported is not None and self.split is None:
+            raise ConfigError("generate: --imported goes with --split; name single objects by --objects FOLDER/NAME")
+        if self.imported is not None and self.split is not None and category is None:
+            chosen += imported_objects(self.imported, self.split)
         if self.procedural < 0:
             raise ConfigError(f"generate: expected --procedural of at least 0, got {self.procedural}")
         if self.procedural or self.seeds:

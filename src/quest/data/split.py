@@ -23,6 +23,8 @@ class ObjectSplit:
 
     partnet_mobility: dict[str, tuple[str, ...]]
     """Folder names per part."""
+    sweethome3d: dict[str, dict[str, str]]
+    """Names of imported objects per part, and of which models of their libraries they are made."""
     procedural_seeds: dict[str, tuple[int, int]]
     """First and last object seed per part, both included."""
 
@@ -32,7 +34,7 @@ def object_split() -> ObjectSplit:
     """The split that the package ships."""
     raw = json.loads(resources.files("quest.data").joinpath("split.json").read_text(encoding="utf-8"))
     ids, seeds = ({part: tuple(raw[kind][part]) for part in PARTS} for kind in ("partnet-mobility", "procedural_seeds"))
-    return ObjectSplit(ids, {part: (first, last) for part, (first, last) in seeds.items()})
+    return ObjectSplit(ids, raw["sweethome3d"], {part: (first, last) for part, (first, last) in seeds.items()})
 
 
 SplitPart = Literal["train", "validation", "test", "unlisted"]
@@ -48,6 +50,8 @@ def part_of_object(source: str, object_id: str) -> Part | None:
     split = object_split()
     if source == "partnet-mobility":
         return next((part for part in PARTS if object_id in split.partnet_mobility[part]), None)
+    if source == "sweethome3d":
+        return next((part for part in PARTS if object_id in split.sweethome3d[part]), None)
     if source != "procedural":
         return None
     match = re.fullmatch(r".+-(\d+)", object_id)

@@ -85,7 +85,7 @@ class DriftRow:
     part: str
     """Part of the object split."""
     source: str
-    """``partnet-mobility`` or ``procedural``."""
+    """As of :class:`quest.types.TakeInfo`."""
     objects: int
     """How many."""
     streams: int

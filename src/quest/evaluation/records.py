@@ -30,7 +30,7 @@ class Subject:
     part: str
     """``train``, ``validation``, ``test``, or ``unlisted`` where the split does not know the object."""
     source: str
-    """``partnet-mobility`` or ``procedural``."""
+    """As of :class:`quest.types.TakeInfo`."""
     level: int
     """How many joints move one after the other."""
     object_id: str

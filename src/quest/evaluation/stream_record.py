@@ -54,7 +54,7 @@ class StreamRecord:
     object_id: str
     """The object."""
     source: str
-    """``partnet-mobility`` or ``procedural``."""
+    """As of :class:`quest.types.TakeInfo`."""
     part: str
     """Part of the object split."""
     level: int

@@ -63,7 +63,7 @@ class Row:
     part: str
     """Part of the object split."""
     source: str
-    """``partnet-mobility`` or ``procedural``."""
+    """As of :class:`quest.types.TakeInfo`."""
     level: int
     """How many joints move one after the other."""
     reading: Reading

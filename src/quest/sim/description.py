@@ -29,6 +29,8 @@ from quest.untrusted import read_json
 
 DESCRIPTION_NAME = "entities.json"
 """Name of the file beside the URDF."""
+CREDIT_NAME = "credit.json"
+"""Name of the file beside it in which an import says whose model it is."""
 
 FRONTS = {"+x": 0.0, "+y": np.pi / 2, "-x": np.pi, "-y": -np.pi / 2}
 """Azimuth of each direction that an object's front may look along, in the frame of the URDF's root link."""

@@ -15,10 +15,12 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
+from quest.data.split import object_split
 from quest.errors import ObjectError
 from quest.sim.articulation import ArticulatedJoint, Articulation, Part
 from quest.sim.description import (
     CORRECTIONS,
+    CREDIT_NAME,
     DESCRIPTION_NAME,
     FRONTS,
     NOTHING_SAID,
@@ -47,7 +49,9 @@ _CATEGORY_OF_BASE = {
     "oven_body": "Oven",
 }
 
-Source = Literal["partnet-mobility", "procedural", "own"]
+Source = Literal["partnet-mobility", "sweethome3d", "procedural", "own"]
+_AS_TOLD = ("own", "sweethome3d")
+"""Sources whose objects are in metres and stand as their files say."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +59,7 @@ class SimObject:
     """An articulated object, ready to be moved and rendered."""
 
     source: Source
-    """``own`` is a user's own."""
+    """``sweethome3d`` is an import that is in the object split, ``own`` any other object of a user."""
     object_id: str
     """The folder's name, or ``CATEGORY-SEED``."""
     category: str
@@ -209,16 +213,25 @@ def _load(path: Path) -> SimObject:
         description = CORRECTIONS.get(folder.name, description)
     model_cat = meta.get("model_cat") if isinstance(meta, dict) else None
     category = str(description.category or model_cat or _category_of_base(folder))
+    object_id = object_id_of(path)
     return object_from_urdf(
         urdf,
-        object_id_of(path),
+        object_id,
         category,
-        source="own" if own else "partnet-mobility",
+        source=_source_of(folder, object_id, warnings) if own else "partnet-mobility",
         where=urdf_path,
         description=description,
         part_names=_names_of_meshes(folder, warnings),
         warnings=warnings,
     )
+
+
+def _source_of(folder: Path, object_id: str, warnings: list[str]) -> Source:
+    """Of an object that says itself what it is: the split knows some models of furniture libraries by name."""
+    credit = _read_json(folder / CREDIT_NAME, warnings)
+    model = credit.get("model") if isinstance(credit, dict) else None
+    listed = (objects.get(object_id) for objects in object_split().sweethome3d.values())
+    return "sweethome3d" if model is not None and model in listed else "own"
 
 
 def object_from_urdf(
@@ -252,7 +265,7 @@ def object_from_urdf(
     articulation = closed(articulation)
     scale = _scale(articulation, source, category, description, told)
     front_rad = None if description.front is None else FRONTS[description.front]
-    articulation = placed(scaled(articulation, scale), front_rad, by_lids=source == "own")
+    articulation = placed(scaled(articulation, scale), front_rad, by_lids=source in _AS_TOLD)
     half_diagonal_m = float(np.linalg.norm(articulation.extent_m)) / 2
     pointed_out = place(description, articulation, body_of_link, scale)
     entities = find_entities(articulation, half_diagonal_m, category=category, placed=pointed_out)
@@ -316,7 +329,7 @@ def _scale(
             warnings.append("category unknown (no meta.json): assumed to be 0.8 m long")
         return real_scale(articulation, category)
     longest = float(articulation.extent_m.max())
-    if source == "own" and not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
+    if source in _AS_TOLD and not _PLAUSIBLE_M[0] <= longest <= _PLAUSIBLE_M[1]:
         warnings.append(
             f"is {longest:.3g} m long if its units are metres: tell size_m in {DESCRIPTION_NAME} if they are not; "
             "beyond 6.55 m takes have no depth"

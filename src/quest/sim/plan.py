@@ -6,7 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from quest.data.split import Part, object_split
 from quest.errors import ObjectError
+from quest.sim.description import CREDIT_NAME
 from quest.sim.generate import take_name
 from quest.sim.objects import SimObject, find_objects, load_object, object_id_of
 from quest.sim.procedural import CATEGORIES, category_for_seed, make_object
@@ -87,6 +89,23 @@ def parse_object(text: str) -> list[tuple[str, str]]:
             f"objects {text!r}: expected partnet:ID,ID (partnet:44817,23724), procedural:CATEGORY-SEED, or a path"
         )
     return [(source, name) for name in names]
+
+
+def imported_objects(root: Path, part: Part) -> list[tuple[str, str]]:
+    """Sources and paths of the objects of ``quest objects import`` that are in a part of the split.
+
+    Raises:
+        ObjectError: one of them is not below ``root``.
+    """
+    named = object_split().sweethome3d[part]
+    missing = [name for name in named if not (root / name / CREDIT_NAME).is_file()]
+    if missing:
+        raise ObjectError(
+            f"{root}: expected the {len(named)} imported objects of the split's part {part!r}, found no "
+            f"{', '.join(missing[:3])}{', …' if len(missing) > 3 else ''}; import all libraries of the Debian package "
+            f"sweethome3d-furniture there (quest objects import)"
+        )
+    return [("own", str(root / name)) for name in named]
 
 
 def procedural_objects(

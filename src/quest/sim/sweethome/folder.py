@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from quest.errors import ObjectError
 from quest.sim.articulation import apply
-from quest.sim.description import DESCRIPTION_NAME
+from quest.sim.description import CREDIT_NAME, DESCRIPTION_NAME
 from quest.sim.sweethome.joints import Link, Note, find_links, grips, notes
 from quest.sim.sweethome.library import Library, Model
 from quest.sim.sweethome.wavefront import Wavefront, read_materials, read_wavefront
@@ -29,8 +29,6 @@ from quest.whole_file import whole_file
 
 THINGS = "things"
 """Folder of what does not open."""
-CREDIT = "credit.json"
-"""In every folder: whose model it is."""
 CREDITS = "CREDITS.md"
 
 _FORMAT = 1
@@ -109,11 +107,12 @@ def _cell(text: object) -> str:
 
 
 def _folders(out: Path) -> list[Path]:
-    return sorted(file.parent for pattern in (f"*/{CREDIT}", f"{THINGS}/*/{CREDIT}") for file in out.glob(pattern))
+    patterns = (f"*/{CREDIT_NAME}", f"{THINGS}/*/{CREDIT_NAME}")
+    return sorted(file.parent for pattern in patterns for file in out.glob(pattern))
 
 
 def _credit(folder: Path) -> dict[str, str]:
-    raw = read_json(folder / CREDIT, ObjectError, "remove the folder and import it again")
+    raw = read_json(folder / CREDIT_NAME, ObjectError, "remove the folder and import it again")
     return raw if isinstance(raw, dict) else {}
 
 
@@ -143,7 +142,7 @@ def _import_model(library: Library, model: Model, out: Path, names: dict[str | N
         (partial / DESCRIPTION_NAME).write_text(json.dumps(words, indent=1) + "\n", encoding="utf-8")
     credit = {"name": model.name, "creator": model.creator, "licence": model.licence, "library": library.path.name}
     credit |= {"model": model.path, "digest": digest}
-    (partial / CREDIT).write_text(json.dumps(credit, indent=1) + "\n", encoding="utf-8")
+    (partial / CREDIT_NAME).write_text(json.dumps(credit, indent=1) + "\n", encoding="utf-8")
     folder.parent.mkdir(parents=True, exist_ok=True)
     partial.rename(folder)
     names[model.path] = folder
