@@ -9,6 +9,7 @@ import pytest
 
 from quest.types import Clip, Query
 from tests.filter.scenes import FOCAL, WALL_M, Board, follow, scene
+from tests.track.clips import make_tracker
 
 FRAMES = 24
 STILL = np.zeros(FRAMES)
@@ -65,6 +66,24 @@ def test_an_occluder_that_passes_takes_nothing_along() -> None:
     assert not tracks.visible[covered, 0].any()
     assert tracks.visible[-5:, 0].all()
     np.testing.assert_allclose(tracks.uv_px[:, 0], there, atol=1.0)
+
+
+def test_what_was_covered_is_found_again_where_it_rests_without_depth() -> None:
+    way = np.stack([-60 + 8.0 * np.arange(30), np.full(30, 20.0)], axis=-1)
+    tracks = follow(scene(np.zeros(30), Board(way, (50, 80), 0.8, seed=6), depth=False), [Query.point(0, *AT)])
+    np.testing.assert_allclose(tracks.uv_px[-3:, 0], np.tile(AT, (3, 1)), atol=1.0)
+    assert tracks.visible[-3:, 0].all()
+
+
+def test_depth_may_begin_while_layers_move() -> None:
+    way = np.stack([10 + 2.0 * np.arange(FRAMES), np.full(FRAMES, 40.0)], axis=-1)
+    clip = scene(STILL, Board(way, (50, 40), 1.7, seed=5))
+    stream = make_tracker().stream(clip.camera, [Query.point(0, 140.0, 60.0), Query.point(15, 145.0, 100.0)])
+    for t in range(len(clip)):
+        frame = clip.frame(t)
+        state = stream.step(frame.rgb, frame.depth_m if t >= 15 else None, frame.stamp_s)
+    np.testing.assert_allclose(state.uv_px, [[140.0, 60.0], [145.0, 100.0]], atol=1.0)
+    assert np.isfinite(state.point_world).all()
 
 
 def test_queries_come_in_when_they_are_asked_for() -> None:

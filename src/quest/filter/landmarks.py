@@ -27,9 +27,9 @@ _COUNT = 400
 _FINE_PX = 5
 _NEAR_PX = 18
 _NEAR_COUNT = 25
-_MOST_BODIES = 16
+MOST_BODIES = 16
 _SURE = float(np.log(150.0))
-_NEIGHBOURS = 5
+NEIGHBOURS = 5
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ class Landmarks:
         The landmarks are ``around``: at :attr:`rest`, or at :attr:`point_world` for what is seen for the first time.
         """
         known = np.flatnonzero(np.isfinite(around).all(axis=-1))
-        if len(known) <= _NEIGHBOURS:
+        if len(known) <= NEIGHBOURS:
             return np.full((len(point), len(self.pose)), 1 / len(self.pose))
         asked = np.asarray(np.isfinite(point).all(axis=-1))
-        apart, index = KDTree(around[known]).query(np.where(asked[:, None], point, 0.0), _NEIGHBOURS + 1)
+        apart, index = KDTree(around[known]).query(np.where(asked[:, None], point, 0.0), NEIGHBOURS + 1)
         near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
         member = np.eye(len(self.pose))[self.body] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
         total = np.einsum("mn,mnb->mb", near, member[known][index]) * asked[:, None] + 1e-9
@@ -186,7 +186,7 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
     odd = (off.min(axis=1) > GATE) & np.isfinite(seen.depth_m)
     free = np.flatnonzero(odd & _surrounded(landmarks.point_world, odd))
     new = None
-    if known and len(bodies) < _MOST_BODIES:
+    if known and len(bodies) < MOST_BODIES:
         new = common_motion(landmarks.place[free, 0], seen.only(free), view, noise)
     if new is not None:
         motion, inlier = new
@@ -207,9 +207,9 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
 def _surrounded(point: Float[np.ndarray, "N 3"], odd: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     """Whether most points near each are odd as well: bodies are connected, and errors are scattered."""
     known = np.flatnonzero(np.isfinite(point).all(axis=-1))
-    if len(known) <= _NEIGHBOURS:
+    if len(known) <= NEIGHBOURS:
         return odd
-    _, near = KDTree(point[known]).query(point[known], _NEIGHBOURS + 1)
+    _, near = KDTree(point[known]).query(point[known], NEIGHBOURS + 1)
     most = np.zeros(len(point), dtype=bool)
     most[known] = odd[known][near].mean(axis=1) > 0.5
     return most
@@ -267,19 +267,27 @@ def sow(
     noise: Noise,
 ) -> Landmarks:
     """Add corners where there are none, closer together around the queries; with depth only where there is any."""
+    uv_px = new_corners(picture, landmarks.uv_px, around_px)
+    landmarks = replace(landmarks, surfaces=sow_surfaces(landmarks.surfaces, landmarks.pose, view))
+    return _born(landmarks, uv_px, view, noise)
+
+
+def new_corners(
+    picture: GreyPicture, uv_px: Float[np.ndarray, "N 2"], around_px: Float[np.ndarray, "K 2"]
+) -> Float[np.ndarray, "M 2"]:
+    """Corners of a picture where there are no points yet, closer together around some places."""
     near = np.zeros(picture.grey.shape, dtype=np.uint8)
     for x, y in around_px[np.isfinite(around_px).all(axis=-1)]:
         cv2.circle(near, (int(x), int(y)), _NEAR_PX, 1, -1)
     width, height = picture.size
-    column, row = np.floor(landmarks.uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
-    fine, all_over = _NEAR_COUNT * len(around_px) - int(near[row, column].sum()), _COUNT - len(landmarks.uv_px)
+    column, row = np.floor(uv_px).astype(np.int64).clip(0, (width - 1, height - 1)).T
+    fine, all_over = _NEAR_COUNT * len(around_px) - int(near[row, column].sum()), _COUNT - len(uv_px)
     new = [np.zeros((0, 2))]
     for cell_px, allowed, count in ((_FINE_PX, near, fine), (_CELL_PX, np.ones_like(near), all_over)):
-        for x, y in np.concatenate([landmarks.uv_px, *new]):
+        for x, y in np.concatenate([uv_px, *new]):
             cv2.circle(allowed, (int(x), int(y)), cell_px, 0, -1)
         new.append(corners(picture, allowed > 0, cell_px=cell_px, count=count))
-    landmarks = replace(landmarks, surfaces=sow_surfaces(landmarks.surfaces, landmarks.pose, view))
-    return _born(landmarks, np.concatenate(new), view, noise)
+    return np.concatenate(new)
 
 
 def layer_depth(

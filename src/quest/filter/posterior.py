@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from quest.filter.appearance import PATCH_PX, Likeness
+from quest.filter.appearance import CELL_REACH_PX, PATCH_PX, Likeness, Places
 from quest.filter.landmarks import Landmarks, ray_error
+from quest.filter.layers import Layers
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.queries import GATE, SURE, Queries
@@ -23,11 +24,13 @@ from quest.filter.view import View, in_image, move, move_back
 RIVALS = 3
 """Places elsewhere that are weighed."""
 _SAME_PX = 24.0
-"""Places nearer to each other than this, in two frames, are said to be of one thing."""
+"""Places nearer to each other than this are said to be one."""
 _OCCUPIED_PX = 12.0
 """Within which of another query's place there is no room for one more."""
 _TOGETHER_PX = 2.0
 """How far apart its own patch and its body's place are where both saw the same view of it."""
+_CARRIES_AT_LEAST = np.array([0.1, 1e-3])
+"""How probable it is that the world, or that any one of the others, carries what nothing around it is on."""
 _HALF, _HARDLY = float(np.log(0.5)), float(np.log(0.05))
 _MOST = 9.0
 """Log-odds are kept within this."""
@@ -53,7 +56,15 @@ class _Places:
     """Whether the depth is as predicted."""
 
 
-def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, dt_s: float, noise: Noise) -> Queries:
+def weigh(
+    queries: Queries,
+    landmarks: Landmarks,
+    layers: Layers | None,
+    picture: Picture,
+    view: View,
+    dt_s: float,
+    noise: Noise,
+) -> Queries:
     """Which hypotheses explain the frame; what is out of question begins anew at the best.
 
     The queries' own patches are followed into the frame already.
@@ -70,7 +81,7 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     rides = (log_odds[each, best] > 0) & queries.known
     here = np.where(rides, best + 1, 0)
     at_px = places.uv_px[each, here]
-    judged = _judged(queries, places, here, likeness, dt_s, noise)
+    judged = _judged(queries, places, here, layers, likeness, dt_s, noise)
 
     jumps = judged.rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near[each, best])
@@ -82,6 +93,9 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
     point = np.repeat(view.lift(own_px, depth_m)[:, None], log_odds.shape[1], axis=1)
     together = queries.own_found & (apart[each, best] < _TOGETHER_PX**2)
     confirmed = rides & together & places.agrees[each, here] & (judged.seen_log_odds > 0)
+    if layers is not None:
+        last_px = np.where(jumps[:, None], judged.rival_px, at_px)
+        judged = judged.seen_at(last_px, jumps | (judged.seen_log_odds > 0), layers)
     return replace(
         _viewed(judged, confirmed, at_px, picture),
         own_px=own_px,
@@ -101,19 +115,25 @@ def weigh(queries: Queries, landmarks: Landmarks, picture: Picture, view: View, 
 
 
 def _judged(
-    queries: Queries, places: _Places, here: Int[np.ndarray, " K"], likeness: Likeness, dt_s: float, noise: Noise
+    queries: Queries,
+    places: _Places,
+    here: Int[np.ndarray, " K"],
+    layers: Layers | None,
+    likeness: Likeness,
+    dt_s: float,
+    noise: Noise,
 ) -> Queries:
     """Whether each query is seen at its most probable place, occluded there, elsewhere, or nowhere in the frame."""
     each = np.arange(len(queries))
     seen, occluded, explained = (value[each, here] for value in (places.seen, places.occluded, places.covered))
-    rival_px, rival, others = _elsewhere(queries, places.uv_px[each, here], likeness, noise)
+    rival_px, rival, others = _elsewhere(queries, places.uv_px[each, here], layers, likeness, noise)
     # What is out of view, or behind something, is still there: then hardly anything speaks for elsewhere.
     elsewhere = np.where(explained, _HARDLY, _HALF)
     rival, others = (ratio + elsewhere - _HALF for ratio in (rival, others))
     # An occlusion that nothing explains does not last.
     hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
     stays, left = np.logaddexp(seen, hidden), np.logaddexp(np.logaddexp(rival, others), elsewhere)
-    same = ((rival_px - queries.rival_px) ** 2).sum(axis=-1) < _SAME_PX**2
+    same = _same(rival_px, queries.rival_px)
     rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
     told = rival - np.logaddexp(stays, others) - rival_log_odds
     seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
@@ -169,16 +189,18 @@ def _carriers(
     parted = np.logaddexp(np.log(1 - noise.stray) + parted, np.log(noise.stray))
     there = np.logaddexp(places.seen, places.occluded)
     share = landmarks.share(queries.rest, landmarks.rest)
-    around = np.log(share + np.where(np.arange(share.shape[1]) > 0, 1e-3, 0.1))
+    around = np.log(share + _CARRIES_AT_LEAST[np.minimum(np.arange(share.shape[1]), 1)])
     told = np.where(queries.own_found[:, None], parted, 0.0) + there[:, 1:] - there[:, :1]
     return noise.rests_log_odds + told + around
 
 
 def _elsewhere(
-    queries: Queries, at_px: Float[np.ndarray, "K 2"], likeness: Likeness, noise: Noise
+    queries: Queries, at_px: Float[np.ndarray, "K 2"], layers: Layers | None, likeness: Likeness, noise: Noise
 ) -> tuple[Float[np.ndarray, "K 2"], Float[np.ndarray, " K"], Float[np.ndarray, " K"]]:
     """The most probable place elsewhere, its log-likelihood ratio against nowhere, and that of all other places."""
     found = likeness.elsewhere(at_px, RIVALS, noise)
+    if layers is not None:
+        found = _or_where_it_was(found, queries, at_px, layers, likeness, noise)
     taken = ((found.uv_px[:, :, None] - at_px) ** 2).sum(axis=-1) < _OCCUPIED_PX**2
     free = 1 - (taken / (1 + np.exp(-queries.seen_log_odds))).max(axis=-1)
     ratio = found.log_odds + np.log(free)
@@ -186,6 +208,41 @@ def _elsewhere(
     best = ratio[each, first]
     ratio[each, first] = -np.inf
     return found.uv_px[each, first], best, np.logaddexp.reduce(ratio, axis=1)
+
+
+def _or_where_it_was(
+    found: Places,
+    queries: Queries,
+    at_px: Float[np.ndarray, "K 2"],
+    layers: Layers,
+    likeness: Likeness,
+    noise: Noise,
+) -> Places:
+    """Places elsewhere, and those to which the world, and what was around it when it was seen last, brought it.
+
+    Its patch may have gone off with what passed in front of it. So it is as probable there as the layers are to carry
+    it, and not by chance alone, as anywhere else.
+    """
+    share = queries.seen_share + _CARRIES_AT_LEAST[np.minimum(np.arange(len(layers)), 1)]
+    which = np.stack([np.zeros(len(queries), dtype=np.int64), share.argmax(axis=1)], axis=1)
+    brought = np.take_along_axis(layers.brought(queries.seen_place), which[..., None], axis=1)
+    prior = np.log(np.take_along_axis(share, which, axis=1)).clip(max=0.0)
+    possible = in_image(brought, likeness.picture.size) & ~_same(brought, at_px[:, None])
+    looked = likeness.at(np.where(possible[..., None], brought, at_px[:, None]), noise, CELL_REACH_PX)
+    there = _same(found.uv_px[:, :, None], brought[:, None]) & possible[:, None]
+    gain = np.where(there, prior[:, None] - noise.jump_log_odds, 0.0).max(axis=-1).clip(min=0.0)
+    uv_px = np.concatenate([found.uv_px, looked.uv_px], axis=1)
+    log_odds = np.concatenate([found.log_odds + gain, np.where(possible, looked.log_odds + prior, -np.inf)], axis=1)
+    # One place counts once, where it looks most like it.
+    better = log_odds[:, None] > log_odds[:, :, None]
+    better |= (log_odds[:, None] == log_odds[:, :, None]) & np.tri(log_odds.shape[1], k=-1, dtype=bool)
+    twice = (better & _same(uv_px[:, None], uv_px[:, :, None])).any(axis=2)
+    return Places(uv_px, np.where(twice, -np.inf, log_odds))
+
+
+def _same(one: Float[np.ndarray, "*#B 2"], other: Float[np.ndarray, "*#B 2"]) -> Bool[np.ndarray, "*B"]:
+    """Whether places are so near each other that they are said to be one."""
+    return np.asarray(((one - other) ** 2).sum(axis=-1) < _SAME_PX**2)
 
 
 def _viewed(

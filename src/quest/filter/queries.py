@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from quest.filter.appearance import PATCH_PX
+from quest.filter.layers import Layers, with_column
 from quest.filter.noise import Noise
 from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
 from quest.filter.picture import GreyPicture, Picture
@@ -52,6 +53,10 @@ class Queries:
     """That it is not there."""
     unseen_s: Float[np.ndarray, " K"]
     """For how long it was not seen there, and nothing explains why, seconds."""
+    seen_place: Float[np.ndarray, "K L 2"]
+    """Where it was seen last, on each layer of pictures without depth; NaN with depth."""
+    seen_share: Float[np.ndarray, "K L"]
+    """Share of each layer around there."""
     rival_px: Float[np.ndarray, "K 2"]
     """The most probable place elsewhere."""
     rival_log_odds: Float[np.ndarray, " K"]
@@ -65,6 +70,7 @@ class Queries:
         depth_m: Float[np.ndarray, " K"],
         place: Float[np.ndarray, "K B 3"],
         error: Float[np.ndarray, "K 3"],
+        layers: Layers | None,
     ) -> Queries:
         """Pixels of a frame that are named in it."""
         count, bodies = place.shape[:2]
@@ -83,6 +89,8 @@ class Queries:
             seen_log_odds=np.full(count, SURE),
             lost_log_odds=np.full(count, -SURE),
             unseen_s=np.zeros(count),
+            seen_place=_on(layers, uv_px)[0],
+            seen_share=_on(layers, uv_px)[1],
             rival_px=uv_px,
             rival_log_odds=np.full(count, -SURE),
         )
@@ -106,6 +114,15 @@ class Queries:
             lost_log_odds=np.where(at, -SURE, self.lost_log_odds),
             unseen_s=np.where(at, 0.0, self.unseen_s),
             rival_log_odds=np.where(at, -SURE, self.rival_log_odds),
+        )
+
+    def seen_at(self, uv_px: Float[np.ndarray, "K 2"], which: Bool[np.ndarray, " K"], layers: Layers) -> Queries:
+        """Some of them are seen at some pixels."""
+        place, share = _on(layers, uv_px)
+        return replace(
+            self,
+            seen_place=np.where(which[:, None, None], place, self.seen_place),
+            seen_share=np.where(which[:, None], share, self.seen_share),
         )
 
     @property
@@ -132,14 +149,29 @@ class Queries:
         """Where each is on its most probable body."""
         return move(pose[self.body], self.rest)
 
-    def meet(self, bodies: int) -> Queries:
-        """A body that begins to move was part of the world: what rested there may ride on it."""
+    def meet(self, bodies: int, layers: Layers | None) -> Queries:
+        """A body, or layer, that begins to move was part of the world: what rested there may ride on it."""
         new = bodies - self.place.shape[1]
+        place, share = (self.seen_place, self.seen_share) if layers is not None else _on(None, self.own_px)
+        if layers is not None and layers.new is not None:
+            place = with_column(place, layers.new, place[:, 0])
+            share = with_column(share, layers.new, np.zeros(len(self)))
         return replace(
             self,
+            seen_place=place,
+            seen_share=share,
             place=np.concatenate([self.place, np.repeat(self.place[:, :1], new, axis=1)], axis=1),
             log_odds=np.concatenate([self.log_odds, np.repeat(self.log_odds[:, :1], new, axis=1)], axis=1),
         )
+
+
+def _on(
+    layers: Layers | None, uv_px: Float[np.ndarray, "K 2"]
+) -> tuple[Float[np.ndarray, "K L 2"], Float[np.ndarray, "K L"]]:
+    """Places of some pixels on each layer, and the share of each around them; of no layer with depth."""
+    if layers is None:
+        return np.full((len(uv_px), 1, 2), np.nan), np.zeros((len(uv_px), 1))
+    return layers.onto(uv_px), layers.share(uv_px)
 
 
 def follow_patches(

@@ -26,7 +26,8 @@ LEAST = 8
 """Fewer points that agree are no body."""
 _SURFACE_GATE = 9.0
 _TRIALS = 200
-_SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
+SCALES = (16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0)
+"""How far off a residual may be before it counts less, in gates, from step to step of a fit."""
 _FAR = 1e3
 """Metres of depth error where no depth was measured."""
 
@@ -143,7 +144,7 @@ def fit(
     pose, change = expected.copy(), np.zeros(6)
     inverse = np.linalg.inv(seen.spread)
     told = np.zeros((6, 6))
-    for scale in _SCALES:
+    for scale in SCALES:
         off, jacobian = _linearise(move(pose, place), middle + change[3:], seen, view)
         weight = (1 + np.einsum("ni,nij,nj->n", off, inverse, off) / (scale * GATE)) ** -2
         weighted = weight[:, None, None] * np.swapaxes(jacobian, -1, -2) @ inverse

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from quest.filter.appearance import CELL_REACH_PX, Likeness
 from quest.filter.joints import Joint, joints_of
 from quest.filter.landmarks import Landmarks, observe, ray_error, sow
+from quest.filter.layers import Layers, observe_layers, sow_layers
 from quest.filter.local_motion import follow
 from quest.filter.noise import Noise
 from quest.filter.picture import GreyPicture, Picture
@@ -38,6 +39,8 @@ class FilterState:
     stamp_s: float
     landmarks: Landmarks
     queries: Queries
+    layers: Layers | None
+    """What is known of pictures as long as none had depth."""
     warp: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.eye(3))
     """Homography of the picture since the previous frame, for places without depth; in the picture's pixels."""
 
@@ -45,9 +48,10 @@ class FilterState:
 def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterState:
     """The state after the first frame, without queries."""
     nowhere = np.zeros((0, 2))
-    landmarks = sow(Landmarks.none(), picture, view, nowhere, noise)
-    queries = Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3)))
-    return FilterState(picture, view, stamp_s, landmarks, queries)
+    layers = Layers.none(picture.size) if view.depth_m is None else None
+    landmarks, layers = _sown(Landmarks.none(), layers, picture, view, nowhere, noise)
+    queries = Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3)), layers)
+    return FilterState(picture, view, stamp_s, landmarks, queries, layers)
 
 
 def step(
@@ -67,17 +71,35 @@ def step(
     landmarks, pose, warp = observe(
         state.landmarks, state.picture, grey, state.view, depth_m, cam_from_world, dt_s, noise
     )
-    view = View(state.view.matrix, pose, depth_m)
-    queries = state.queries.meet(len(landmarks.pose))
+    view, layers = View(state.view.matrix, pose, depth_m), state.layers
+    if layers is not None:
+        layers = observe_layers(layers, state.picture, grey, dt_s, noise)
+        warp = layers.world_since(state.layers)
+        layers = layers if depth_m is None else None
+    queries = state.queries.meet(len(landmarks.pose), layers)
     if len(queries):
         body = np.where(queries.rides, queries.body, 0)
         expected_px = _carried(queries.own_px, body, state, landmarks, view, warp)
         queries = follow_patches(queries, state.picture, grey, expected_px, state.view, view, dt_s, noise)
     picture = grey.described(describe())
     if len(queries):
-        queries = weigh(queries, landmarks, picture, view, dt_s, noise)
-    landmarks = sow(landmarks, picture, view, _at(queries, landmarks, view)[0], noise)
-    return FilterState(picture, view, stamp_s, landmarks, queries, warp)
+        queries = weigh(queries, landmarks, layers, picture, view, dt_s, noise)
+    landmarks, layers = _sown(landmarks, layers, picture, view, _at(queries, landmarks, view)[0], noise)
+    return FilterState(picture, view, stamp_s, landmarks, queries, layers, warp)
+
+
+def _sown(
+    landmarks: Landmarks,
+    layers: Layers | None,
+    picture: Picture,
+    view: View,
+    around_px: Float[np.ndarray, "K 2"],
+    noise: Noise,
+) -> tuple[Landmarks, Layers | None]:
+    """With new points where there are none; without depth so far they are those of layers."""
+    if layers is None:
+        return sow(landmarks, picture, view, around_px, noise), None
+    return landmarks, sow_layers(layers, picture, around_px)
 
 
 def _at(
@@ -96,9 +118,10 @@ def ask(state: FilterState, uv_px: Float[np.ndarray, "K 2"], noise: Noise) -> Fi
     depth_m, pose = state.view.near_depth_at(uv_px), state.landmarks.pose
     point = state.view.lift(uv_px, depth_m)
     place = move_back(pose, np.repeat(point[:, None], len(pose), axis=1))
-    new = Queries.named(state.picture, uv_px, depth_m, place, ray_error(state.view, uv_px, point, noise))
-    landmarks = sow(state.landmarks, state.picture, state.view, uv_px, noise)
-    return replace(state, landmarks=landmarks, queries=state.queries.join(new))
+    error = ray_error(state.view, uv_px, point, noise)
+    new = Queries.named(state.picture, uv_px, depth_m, place, error, state.layers)
+    landmarks, layers = _sown(state.landmarks, state.layers, state.picture, state.view, uv_px, noise)
+    return replace(state, landmarks=landmarks, layers=layers, queries=state.queries.join(new))
 
 
 def keep(state: FilterState, rows: Sequence[int]) -> FilterState:
