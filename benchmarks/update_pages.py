@@ -398,6 +398,8 @@ def simulated(followed: list[dict[str, Any]], found: list[dict[str, Any]]) -> It
     rows, unasked = ([r for r in each if r["level"] == 1 and r["suite"] == "standard"] for each in (followed, found))
     for source, place in SOURCES.items():
         moved = {row["tracker"]: row for row in rows if row["source"] == source and matches(row, MOVED)}
+        if not moved:
+            continue
         for measure, where in (("median error, px", "metrics.median_px"), ("right identity, %", "%metrics.acc")):
             yield summary_line(place, "objects/tracks", measure, where, moved)
         own = {row["tracker"]: row for row in unasked if row["source"] == source and matches(row, FOUND)}
