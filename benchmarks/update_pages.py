@@ -148,6 +148,15 @@ RESULTS = Page(
             "--mix broad --sensor stereo --size 480 --every 2`.",
             suite="hands",
         ),
+        tracking(
+            "free.json",
+            "Free furniture",
+            "Test objects of Sweet Home 3D's libraries, which taught nothing. Takes: `quest generate --out "
+            "runs/takes/free-test --split test --no-partnet --imported free --mix broad --size 480 --sensor stereo "
+            "--level 1 --views 1`.",
+            suite="standard",
+        ),
+        discovery("free.json", "Discovery on free furniture"),
         Table(
             "predicted_joints.json",
             "Joints from predicted tracks",

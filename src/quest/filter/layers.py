@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import expm
 from scipy.spatial import KDTree
 
 from quest.filter.camera_motion import INLIER_PX
@@ -59,8 +59,15 @@ class Layers:
     @classmethod
     def none(cls, size: tuple[int, int]) -> Layers:
         """Before the first frame."""
-        shapes = ((0, 2), (0, 2, 2), (0, 1, 2), (0, 1))
-        return cls(*(np.zeros(shape) for shape in shapes), np.eye(3)[None], np.zeros((1, 8, 8)), size)
+        return cls(
+            np.zeros((0, 2)),
+            np.zeros((0, 2, 2)),
+            np.zeros((0, 1, 2)),
+            np.zeros((0, 1)),
+            np.eye(3)[None],
+            np.zeros((1, 8, 8)),
+            size,
+        )
 
     def __len__(self) -> int:
         return len(self.map)
@@ -170,15 +177,16 @@ def _fitted(layers: Layers, index: int, mine: Int[np.ndarray, " M"], spread: Flo
     told, change = np.zeros((8, 8)), np.zeros(8)
     for scale in SCALES:
         off, by_change = _residual(layers, index, mine)
-        use = np.isfinite(off).all(axis=1)
+        use = np.asarray(np.isfinite(off).all(axis=1))
         off, by_change = np.where(use[:, None], off, 0.0), np.where(use[:, None, None], by_change, 0.0)
         weight = use * (1 + np.einsum("ni,nij,nj->n", off, inverse, off) / (scale * _GATE)) ** -2
         weighted = weight[:, None, None] * np.swapaxes(by_change, 1, 2) @ inverse
         told = (weighted @ by_change).sum(axis=0)
         delta = np.linalg.solve(told + known, np.einsum("nij,nj->i", weighted, off) - known @ change)
         change = change + delta
-        moved = expm(np.tensordot(delta, _CHANGES, 1)) @ layers.map[index]
-        layers = layers._with(index, moved, layers.map_covariance[index])
+        # Not by SciPy: threads of its OpenBLAS keep all cores busy with waiting long after such a product.
+        moved = torch.linalg.matrix_exp(torch.from_numpy(np.einsum("i,ijk->jk", delta, _CHANGES))).numpy()
+        layers = layers._with(index, moved @ layers.map[index], layers.map_covariance[index])
     return layers._with(index, layers.map[index], np.linalg.inv(told + known))
 
 

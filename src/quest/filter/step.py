@@ -71,11 +71,11 @@ def step(
     landmarks, pose, warp = observe(
         state.landmarks, state.picture, grey, state.view, depth_m, cam_from_world, dt_s, noise
     )
-    view, layers = View(state.view.matrix, pose, depth_m), state.layers
-    if layers is not None:
-        layers = observe_layers(layers, state.picture, grey, dt_s, noise)
-        warp = layers.world_since(state.layers)
-        layers = layers if depth_m is None else None
+    view, layers = View(state.view.matrix, pose, depth_m), None
+    if state.layers is not None:
+        seen = observe_layers(state.layers, state.picture, grey, dt_s, noise)
+        warp = seen.world_since(state.layers)
+        layers = seen if depth_m is None else None
     queries = state.queries.meet(len(landmarks.pose), layers)
     if len(queries):
         body = np.where(queries.rides, queries.body, 0)
