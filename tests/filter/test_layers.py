@@ -66,3 +66,18 @@ def test_a_moving_camera_moves_the_world_along() -> None:
     start = LARGER * np.array([[90.0, 60.0]])
     at = states[-1].brought(np.repeat(states[0].onto(start)[:, :1], len(states[-1]), axis=1))
     np.testing.assert_allclose(at[0, 0], start[0] - LARGER * np.array([FOCAL * 0.4 / WALL_M, 0]), atol=0.5)
+
+
+def test_a_map_that_shrinks_a_layer_to_nothing_is_none() -> None:
+    layers = Layers.none(LARGE)
+    for bad in (np.zeros((3, 3)), np.diag([1e-3, 1e-3, 1.0]), np.diag([-1.0, 1.0, 1.0]), np.full((3, 3), np.nan)):
+        assert layers._with(0, bad, np.eye(8)) is layers
+
+
+def test_pictures_without_corners_have_layers_without_points() -> None:
+    grey, noise, nowhere = GreyPicture(np.full(LARGE[::-1], 90, np.uint8)), Noise(), np.zeros((0, 2))
+    layers = sow_layers(Layers.none(LARGE), grey, nowhere)
+    for _ in range(3):
+        layers = sow_layers(observe_layers(layers, grey, grey, 1 / 15, noise), grey, nowhere)
+    at = np.array([[100.0, 50.0]])
+    np.testing.assert_allclose(layers.brought(layers.onto(at))[0, 0], at[0], atol=1e-6)

@@ -29,6 +29,8 @@ from quest.filter.rigid_motion import LEAST, SCALES
 _GATE = 12.0
 """Squared residual in standard deviations beyond which a point is not on a layer (chi-square, 2 degrees, 0.25 %)."""
 _SURE = float(np.log(150.0))
+_LEAST_AREA = 0.01
+"""To what share of its area a layer may shrink."""
 _FARTHEST = 2.0
 """Units from the middle of the picture beyond which nothing is in view."""
 _CHANGES: Float[np.ndarray, "8 3 3"] = np.zeros((8, 3, 3))
@@ -115,6 +117,10 @@ class Layers:
         return units * max(self.size) + np.array(self.size) / 2
 
     def _with(self, index: int, map: Float[np.ndarray, "3 3"], covariance: Float[np.ndarray, "8 8"]) -> Layers:
+        """With another map; one that folds a layer, or shrinks it to nothing, is none."""
+        scale = np.linalg.det(map) / map[2, 2] ** 3 if map[2, 2] > 0 else 0.0
+        if not scale > _LEAST_AREA:
+            return self
         maps, covariances = self.map.copy(), self.map_covariance.copy()
         maps[index], covariances[index] = map / map[2, 2], covariance
         return replace(self, map=maps, map_covariance=covariances)
@@ -133,7 +139,7 @@ def observe_layers(layers: Layers, previous: GreyPicture, picture: GreyPicture, 
         layers = _fitted(_guessed(layers, i, from_px[mine], mine), i, mine, spread)
     of_world = layer == 0
     off = ((layers.brought(layers.place)[of_world, 0] - layers.uv_px[of_world]) ** 2).sum(axis=-1)
-    if of_world.any():  # the median of chi-square is ln 4
+    if np.isfinite(off).any():  # the median of chi-square is ln 4
         spread = layers.covariance + max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) * np.eye(2)
     off = np.stack([_misfit(layers, i, spread) for i in range(len(layers))], axis=1)
     told = (_GATE - np.minimum(off, 3 * _GATE)) / 2 + np.log(layers.share(layers.uv_px) + noise.stray)
@@ -225,7 +231,7 @@ def _founded(
         return layers
     both = (layers.place[free, 0], layers._units(layers.uv_px[free]))
     motion, inlier = cv2.estimateAffine2D(*both, method=cv2.RANSAC, ransacReprojThreshold=INLIER_PX / max(layers.size))
-    if motion is None or inlier.sum() < LEAST or np.linalg.det(motion[:, :2]) <= 0:
+    if motion is None or inlier.sum() < LEAST or not np.linalg.det(motion[:, :2]) > _LEAST_AREA:
         return layers
     members = free[inlier[:, 0] > 0]
     joins = np.full(len(layers.uv_px), -_SURE)

@@ -74,6 +74,7 @@ class Queries:
     ) -> Queries:
         """Pixels of a frame that are named in it."""
         count, bodies = place.shape[:2]
+        seen_place, seen_share = _on(layers, uv_px)
         return cls(
             anchor=tiles(picture, uv_px),
             descriptor=picture.describe(uv_px)[:, None].repeat(2, axis=1),
@@ -89,8 +90,8 @@ class Queries:
             seen_log_odds=np.full(count, SURE),
             lost_log_odds=np.full(count, -SURE),
             unseen_s=np.zeros(count),
-            seen_place=_on(layers, uv_px)[0],
-            seen_share=_on(layers, uv_px)[1],
+            seen_place=seen_place,
+            seen_share=seen_share,
             rival_px=uv_px,
             rival_log_odds=np.full(count, -SURE),
         )
