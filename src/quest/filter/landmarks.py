@@ -28,7 +28,8 @@ _FINE_PX = 5
 _NEAR_PX = 18
 _NEAR_COUNT = 25
 MOST_BODIES = 16
-_SURE = float(np.log(150.0))
+SURE = float(np.log(150.0))
+"""Log-odds beyond which a hypothesis is out of question."""
 NEIGHBOURS = 5
 
 
@@ -110,10 +111,8 @@ class Landmarks:
         if len(known) <= NEIGHBOURS:
             return np.full((len(point), len(self.pose)), 1 / len(self.pose))
         asked = np.asarray(np.isfinite(point).all(axis=-1))
-        apart, index = KDTree(around[known]).query(np.where(asked[:, None], point, 0.0), NEIGHBOURS + 1)
-        near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
-        member = np.eye(len(self.pose))[self.body] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
-        total = np.einsum("mn,mnb->mb", near, member[known][index]) * asked[:, None] + 1e-9
+        total = members_near(np.where(asked[:, None], point, 0.0), around[known], self.log_weight[known])
+        total = total * asked[:, None] + 1e-9
         return total / total.sum(axis=1, keepdims=True)
 
 
@@ -184,15 +183,15 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
     landmarks = replace(landmarks, bodies=bodies, surfaces=surfaces)
     off = _misfits(landmarks, seen, view)
     odd = (off.min(axis=1) > GATE) & np.isfinite(seen.depth_m)
-    free = np.flatnonzero(odd & _surrounded(landmarks.point_world, odd))
+    free = np.flatnonzero(odd & surrounded(landmarks.point_world, odd))
     new = None
     if known and len(bodies) < MOST_BODIES:
         new = common_motion(landmarks.place[free, 0], seen.only(free), view, noise)
     if new is not None:
         motion, inlier = new
         middle = move(motion, landmarks.place[free[inlier], 0]).mean(axis=0)
-        joins = np.full(len(weight), -_SURE)
-        joins[free[inlier]] = _SURE
+        joins = np.full(len(weight), -SURE)
+        joins[free[inlier]] = SURE
         weight = np.concatenate([weight, joins[:, None]], axis=1)
         landmarks = replace(
             landmarks,
@@ -201,10 +200,20 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
             place=np.concatenate([landmarks.place, landmarks.place[:, :1]], axis=1),
             log_weight=weight,
         )
-    return replace(landmarks, log_weight=weight).only(weight.max(axis=1) > -_SURE)
+    return replace(landmarks, log_weight=weight).only(weight.max(axis=1) > -SURE)
 
 
-def _surrounded(point: Float[np.ndarray, "N 3"], odd: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
+def members_near(
+    point: Float[np.ndarray, "K D"], around: Float[np.ndarray, "N D"], log_weight: Float[np.ndarray, "N B"]
+) -> Float[np.ndarray, "K B"]:
+    """How many of the points near some places each body carries, the nearer ones the more; sure outliers count not."""
+    apart, index = KDTree(around).query(point, NEIGHBOURS + 1)
+    near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
+    member = np.eye(log_weight.shape[1])[log_weight.argmax(axis=1)] * (log_weight.max(axis=1) > -SURE)[:, None]
+    return np.asarray(np.einsum("mn,mnb->mb", near, member[index]))
+
+
+def surrounded(point: Float[np.ndarray, "N D"], odd: Bool[np.ndarray, " N"]) -> Bool[np.ndarray, " N"]:
     """Whether most points near each are odd as well: bodies are connected, and errors are scattered."""
     known = np.flatnonzero(np.isfinite(point).all(axis=-1))
     if len(known) <= NEIGHBOURS:

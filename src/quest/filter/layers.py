@@ -17,18 +17,16 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.spatial import KDTree
 
 from quest.filter.camera_motion import INLIER_PX
-from quest.filter.landmarks import MOST_BODIES, NEIGHBOURS, new_corners
+from quest.filter.landmarks import MOST_BODIES, NEIGHBOURS, SURE, members_near, new_corners, surrounded
 from quest.filter.local_motion import follow
 from quest.filter.noise import Noise
 from quest.filter.picture import GreyPicture
 from quest.filter.rigid_motion import LEAST, SCALES
 
-_GATE = 12.0
-"""Squared residual in standard deviations beyond which a point is not on a layer (chi-square, 2 degrees, 0.25 %)."""
-_SURE = float(np.log(150.0))
+GATE = 12.0
+"""Squared distance in standard deviations beyond which two places differ (chi-square, 2 degrees, 0.25 %)."""
 _LEAST_AREA = 0.01
 """To what share of its area a layer may shrink."""
 _FARTHEST = 2.0
@@ -97,10 +95,7 @@ class Layers:
         """Share of each layer in the points near some pixels."""
         if len(self.uv_px) <= NEIGHBOURS:
             return np.full((len(uv_px), len(self)), 1 / len(self))
-        apart, index = KDTree(self.uv_px).query(uv_px, NEIGHBOURS + 1)
-        near = np.exp(-((apart / np.maximum(apart[:, -1:], 1e-9)) ** 2) / 2)
-        member = np.eye(len(self))[self.layer] * (self.log_weight.max(axis=1) > -_SURE)[:, None]
-        total = np.einsum("mn,mnl->ml", near, member[index]) + 1e-9
+        total = members_near(uv_px, self.uv_px, self.log_weight) + 1e-9
         return np.asarray(total / total.sum(axis=1, keepdims=True))
 
     def world_since(self, before: Layers) -> Float[np.ndarray, "3 3"]:
@@ -142,10 +137,10 @@ def observe_layers(layers: Layers, previous: GreyPicture, picture: GreyPicture, 
     if np.isfinite(off).any():  # the median of chi-square is ln 4
         spread = layers.covariance + max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) * np.eye(2)
     off = np.stack([_misfit(layers, i, spread) for i in range(len(layers))], axis=1)
-    told = (_GATE - np.minimum(off, 3 * _GATE)) / 2 + np.log(layers.share(layers.uv_px) + noise.stray)
+    told = (GATE - np.minimum(off, 3 * GATE)) / 2 + np.log(layers.share(layers.uv_px) + noise.stray)
     weight = layers.log_weight + (told - layers.log_weight) * min(dt_s / noise.points_s, 1.0)
-    layers = _founded(replace(layers, log_weight=weight), off.min(axis=1) > _GATE, spread, dt_s, noise)
-    return layers.only(layers.log_weight.max(axis=1) > -_SURE)
+    layers = _founded(replace(layers, log_weight=weight), off.min(axis=1) > GATE, spread, dt_s, noise)
+    return layers.only(layers.log_weight.max(axis=1) > -SURE)
 
 
 def sow_layers(layers: Layers, picture: GreyPicture, around_px: Float[np.ndarray, "K 2"]) -> Layers:
@@ -185,7 +180,7 @@ def _fitted(layers: Layers, index: int, mine: Int[np.ndarray, " M"], spread: Flo
         off, by_change = _residual(layers, index, mine)
         use = np.asarray(np.isfinite(off).all(axis=1))
         off, by_change = np.where(use[:, None], off, 0.0), np.where(use[:, None, None], by_change, 0.0)
-        weight = use * (1 + np.einsum("ni,nij,nj->n", off, inverse, off) / (scale * _GATE)) ** -2
+        weight = use * (1 + np.einsum("ni,nij,nj->n", off, inverse, off) / (scale * GATE)) ** -2
         weighted = weight[:, None, None] * np.swapaxes(by_change, 1, 2) @ inverse
         told = (weighted @ by_change).sum(axis=0)
         delta = np.linalg.solve(told + known, np.einsum("nij,nj->i", weighted, off) - known @ change)
@@ -223,19 +218,16 @@ def _founded(
     """
     unused = np.setdiff1d(np.arange(1, len(layers)), layers.layer)
     new = len(layers) if len(layers) < MOST_BODIES else next(iter(unused.tolist()), None)
-    if len(layers.uv_px) <= NEIGHBOURS or new is None:
-        return layers
-    _, near = KDTree(layers.uv_px).query(layers.uv_px, NEIGHBOURS + 1)
-    free = np.flatnonzero(odd & (odd[near].mean(axis=1) > 0.5))
-    if len(free) < LEAST:
+    free = np.flatnonzero(odd & surrounded(layers.uv_px, odd))
+    if len(free) < LEAST or new is None:
         return layers
     both = (layers.place[free, 0], layers._units(layers.uv_px[free]))
     motion, inlier = cv2.estimateAffine2D(*both, method=cv2.RANSAC, ransacReprojThreshold=INLIER_PX / max(layers.size))
     if motion is None or inlier.sum() < LEAST or not np.linalg.det(motion[:, :2]) > _LEAST_AREA:
         return layers
     members = free[inlier[:, 0] > 0]
-    joins = np.full(len(layers.uv_px), -_SURE)
-    joins[members] = _SURE
+    joins = np.full(len(layers.uv_px), -SURE)
+    joins[members] = SURE
     layers = replace(
         layers,
         place=with_column(layers.place, new, layers.place[:, 0]),

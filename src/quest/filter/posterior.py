@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from quest.filter.appearance import CELL_REACH_PX, PATCH_PX, Likeness, Places
-from quest.filter.landmarks import Landmarks, ray_error
-from quest.filter.layers import Layers
+from quest.filter.landmarks import SURE, Landmarks, ray_error
+from quest.filter.layers import GATE, Layers
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
-from quest.filter.queries import GATE, SURE, Queries
+from quest.filter.queries import Queries
 from quest.filter.surfaces import depth_error, depth_ratio
 from quest.filter.view import View, in_image, move, move_back
 

@@ -8,17 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from quest.filter.appearance import PATCH_PX
-from quest.filter.layers import Layers, with_column
+from quest.filter.landmarks import SURE
+from quest.filter.layers import GATE, Layers, with_column
 from quest.filter.noise import Noise
 from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
 from quest.filter.picture import GreyPicture, Picture
 from quest.filter.surfaces import depth_error
 from quest.filter.view import View, move
-
-SURE = float(np.log(150.0))
-"""Log-odds beyond which a hypothesis is out of question."""
-GATE = 12.0
-"""Squared distance in standard deviations beyond which two places differ (chi-square, 0.25 %)."""
 
 
 @dataclass(frozen=True)
