@@ -12,7 +12,15 @@ from quest.filter.bodies import Bodies, go_on, on_joint, screw, twist, update
 from quest.filter.camera_motion import stands_still
 from quest.filter.noise import Noise
 from quest.filter.rigid_motion import Seen, Surface, common_motion, fit, misfit
-from quest.filter.surfaces import Surfaces, depth_ratio, measure, sow_surfaces
+from quest.filter.surfaces import (
+    Surfaces,
+    depth_error,
+    depth_growth,
+    depth_ratio,
+    in_front,
+    measure,
+    sow_surfaces,
+)
 from quest.filter.view import View, move, move_back
 from quest.types import Query
 from tests.filter.scenes import SIZE, Board, follow, scene
@@ -113,6 +121,30 @@ def test_depth_ratio_speaks_for_against_and_not_at_all() -> None:
     assert ratio[0] > 1
     assert ratio[1] < -2
     np.testing.assert_array_equal(ratio[2:], 0)
+
+
+def test_what_is_in_front_is_told_by_degrees() -> None:
+    off_m = np.array([0.1, 0.0, -0.04, -0.08, -0.5, np.nan])
+    front = in_front(off_m, np.full(6, 0.03), NOISE)
+    assert (np.diff(front[:5]) > 0).all()
+    assert front[1] < 0.1
+    assert 0.1 < front[2] < 0.5
+    assert front[3] > 0.8
+    assert front[4] > 0.999
+    assert front[5] == 0
+
+
+@pytest.mark.parametrize("grows", [0.0, 0.002, 0.008])
+def test_the_noise_of_depth_is_measured_on_a_frame(grows: float) -> None:
+    """A floor and a wall, seen by a camera that errs in disparity, with holes."""
+    rng = np.random.default_rng(0)
+    row, column = np.mgrid[:240, :320]
+    inverse = np.maximum(0.2, 0.1 + row / 300 + column / 3000) + rng.normal(0, 1, (240, 320)) * grows
+    depth_m = np.where(rng.random((240, 320)) < 0.2, 0, 1 / inverse)
+    assert depth_growth(depth_m) == pytest.approx(grows, rel=0.05, abs=1e-4)
+    measured = replace(NOISE, depth_grows=grows)
+    assert depth_error(np.array([4.0]), measured) == pytest.approx(max(0.04, 16 * grows))
+    assert depth_growth(np.where(row < 4, depth_m, 0)) is None
 
 
 def test_a_camera_stands_still_until_points_say_otherwise() -> None:

@@ -37,6 +37,8 @@ class Noise:
     """Error of a depth, as a share of it."""
     depth_m: float = 0.015
     """Its least error, metres."""
+    depth_grows: float = 0.0
+    """How much more it errs by chance, for the square of the depth, 1/m: measured on every stream."""
     relief_m: float = 0.04
     """How far the surface around an entity stands out or falls back, metres."""
     speed_m_s: float = 1.0

@@ -18,7 +18,7 @@ from quest.filter.layers import GATE, Layers
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.queries import Queries
-from quest.filter.surfaces import depth_error, depth_ratio
+from quest.filter.surfaces import depth_error, depth_ratio, in_front
 from quest.filter.view import View, in_image, move, move_back
 
 RIVALS = 3
@@ -31,7 +31,7 @@ _TOGETHER_PX = 2.0
 """How far apart its own patch and its body's place are where both saw the same view of it."""
 _CARRIES_AT_LEAST = np.array([0.1, 1e-3])
 """How probable it is that the world, or that any one of the others, carries what nothing around it is on."""
-_HALF, _HARDLY = float(np.log(0.5)), float(np.log(0.05))
+_HALF, _HARDLY = 0.5, 0.05
 _MOST = 9.0
 """Log-odds are kept within this."""
 
@@ -50,8 +50,8 @@ class _Places:
     """Log-likelihood ratio of the evidence there if it is seen there, against it being nowhere."""
     occluded: Float[np.ndarray, "K P"]
     """The same if it is there and not seen, which is as probable before anything is measured."""
-    covered: Bool[np.ndarray, "K P"]
-    """Whether something is in front of that place, or it is out of view."""
+    covered: Float[np.ndarray, "K P"]
+    """How probable it is that something is in front of that place, or that it is out of view."""
     agrees: Bool[np.ndarray, "K P"]
     """Whether the depth is as predicted."""
 
@@ -128,22 +128,25 @@ def _judged(
     seen, occluded, explained = (value[each, here] for value in (places.seen, places.occluded, places.covered))
     rival_px, rival, others = _elsewhere(queries, places.uv_px[each, here], layers, likeness, noise)
     # What is out of view, or behind something, is still there: then hardly anything speaks for elsewhere.
-    elsewhere = np.where(explained, _HARDLY, _HALF)
-    rival, others = (ratio + elsewhere - _HALF for ratio in (rival, others))
+    elsewhere = np.log(_HARDLY * explained + _HALF * (1 - explained))
+    rival, others = (ratio + elsewhere - np.log(_HALF) for ratio in (rival, others))
+    with np.errstate(divide="ignore"):
+        behind, unexplained = (occluded + np.log(p) for p in (explained, 1 - explained))
     # An occlusion that nothing explains does not last.
-    hidden = occluded - np.where(explained, 0.0, queries.unseen_s / noise.hidden_s)
+    hidden = np.logaddexp(behind, unexplained - queries.unseen_s / noise.hidden_s)
     stays, left = np.logaddexp(seen, hidden), np.logaddexp(np.logaddexp(rival, others), elsewhere)
     same = _same(rival_px, queries.rival_px)
     rival_log_odds = np.where(same, queries.rival_log_odds, noise.jump_log_odds)
     told = rival - np.logaddexp(stays, others) - rival_log_odds
     seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
+    new = min(dt_s / noise.correlated_s, 1.0)
     return replace(
         queries,
         seen_log_odds=seen_log_odds,
-        lost_log_odds=np.where(explained, left - stays, -seen_log_odds).clip(-_MOST, _MOST),
-        unseen_s=np.where(explained, 0.0, (queries.unseen_s + dt_s) / (1 + np.exp(seen_log_odds))),
+        lost_log_odds=(np.logaddexp(left, unexplained) - np.logaddexp(seen, behind)).clip(-_MOST, _MOST),
+        unseen_s=(1 - explained) * (queries.unseen_s + dt_s) / (1 + np.exp(seen_log_odds)) ** new,
         rival_px=rival_px,
-        rival_log_odds=rival_log_odds + told * min(dt_s / noise.correlated_s, 1.0),
+        rival_log_odds=rival_log_odds + told * new,
     )
 
 
@@ -160,16 +163,15 @@ def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: Vi
     # Of its own patch nothing is predicted.
     off_m = np.concatenate([np.full((count, 1), np.nan), off_m], axis=1)
     spread_m = np.concatenate([np.ones((count, 1)), depth_error(depth_m, noise)], axis=1)
-    covered = off_m < -3 * spread_m
-    deep = np.where(covered, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
+    deep = np.where(off_m < -3 * spread_m, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
     return _Places(
         uv_px=uv_px,
         depth_m=depth_m,
         ride_px2=np.nan_to_num(landmarks.ride_px2(queries.place, queries.error, view), nan=1.0),
         possible=possible,
         seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,
-        occluded=np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0) + _HALF,
-        covered=covered | ~inside,
+        occluded=np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0) + np.log(_HALF),
+        covered=np.where(inside, in_front(off_m, spread_m, noise), 1.0),
         agrees=abs(off_m) < spread_m,
     )
 

@@ -14,12 +14,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.special import ndtr
 
 from quest.filter.noise import Noise
 from quest.filter.view import View, in_image, move, move_back
 
 _CELL_PX = 12
 _REACH_PX = 3
+_LEAST_KNOWN = 500
+"""Depths without which their noise is not told."""
 _MOST = 4000
 """Points beyond that are forgotten, the oldest first."""
 
@@ -79,9 +82,39 @@ def depth_ratio(
     return np.where(told, np.log(np.where(told, agrees, 1.0) * noise.depths_m), 0.0)
 
 
+def in_front(
+    off_m: Float[np.ndarray, "*N"], spread_m: Float[np.ndarray, "*N"], noise: Noise
+) -> Float[np.ndarray, "*N"]:
+    """How probable it is that a depth is of something in front of what is predicted, and not of that; 0 without depth.
+
+    Arguments are those of :func:`depth_ratio`. What is in front is anywhere there.
+    """
+    off = np.nan_to_num(off_m / spread_m, nan=np.inf)
+    front = ndtr(-off) / noise.depths_m
+    there = np.exp(-(off**2) / 2) / (np.sqrt(2 * np.pi) * spread_m)
+    return np.divide(front, front + there, out=np.zeros_like(front), where=front > 0)
+
+
 def depth_error(depth_m: Float[np.ndarray, "*N"], noise: Noise) -> Float[np.ndarray, "*N"]:
     """Standard deviation of a depth, metres."""
-    return np.maximum(noise.depth_m, noise.depth * np.nan_to_num(depth_m, nan=1.0))
+    depth_m = np.nan_to_num(depth_m, nan=1.0)
+    return np.maximum(np.maximum(noise.depth_m, noise.depth * depth_m), noise.depth_grows * depth_m**2)
+
+
+def depth_growth(depth_m: Float[np.ndarray, "H W"]) -> float | None:
+    """How much depth errs by chance for its square, 1/m, told by one frame; None where too little of it is known.
+
+    Of three pixels in a row on a plane the inverse depth in the middle is the mean of the outer ones. By how much it is
+    not tells the noise, for most pixels are on surfaces that are nearly flat. In cameras that measure disparity it
+    grows with the square of the depth.
+    """
+    apart, sample = 4, depth_m[::2].astype(np.float64)
+    left, middle, right = sample[:, : -2 * apart : 3], sample[:, apart:-apart:3], sample[:, 2 * apart :: 3]
+    known = (left > 0) & (middle > 0) & (right > 0)
+    if known.sum() < _LEAST_KNOWN:
+        return None
+    off = 1 / middle[known] - (1 / left[known] + 1 / right[known]) / 2
+    return float(np.median(abs(off)) / (0.6745 * np.sqrt(1.5)))  # the median of |x| of a normal x is 0.6745
 
 
 def measure(

@@ -11,6 +11,7 @@ from jaxtyping import Float, Float32, UInt8
 from quest.depth import PLAUSIBLE_DEPTH_M
 from quest.errors import InputError
 from quest.filter.picture import GreyPicture
+from quest.filter.surfaces import depth_growth
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.xfeat import LEAST_PX
 from quest.track.health import ELSEWHERE, Health, digest_of
@@ -47,6 +48,8 @@ class PreprocessorState:
     """Whether the poses that were given tell how the camera moves: they have changed."""
     has_depth: bool = False
     """Whether a frame so far brought depth."""
+    depth_grows: float = 0.0
+    """How depth errs by chance, as of :func:`quest.filter.surfaces.depth_growth`; of the newest frame that told."""
     health: Health = field(default_factory=Health)
     """What pictures and depth are compared with."""
 
@@ -195,6 +198,8 @@ class Preprocessor:
             if state.pose is not None or state.now_s > 0:
                 state.flags += (DEPTH_BEGINS_FLAG,)
             state.has_depth = True
+        grows = None if depth_m is None else depth_growth(depth_m)
+        state.depth_grows = state.depth_grows if grows is None else grows
         if depth_m is not None and self.scale != (1.0, 1.0):  # never mixed between pixels
             depth_m = cv2.resize(depth_m, self.size, interpolation=cv2.INTER_NEAREST_EXACT).astype(np.float32)
         return Prepared(depth_m, *self._poses(cam_from_world), blind)

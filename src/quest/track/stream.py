@@ -77,7 +77,7 @@ class Stream:
         finding: Finding | None = None,
     ) -> None:
         self._describer = Describer(features)
-        self._noise = noise
+        self._base_noise = noise
         self._config = config
         self._calibrations = calibrations
         self._preprocessor = Preprocessor(camera, config.follow_px)
@@ -91,6 +91,11 @@ class Stream:
         self._memory = Memory(self._preprocessor.state, self._queries.state, state, finding=finding)
         self._looker = Looker(behind=finding is not None and finding.behind)
         self._callbacks: list[Callable[[Alarm], None]] = []
+
+    @property
+    def _noise(self) -> Noise:
+        """Parameters of the filter; how noisy depth is was measured on the stream's own."""
+        return replace(self._base_noise, depth_grows=self._preprocessor.state.depth_grows)
 
     @property
     def memory(self) -> Memory:
