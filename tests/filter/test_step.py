@@ -68,6 +68,21 @@ def test_an_occluder_that_passes_takes_nothing_along() -> None:
     np.testing.assert_allclose(tracks.uv_px[:, 0], there, atol=1.0)
 
 
+def test_how_an_occluder_looks_does_not_tell_what_carries_what_is_behind_it() -> None:
+    way = np.stack([np.where(np.arange(FRAMES) < 8, -200.0, 40.0), np.full(FRAMES, 20.0)], axis=-1)
+    log_odds = []
+    for seed in (1, 4):
+        clip = scene(STILL, Board(way, (60, 80), 0.8, seed))
+        stream = make_tracker().stream(clip.camera, [Query.point(0, *AT)])
+        states = [stream.step(**vars(clip.frame(t))) for t in range(FRAMES)]
+        assert stream.memory.filter is not None
+        log_odds.append(float(stream.memory.filter.queries.log_odds[0, 0]))
+        assert not any(state.visible[0] for state in states[8:])
+        np.testing.assert_allclose(states[-1].point_world, states[0].point_world, atol=0.01)
+    assert log_odds[0] == pytest.approx(log_odds[1], abs=0.01)
+    assert log_odds[0] > 2
+
+
 def test_what_was_covered_is_found_again_where_it_rests_without_depth() -> None:
     way = np.stack([-60 + 8.0 * np.arange(30), np.full(30, 20.0)], axis=-1)
     tracks = follow(scene(np.zeros(30), Board(way, (50, 80), 0.8, seed=6), depth=False), [Query.point(0, *AT)])

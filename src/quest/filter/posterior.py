@@ -70,7 +70,7 @@ def weigh(
     The queries' own patches are followed into the frame already.
     """
     likeness = Likeness.of(picture, queries.descriptor, queries.patch)
-    places = _places(queries, landmarks, likeness, view, noise)
+    places = _places(queries, landmarks, likeness, view, dt_s, noise)
     apart = ((queries.own_px[:, None] - places.uv_px[:, 1:]) ** 2).sum(axis=-1)
     near = queries.own_variance[:, None] + places.ride_px2
     # Evidence repeats itself from frame to frame: however long it lasts, it counts once.
@@ -150,7 +150,9 @@ def _judged(
     )
 
 
-def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: View, noise: Noise) -> _Places:
+def _places(
+    queries: Queries, landmarks: Landmarks, likeness: Likeness, view: View, dt_s: float, noise: Noise
+) -> _Places:
     """What appearance and depth say at each place."""
     count, bodies = queries.log_odds.shape
     point = move(landmarks.pose, queries.place)
@@ -160,13 +162,16 @@ def _places(queries: Queries, landmarks: Landmarks, likeness: Likeness, view: Vi
     uv_px = np.concatenate([queries.own_px[:, None], ride_px], axis=1)
     inside = in_image(uv_px, likeness.picture.size)
     off_m = view.near_depth_at(ride_px.reshape(-1, 2)).reshape(count, bodies) - depth_m
-    # Of its own patch nothing is predicted.
-    off_m = np.concatenate([np.full((count, 1), np.nan), off_m], axis=1)
-    spread_m = np.concatenate([np.ones((count, 1)), depth_error(depth_m, noise)], axis=1)
+    # Of its own patch nothing is predicted but that it does not come nearer at once: what does is in front of it.
+    own_off_m = view.near_depth_at(queries.own_px) - queries.own_depth + noise.speed_m_s * dt_s
+    depth_m = np.concatenate([queries.own_depth[:, None], depth_m], axis=1)
+    spread_m = depth_error(depth_m, noise)
+    own_off_m = np.where(own_off_m < -3 * spread_m[:, 0], own_off_m, np.nan)
+    off_m = np.concatenate([own_off_m[:, None], off_m], axis=1)
     deep = np.where(off_m < -3 * spread_m, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
     return _Places(
         uv_px=uv_px,
-        depth_m=depth_m,
+        depth_m=depth_m[:, 1:],
         ride_px2=np.nan_to_num(landmarks.ride_px2(queries.place, queries.error, view), nan=1.0),
         possible=possible,
         seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,

@@ -212,9 +212,10 @@ def read_off(state: FilterState, noise: Noise) -> Answer:
     """The more probable place of every query; seen unless out of view, not found, or behind something."""
     queries, view = state.queries, state.view
     uv_px, rides, ride, ride_depth = _at(queries, state.landmarks, view)
-    measured = view.near_depth_at(uv_px)
-    point = np.where(rides[:, None], ride, view.lift(uv_px, measured))
-    hidden = rides & (measured < ride_depth - 3 * depth_error(ride_depth, noise))
+    measured, expected = view.near_depth_at(uv_px), np.where(rides, ride_depth, queries.own_depth)
+    hidden = measured < expected - 3 * depth_error(expected, noise)
+    own = view.lift(uv_px, np.where(hidden | np.isnan(measured), expected, measured))
+    point = np.where(rides[:, None], ride, own)
     visible = in_image(uv_px, state.picture.size) & ~hidden & (queries.seen_log_odds > 0)
     seen_px = state.picture.to_camera(uv_px)
     return Answer(seen_px, point, visible, queries.lost_log_odds, joints_of(queries, state.landmarks, noise))

@@ -93,7 +93,7 @@ class Stream:
         self._callbacks: list[Callable[[Alarm], None]] = []
 
     @property
-    def _noise(self) -> Noise:
+    def noise(self) -> Noise:
         """Parameters of the filter; how noisy depth is was measured on the stream's own."""
         return replace(self._base_noise, depth_grows=self._preprocessor.state.depth_grows)
 
@@ -193,7 +193,7 @@ class Stream:
         row, count = self._queries.begin(number), len(state.queries)
         others = [i for i in range(count) if i != row]
         order = [*range(row), len(others), *range(row, len(others))]
-        self._memory.filter = filtering.keep(filtering.ask(filtering.keep(state, others), at_px, self._noise), order)
+        self._memory.filter = filtering.keep(filtering.ask(filtering.keep(state, others), at_px, self.noise), order)
         self._watch_new(corrected=number)
 
     def confirm(self, query: int | str) -> None:
@@ -208,7 +208,7 @@ class Stream:
         row = self._queries.row(number)
         if row is None or memory.filter is None:
             raise InputError(f"query {query!r}: expected one that has found its entity, got one that waits")
-        answer = filtering.read_off(memory.filter, self._noise)
+        answer = filtering.read_off(memory.filter, self.noise)
         if answer.visible[row]:
             self.place(number, *answer.uv_px[row].tolist())
         else:
@@ -268,7 +268,7 @@ class Stream:
         state = self._filter(frame, grey, describe)
         at_px = filtering.pixels(state)
         new_px = self._queries.bind(memory.frame - 1, preprocessor.state.now_s, at_px, partial(self._look, rgb))
-        memory.filter = filtering.ask(state, new_px, self._noise) if len(new_px) else state
+        memory.filter = filtering.ask(state, new_px, self.noise) if len(new_px) else state
         if memory.finding is not None:
             memory.filter = self._find(memory.finding, memory.filter, rgb)
         self._watch_new()
@@ -291,10 +291,10 @@ class Stream:
         if memory.filter is None:
             # In the first camera's axes, so that answers do not depend on where the world has its origin.
             view = View(self._preprocessor.matrix, np.eye(4), frame.depth_m)
-            state = filtering.begin(grey.described(describe()), view, now_s, self._noise)
+            state = filtering.begin(grey.described(describe()), view, now_s, self.noise)
         else:
             given = None if frame.cam_from_world is None else frame.cam_from_world @ memory.world_from_filter
-            state = filtering.step(memory.filter, grey, describe, frame.depth_m, now_s, given, self._noise)
+            state = filtering.step(memory.filter, grey, describe, frame.depth_m, now_s, given, self.noise)
         if frame.first_pose is not None:
             memory.world_from_filter = np.linalg.inv(frame.first_pose) @ state.view.cam_from_world
             self._preprocessor.state.flags += () if memory.filter is None else (POSES_BEGIN_FLAG,)
@@ -321,7 +321,7 @@ class Stream:
         alone = filtering.moves_alone(look, found.uv_px)
         least = logit(np.where(alone, min(config.threshold, config.prompt_threshold), config.threshold))
         sure = np.flatnonzero(told.log_odds[: len(found)] > least)
-        sure = sure[~filtering.returns(look, found.uv_px[sure], self._noise)]
+        sure = sure[~filtering.returns(look, found.uv_px[sure], self.noise)]
         now_px = filtering.carry(look, state, finding.warp, found.uv_px[sure])
         moved = np.tile(now_px - found.uv_px[sure], 2)
         now = replace(found.select(sure), uv_px=now_px, box_px=found.box_px[sure] + moved)
@@ -329,16 +329,16 @@ class Stream:
         begun = there[queries.discover(now.select(there), filtering.pixels(state))]
         left = np.setdiff1d(np.flatnonzero(told.log_odds > FORGOTTEN), sure[begun])
         finding.candidates = told.only(left[np.argsort(-told.log_odds[left], kind="stable")][: config.most])
-        return filtering.ask(state, now_px[begun], self._noise) if len(begun) else state
+        return filtering.ask(state, now_px[begun], self.noise) if len(begun) else state
 
     def _answer(self, state: FilterState, stamp_s: float, *, has_depth: bool) -> tuple[StreamState, tuple[Alarm, ...]]:
         """What is said of the newest frame, and the alarms that are raised in it."""
         memory, following, told = self._memory, self._queries.state.following, self._preprocessor.state
-        answer, numbers = filtering.read_off(state, self._noise), [f.number for f in following]
+        answer, numbers = filtering.read_off(state, self.noise), [f.number for f in following]
         lost_p, alarms, raised = self._watch(numbers, answer, state, stamp_s)
         doubt, blind_s = probability(answer.lost_log_odds), told.now_s - state.stamp_s
         if blind_s > 0:  # while nothing is seen, everything may come to move
-            stays = np.exp(-blind_s / self._noise.hidden_s)
+            stays = np.exp(-blind_s / self.noise.hidden_s)
             lost_p, doubt = (1 - (1 - p) * stays for p in (lost_p, doubt))
         lost = [
             (p if np.isfinite(p) else d) > 0.5 or alarm is not None

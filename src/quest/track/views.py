@@ -89,6 +89,7 @@ class _Seen:
 
     answer: StreamState
     view: View
+    noise: Noise
     covariance: Float[np.ndarray, "K 3 3"]
     """Of the answer's world points."""
     lost_p: Float[np.ndarray, " K"]
@@ -99,7 +100,7 @@ class _Seen:
         point, alarmed = answer.point_world.astype(np.float64), np.array([a is not None for a in answer.alarm], bool)
         lost_p = np.where(np.isfinite(answer.lost_p), answer.lost_p, 1 - answer.confidence)
         covariance = place_covariance(point, answer.visible, view, noise)
-        return cls(answer, view, covariance, np.where(alarmed, 1.0, lost_p).astype(np.float64))
+        return cls(answer, view, noise, covariance, np.where(alarmed, 1.0, lost_p).astype(np.float64))
 
     def row(self, number: int | None) -> int | None:
         """The row of a query; None where it is not followed."""
@@ -183,7 +184,7 @@ class ViewsStream:
             for stream, own in zip(self.streams, frames, strict=True)
         )
         seen = {
-            v: _Seen.of(answers[-1], _view(self.streams[v].camera, frames[v][-1]), self._noise)
+            v: _Seen.of(answers[-1], _view(self.streams[v].camera, frames[v][-1]), self.streams[v].noise)
             for v, answers in enumerate(self.answers)
             if answers
         }
@@ -295,18 +296,18 @@ class ViewsStream:
 
     def _spread(self, entity: _Entity, seen: dict[int, _Seen], now_s: float) -> None:
         """Views that see the fused place, and do not follow the entity to it, are put there."""
-        fused, noise = entity.fused, self._noise
+        fused = entity.fused
         if fused is None or 1 - fused.lost_p < _SURE_P or not np.isfinite(fused.point_world).all():
             return
         for v, one in seen.items():
-            recent = now_s - entity.placed_s.get(v, -np.inf) < noise.correlated_s
+            recent = now_s - entity.placed_s.get(v, -np.inf) < self._noise.correlated_s
             followed = one.row(entity.number.get(v)) is not None
             if recent or (followed and fused.right_p[v] > 0.5) or (not followed and v in entity.number):
                 continue
             uv_px, depth_m = one.view.project(fused.point_world[None])
             camera = self.streams[v].camera
             ray = one.view.cam_from_world[2, :3]
-            spread_m = np.hypot(depth_error(depth_m, noise), np.sqrt(ray @ fused.covariance @ ray))
+            spread_m = np.hypot(depth_error(depth_m, one.noise), np.sqrt(ray @ fused.covariance @ ray))
             off_m = one.view.near_depth_at(uv_px) - depth_m
             if in_image(uv_px, (camera.width, camera.height))[0] and abs(off_m[0]) < spread_m[0]:
                 x, y = uv_px[0].tolist()
