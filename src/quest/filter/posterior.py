@@ -82,6 +82,10 @@ def weigh(
     here = np.where(rides, best + 1, 0)
     at_px = places.uv_px[each, here]
     judged = _judged(queries, places, here, layers, likeness, dt_s, noise)
+    of_it = np.where(rides, new / (1 + np.exp(-judged.seen_log_odds)), 0.0)
+    judged = judged.deeper(
+        best, places.depth_m[each, best], view.near_depth_at(at_px), of_it, landmarks.pose, view, noise
+    )
 
     jumps = judged.rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near[each, best])
@@ -103,8 +107,10 @@ def weigh(
             jumps, noise.anchor_px**2, np.where(caught, places.ride_px2[each, best], queries.own_variance)
         ),
         own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
-        place=np.where(anew[:, None, None], move_back(landmarks.pose, point), queries.place),
+        place=np.where(anew[:, None, None], move_back(landmarks.pose, point), judged.place),
         error=np.where(anew[:, None], ray_error(view, own_px, point[:, 0], noise), queries.error),
+        told_along=np.where(anew[:, None], 0.0, judged.told_along),
+        along_m=np.where(anew, 0.0, judged.along_m),
         anew=queries.anew | (anew & queries.known),
         log_odds=np.where(anew[:, None], 0.0, np.clip(log_odds, -SURE, SURE)),
         seen_log_odds=np.where(jumps, judged.rival_log_odds, judged.seen_log_odds),

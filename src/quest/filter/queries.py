@@ -13,6 +13,7 @@ from quest.filter.layers import GATE, Layers, with_column
 from quest.filter.noise import Noise
 from quest.filter.patches import GRID_PX, look, patch_motion, tile_motion, tiles
 from quest.filter.picture import GreyPicture, Picture
+from quest.filter.ray import ALONG_M, depths_told, most_probable
 from quest.filter.surfaces import depth_error
 from quest.filter.view import View, move
 
@@ -39,6 +40,10 @@ class Queries:
     """On each body, metres; NaN without depth."""
     error: Float[np.ndarray, "K 3"]
     """Standard deviation of the place, along the ray on which it was seen, metres in the world; NaN without depth."""
+    told_along: Float[np.ndarray, "K S"]
+    """Log-likelihood, by the depths since, of each place along that ray (:data:`quest.filter.ray.ALONG_M`)."""
+    along_m: Float[np.ndarray, " K"]
+    """How far along it the place is, metres."""
     anew: Bool[np.ndarray, " K"]
     """Whether the place was told anew since it was first known: how it came there is not known."""
     log_odds: Float[np.ndarray, "K B"]
@@ -81,6 +86,8 @@ class Queries:
             own_found=np.ones(count, dtype=bool),
             place=place,
             error=error,
+            told_along=np.zeros((count, len(ALONG_M))),
+            along_m=np.zeros(count),
             anew=np.zeros(count, dtype=bool),
             log_odds=np.zeros((count, bodies)),
             seen_log_odds=np.full(count, SURE),
@@ -121,6 +128,30 @@ class Queries:
             seen_place=np.where(which[:, None, None], place, self.seen_place),
             seen_share=np.where(which[:, None], share, self.seen_share),
         )
+
+    def deeper(
+        self,
+        body: Int[np.ndarray, " K"],
+        depth_m: Float[np.ndarray, " K"],
+        measured_m: Float[np.ndarray, " K"],
+        new: Float[np.ndarray, " K"],
+        pose: Float[np.ndarray, "B 4 4"],
+        view: View,
+        noise: Noise,
+    ) -> Queries:
+        """With their places along their rays by one depth more, measured where a body brings them.
+
+        ``new`` is how much of that is evidence of them, 0 to 1.
+        """
+        ray = self.error / np.linalg.norm(self.error, axis=-1, keepdims=True)
+        ahead = np.einsum("j,kji,ki->k", view.cam_from_world[2, :3], pose[body, :3, :3], ray)
+        told = depths_told(depth_m, ahead, self.along_m, measured_m, noise)
+        sure = np.isfinite(told).all(axis=1) & np.isfinite(measured_m) & (new > 0)
+        told_along = self.told_along + np.where(sure[:, None], new[:, None] * told, 0.0)
+        told_along -= told_along.max(axis=1, keepdims=True)
+        along_m = np.where(sure, most_probable(told_along, noise), self.along_m)
+        shift = np.where(sure[:, None], (along_m - self.along_m)[:, None] * ray, 0.0)
+        return replace(self, told_along=told_along, along_m=along_m, place=self.place + shift[:, None])
 
     @property
     def known(self) -> Bool[np.ndarray, " K"]:

@@ -1,0 +1,49 @@
+"""Evidence of depth along the ray on which a query was named: how deep it lies, by all frames in which it was seen.
+
+One depth may well be that of the door behind a thin handle, or be missing. So a histogram filter over places along that
+ray, which goes with the body, gathers the depths of all frames.
+
+Reference: Thrun, Burgard and Fox, Probabilistic Robotics, 2005, chapter 4.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+
+from quest.filter.noise import Noise
+from quest.filter.surfaces import depth_error, depth_ratio
+
+ALONG_M: Float[np.ndarray, " S"] = np.linspace(-0.2, 0.2, 41)
+"""How much farther along the ray than the first depth said, metres."""
+_AROUND = 3
+"""Steps on either side of the most probable one that are one place."""
+
+
+def depths_told(
+    depth_m: Float[np.ndarray, " K"],
+    deeper: Float[np.ndarray, " K"],
+    along_m: Float[np.ndarray, " K"],
+    measured_m: Float[np.ndarray, " K"],
+    noise: Noise,
+) -> Float[np.ndarray, "K S"]:
+    """Log-likelihood ratio of each of :data:`ALONG_M`, by a depth measured where queries are seen.
+
+    Args:
+        depth_m: predicted, metres; NaN where it is not.
+        deeper: by how much that grows along the ray, metres a metre.
+        along_m: how far along it is predicted.
+        measured_m: NaN where nothing was measured.
+        noise: parameters.
+    """
+    expected = depth_m[:, None] + (ALONG_M - along_m[:, None]) * deeper[:, None]
+    return depth_ratio(measured_m[:, None] - expected, depth_error(expected, noise), noise)
+
+
+def most_probable(told: Float[np.ndarray, "K S"], noise: Noise) -> Float[np.ndarray, " K"]:
+    """How far along the ray queries are, metres: the mean around the maximum."""
+    log_p = told - (ALONG_M / noise.relief_m) ** 2 / 2
+    best = log_p.argmax(axis=1)[:, None]
+    near = abs(np.arange(len(ALONG_M)) - best) <= _AROUND
+    p = np.where(near, np.exp(log_p - np.take_along_axis(log_p, best, axis=1)), 0.0)
+    return np.asarray((p * ALONG_M).sum(axis=1) / p.sum(axis=1))
