@@ -35,7 +35,7 @@ MEMBERS = {
     "unknown",
     "Query": "box frame intent kind label mask name point semantic slot text uv_px words",
     "State": "HELD LOST TRACKING",
-    "Stream": "add budget camera confirm frame looking memory on_alarm place rename retire step unbound",
+    "Stream": "add budget camera confirm frame looking memory noise on_alarm place rename retire step unbound",
     "StreamState": "alarm cam_from_world confidence flags has_depth joint labels lost_log_odds lost_p names only "
     "point_world q query stamp_s state uv_px visible",
     "Tracker": "calibrations config device features find name network noise restore save stream track weights_hash",

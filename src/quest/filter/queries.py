@@ -40,7 +40,7 @@ class Queries:
     """On each body, metres; NaN without depth."""
     error: Float[np.ndarray, "K 3"]
     """Standard deviation of the place, along the ray on which it was seen, metres in the world; NaN without depth."""
-    told_along: Float[np.ndarray, "K S"]
+    told_along: Float[np.ndarray, "K R"]
     """Log-likelihood, by the depths since, of each place along that ray (:data:`quest.filter.ray.ALONG_M`)."""
     along_m: Float[np.ndarray, " K"]
     """How far along it the place is, metres."""

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from quest.filter.noise import Noise
 from quest.filter.surfaces import depth_error, depth_ratio
 
-ALONG_M: Float[np.ndarray, " S"] = np.linspace(-0.2, 0.2, 41)
+ALONG_M: Float[np.ndarray, " R"] = np.linspace(-0.2, 0.2, 41)
 """How much farther along the ray than the first depth said, metres."""
 _AROUND = 3
 """Steps on either side of the most probable one that are one place."""
@@ -26,7 +26,7 @@ def depths_told(
     along_m: Float[np.ndarray, " K"],
     measured_m: Float[np.ndarray, " K"],
     noise: Noise,
-) -> Float[np.ndarray, "K S"]:
+) -> Float[np.ndarray, "K R"]:
     """Log-likelihood ratio of each of :data:`ALONG_M`, by a depth measured where queries are seen.
 
     Args:
@@ -40,7 +40,7 @@ def depths_told(
     return depth_ratio(measured_m[:, None] - expected, depth_error(expected, noise), noise)
 
 
-def most_probable(told: Float[np.ndarray, "K S"], noise: Noise) -> Float[np.ndarray, " K"]:
+def most_probable(told: Float[np.ndarray, "K R"], noise: Noise) -> Float[np.ndarray, " K"]:
     """How far along the ray queries are, metres: the mean around the maximum."""
     log_p = told - (ALONG_M / noise.relief_m) ** 2 / 2
     best = log_p.argmax(axis=1)[:, None]
