@@ -15,9 +15,10 @@ NOISE = Noise()
 ONE = np.ones(1)
 
 
-def told(*measured_m: float) -> np.ndarray:
+def told(*measured_m: float, seen: float = 6.0) -> np.ndarray:
     """What depths say of a query that the first depth put at one metre, straight ahead."""
-    return sum((depths_told(ONE, ONE, 0 * ONE, m * ONE, NOISE) for m in measured_m), np.zeros((1, len(ALONG_M))))
+    each = (depths_told(ONE, ONE, 0 * ONE, m * ONE, seen * ONE, -9 * ONE, NOISE) for m in measured_m)
+    return sum(each, np.zeros((1, len(ALONG_M))))
 
 
 def test_most_depths_tell_where_a_thin_handle_is_before_its_door() -> None:
@@ -25,9 +26,15 @@ def test_most_depths_tell_where_a_thin_handle_is_before_its_door() -> None:
     np.testing.assert_allclose(most_probable(told(*handle_and_door), NOISE), [-0.08], atol=0.005)
 
 
-def test_what_passes_in_front_or_is_not_measured_tells_nothing() -> None:
-    np.testing.assert_array_equal(told(0.5, np.nan), 0)
+def test_what_passes_in_front_tells_nothing() -> None:
+    np.testing.assert_allclose(np.ptp(told(0.5)), 0, atol=1e-9)
     np.testing.assert_allclose(most_probable(told(), NOISE), [0], atol=1e-9)
+
+
+def test_what_does_not_look_like_it_draws_it_nowhere_and_it_is_not_before_it() -> None:
+    np.testing.assert_allclose(most_probable(told(*[0.9] * 9, seen=-6.0), NOISE), [0], atol=0.005)
+    np.testing.assert_allclose(most_probable(told(*[0.9] * 9), NOISE), [-0.1], atol=0.005)
+    assert most_probable(told(*[1.1] * 9, seen=-6.0), NOISE) > 0.02
 
 
 def test_a_first_depth_that_was_wrong_is_mended_by_later_ones() -> None:

@@ -56,6 +56,18 @@ def test_what_moves_is_followed_and_what_rests_beside_it_stays(stride: int, dept
     np.testing.assert_allclose(tracks.uv_px[:, 1], np.tile([140.0, 60.0], (len(way), 1)), atol=0.5)
 
 
+def test_a_room_does_not_move_because_given_poses_err() -> None:
+    camera_m = np.linspace(0, 0.4, 40)
+    board_px = np.stack([100 - np.round(FOCAL * camera_m / 0.5), np.full(40, 20)], axis=-1)
+    room = scene(camera_m, Board(board_px, (60, 70), 0.5, seed=3))
+    assert room.cam_from_world is not None
+    poses = room.cam_from_world.copy()
+    poses[20:, 0, 3] += 0.04
+    tracks = follow(replace(room, cam_from_world=poses), [Query.point(0, 120.0, 50.0), Query.point(0, 40.0, 60.0)])
+    assert tracks.joints is not None
+    assert tracks.joints.kind == ("static", "static")
+
+
 def test_an_occluder_that_passes_takes_nothing_along() -> None:
     """The camera moves, so that its poses are taken from the clip."""
     camera_m = np.linspace(0, 0.2, FRAMES)

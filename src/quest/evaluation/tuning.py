@@ -2,7 +2,8 @@
 
 Both on labelled pictures and on simulated takes of validation objects, each of which counts the same however many
 answers it has. Scores become probabilities by a slope and a shift of their log odds (Platt, *Probabilistic outputs for
-support vector machines*, 1999), the threshold is the one with the best F1 in their mean.
+support vector machines*, 1999). At the threshold the least of their precisions and recalls is greatest: what is
+overlooked and what is wrong weigh the same, and no kind of picture pays for the other.
 """
 
 from __future__ import annotations
@@ -144,13 +145,10 @@ def _fit(sets: Sequence[Answers]) -> tuple[float, float]:
 
 
 def _best_threshold(sets: Sequence[Answers]) -> float:
-    """Log odds with the best F1 in the mean over sets."""
+    """Log odds where the least of all precisions and recalls is greatest."""
     logits = np.unique(np.concatenate([answers.logit for answers in sets]))[::-1]
-    f1 = np.zeros(len(logits))
-    for answers in sets:
-        precision, recall = _rates(answers, logits)
-        f1 += 2 * precision * recall / np.maximum(precision + recall, 1e-9) / len(sets)
-    best = int(f1.argmax())
+    rates = np.array([_rates(answers, logits) for answers in sets])
+    best = int(rates.min(axis=(0, 1)).argmax())
     return float(logits[best] if best + 1 == len(logits) else (logits[best] + logits[best + 1]) / 2)
 
 

@@ -65,6 +65,12 @@ def stands_still(
     return worse or bool((kept[0].sum() - kept[1].sum()) / variance < 6 * np.log(len(uv_px)))
 
 
+def apart_px(point_world: Float[np.ndarray, "N 3"], one: View, other: View) -> float:
+    """How far apart points are in two views, the median in pixels."""
+    apart = np.linalg.norm(one.project(point_world)[0] - other.project(point_world)[0], axis=-1)
+    return float(np.median(np.nan_to_num(apart, nan=np.inf)))
+
+
 def picture_motion(from_px: Float[np.ndarray, "N 2"], to_px: Float[np.ndarray, "N 2"]) -> Float[np.ndarray, "3 3"]:
     """The homography that most points agree on, where no depth says more; the identity where too few do."""
     if len(from_px) < LEAST:

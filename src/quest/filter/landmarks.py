@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.spatial import KDTree
 
 from quest.filter.bodies import Bodies, about, go_on, on_joint, update
-from quest.filter.camera_motion import estimate_pose, picture_motion, stands_still
+from quest.filter.camera_motion import INLIER_PX, apart_px, estimate_pose, picture_motion, stands_still
 from quest.filter.local_motion import corners, follow
 from quest.filter.noise import Noise
 from quest.filter.picture import GreyPicture
@@ -48,6 +48,8 @@ class Landmarks:
     """Log-odds of being carried by each body, against being on none of them."""
     surfaces: Surfaces
     bodies: Bodies
+    still: bool = True
+    """Whether the camera never moved, as poses that were given say: then those are exact."""
     world_px2: float = 0.0
     """Variance of where the world's points are seen in the newest frame with depth: poses and lenses err too."""
 
@@ -78,6 +80,11 @@ class Landmarks:
     def body(self) -> Int[np.ndarray, " N"]:
         """The most probable carrier of each point."""
         return np.asarray(self.log_weight.argmax(axis=1))
+
+    @property
+    def rests(self) -> Bool[np.ndarray, " N"]:
+        """Whether each tells where the camera is."""
+        return (self.body == 0) & (self.log_weight[:, 0] > -1) & np.isfinite(self.place[:, 0]).all(axis=-1)
 
     @property
     def point_world(self) -> Float[np.ndarray, "N 3"]:
@@ -143,7 +150,7 @@ def observe(
     pose = old.cam_from_world if given is None else given
     known = True
     if given is None and np.isfinite(moved.place).any():
-        rests = (moved.body == 0) & (moved.log_weight[:, 0] > -1) & np.isfinite(moved.place[:, 0]).all(axis=-1)
+        rests = moved.rests
         estimated = estimate_pose(moved.place[rests, 0], moved.uv_px[rests], old.matrix, pose)
         if estimated is None:
             return landmarks.only(np.zeros(len(covariance), dtype=bool)), pose, warp
@@ -154,16 +161,28 @@ def observe(
             refuted = rests.copy()
             refuted[rests] = ~estimated[1]
             moved = moved.only(~refuted)
-    view = View(old.matrix, pose, depth_m)
+    view = estimated_view = View(old.matrix, pose, depth_m)
     if depth_m is not None:
         # What was sown without depth has no place; it is sown anew.
-        placed = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
-        moved = _observe_bodies(placed, view, known, dt_s, noise)
+        moved = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
+        moved = replace(moved, still=moved.still and given is not None and np.array_equal(given, old.cam_from_world))
+        if given is not None and not moved.still:
+            # A given pose errs; what stands still as the picture tells it is no body that moves.
+            place = moved.place[moved.rests, 0]
+            estimated = estimate_pose(place, moved.uv_px[moved.rests], old.matrix, pose)
+            estimated_view = view if estimated is None else replace(view, cam_from_world=estimated[0])
+            known = estimated is None or apart_px(place, view, estimated_view) < INLIER_PX
+        moved = _observe_bodies(moved, view, estimated_view, known, dt_s, noise)
     return moved, pose, warp
 
 
-def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, noise: Noise) -> Landmarks:
-    """The pose of each moving body, and which of them carries each point."""
+def _observe_bodies(
+    landmarks: Landmarks, view: View, estimated_view: View, known: bool, dt_s: float, noise: Noise
+) -> Landmarks:
+    """The pose of each moving body, and which of them carries each point.
+
+    The world is seen from ``view`` or, if that errs, from ``estimated_view``. Bodies begin where that is ``known``.
+    """
     depth_m, error_m = layer_depth(view, landmarks.uv_px, noise)
     rests, _ = view.project(landmarks.place[landmarks.body == 0, 0])
     off = ((rests - landmarks.uv_px[landmarks.body == 0]) ** 2).sum(axis=-1)
@@ -171,7 +190,7 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
     spread = max(noise.point_px**2, float(np.nanmedian(off)) / np.log(4)) if len(off) else noise.point_px**2
     landmarks = replace(landmarks, world_px2=spread)
     seen = Seen(landmarks.uv_px, depth_m, landmarks.covariance + spread * np.eye(2), error_m)
-    told = (GATE - np.minimum(_misfits(landmarks, seen, view), 3 * GATE)) / 2
+    told = (GATE - np.minimum(_misfits(landmarks, seen, view, estimated_view), 3 * GATE)) / 2
     told += np.log(landmarks.share(landmarks.point_world, landmarks.point_world) + noise.stray)
     weight = landmarks.log_weight + (told - landmarks.log_weight) * min(dt_s / noise.points_s, 1.0)
     body = np.where(told.max(axis=1) > 0, weight.argmax(axis=1), -1)
@@ -181,7 +200,7 @@ def _observe_bodies(landmarks: Landmarks, view: View, known: bool, dt_s: float, 
     for b in range(1, len(bodies)):
         bodies = _refit(bodies, b, landmarks.place[:, b], body == b, seen, surfaces, view, dt_s, noise)
     landmarks = replace(landmarks, bodies=bodies, surfaces=surfaces)
-    off = _misfits(landmarks, seen, view)
+    off = _misfits(landmarks, seen, view, estimated_view)
     odd = (off.min(axis=1) > GATE) & np.isfinite(seen.depth_m)
     free = np.flatnonzero(odd & surrounded(landmarks.point_world, odd))
     new = None
@@ -224,24 +243,18 @@ def surrounded(point: Float[np.ndarray, "N D"], odd: Bool[np.ndarray, " N"]) -> 
     return most
 
 
-def _misfits(landmarks: Landmarks, seen: Seen, view: View) -> Float[np.ndarray, "N B"]:
+def _misfits(landmarks: Landmarks, seen: Seen, view: View, estimated_view: View) -> Float[np.ndarray, "N B"]:
     bodies = landmarks.bodies
-    return np.stack(
-        [
-            misfit_unsure(
-                move(pose, landmarks.place[:, b]),
-                middle,
-                covariance[:6, :6],
-                landmarks.error @ pose[:3, :3].T,
-                seen,
-                view,
-            )
-            for b, (pose, middle, covariance) in enumerate(
-                zip(bodies.pose, bodies.middle, bodies.covariance, strict=True)
-            )
-        ],
-        axis=1,
-    )
+
+    def off(b: int, view: View) -> Float[np.ndarray, " N"]:
+        pose, covariance = bodies.pose[b], bodies.covariance[b, :6, :6]
+        error = landmarks.error @ pose[:3, :3].T
+        return misfit_unsure(move(pose, landmarks.place[:, b]), bodies.middle[b], covariance, error, seen, view)
+
+    misfits = [off(b, view) for b in range(len(bodies))]
+    if estimated_view is not view:
+        misfits[0] = np.minimum(misfits[0], off(0, estimated_view))
+    return np.stack(misfits, axis=1)
 
 
 def _refit(

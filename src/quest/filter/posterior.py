@@ -18,7 +18,7 @@ from quest.filter.layers import GATE, Layers
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.queries import Queries
-from quest.filter.surfaces import depth_error, depth_ratio, in_front
+from quest.filter.surfaces import depth_error, in_front, occluded_ratio, seen_ratio
 from quest.filter.view import View, in_image, move, move_back
 
 RIVALS = 3
@@ -46,8 +46,10 @@ class _Places:
     """Variance of where each body brings it, pixels squared."""
     possible: Bool[np.ndarray, "K B"]
     """Whether a body can bring it anywhere: its place is known, and in front of the camera."""
+    looks: Float[np.ndarray, "K P"]
+    """Log-likelihood ratio of the appearance there if it is seen there, against it being nowhere."""
     seen: Float[np.ndarray, "K P"]
-    """Log-likelihood ratio of the evidence there if it is seen there, against it being nowhere."""
+    """The same of all evidence."""
     occluded: Float[np.ndarray, "K P"]
     """The same if it is there and not seen, which is as probable before anything is measured."""
     covered: Float[np.ndarray, "K P"]
@@ -81,11 +83,10 @@ def weigh(
     rides = (log_odds[each, best] > 0) & queries.known
     here = np.where(rides, best + 1, 0)
     at_px = places.uv_px[each, here]
-    judged = _judged(queries, places, here, layers, likeness, dt_s, noise)
-    of_it = np.where(rides, new / (1 + np.exp(-judged.seen_log_odds)), 0.0)
-    judged = judged.deeper(
-        best, places.depth_m[each, best], view.near_depth_at(at_px), of_it, landmarks.pose, view, noise
-    )
+    judged, left = _judged(queries, places, here, layers, likeness, dt_s, noise)
+    ahead_m, measured_m = places.depth_m[each, best], np.where(rides, view.near_depth_at(at_px), np.nan)
+    looks, left = places.looks[each, here] - np.log(_HALF), left - np.log(_HALF)
+    judged = judged.deeper(best, ahead_m, measured_m, looks, left, new, landmarks.pose, view, noise)
 
     jumps = judged.rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near[each, best])
@@ -128,8 +129,11 @@ def _judged(
     likeness: Likeness,
     dt_s: float,
     noise: Noise,
-) -> Queries:
-    """Whether each query is seen at its most probable place, occluded there, elsewhere, or nowhere in the frame."""
+) -> tuple[Queries, Float[np.ndarray, " K"]]:
+    """Whether each query is seen at its most probable place, occluded there, or elsewhere, or nowhere in the frame.
+
+    Also the log-likelihood ratio of the last two against nowhere.
+    """
     each = np.arange(len(queries))
     seen, occluded, explained = (value[each, here] for value in (places.seen, places.occluded, places.covered))
     rival_px, rival, others = _elsewhere(queries, places.uv_px[each, here], layers, likeness, noise)
@@ -146,7 +150,7 @@ def _judged(
     told = rival - np.logaddexp(stays, others) - rival_log_odds
     seen_log_odds = (seen - np.logaddexp(left, occluded)).clip(-_MOST, _MOST)
     new = min(dt_s / noise.correlated_s, 1.0)
-    return replace(
+    judged = replace(
         queries,
         seen_log_odds=seen_log_odds,
         lost_log_odds=(np.logaddexp(left, unexplained) - np.logaddexp(seen, behind)).clip(-_MOST, _MOST),
@@ -154,6 +158,7 @@ def _judged(
         rival_px=rival_px,
         rival_log_odds=rival_log_odds + told * new,
     )
+    return judged, left
 
 
 def _places(
@@ -174,14 +179,15 @@ def _places(
     spread_m = depth_error(depth_m, noise)
     own_off_m = np.where(own_off_m < -3 * spread_m[:, 0], own_off_m, np.nan)
     off_m = np.concatenate([own_off_m[:, None], off_m], axis=1)
-    deep = np.where(off_m < -3 * spread_m, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
+    looks = np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf)
     return _Places(
         uv_px=uv_px,
         depth_m=depth_m[:, 1:],
         ride_px2=np.nan_to_num(landmarks.ride_px2(queries.place, queries.error, view), nan=1.0),
         possible=possible,
-        seen=np.where(inside, likeness.at(uv_px, noise).log_odds, -np.inf) + deep,
-        occluded=np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0) + np.log(_HALF),
+        looks=looks,
+        seen=looks + seen_ratio(off_m, spread_m, noise),
+        occluded=occluded_ratio(off_m, spread_m, noise) + np.log(_HALF),
         covered=np.where(inside, in_front(off_m, spread_m, noise), 1.0),
         agrees=abs(off_m) < spread_m,
     )

@@ -134,20 +134,23 @@ class Queries:
         body: Int[np.ndarray, " K"],
         depth_m: Float[np.ndarray, " K"],
         measured_m: Float[np.ndarray, " K"],
-        new: Float[np.ndarray, " K"],
+        seen: Float[np.ndarray, " K"],
+        elsewhere: Float[np.ndarray, " K"],
+        new: float,
         pose: Float[np.ndarray, "B 4 4"],
         view: View,
         noise: Noise,
     ) -> Queries:
         """With their places along their rays by one depth more, measured where a body brings them.
 
-        ``new`` is how much of that is evidence of them, 0 to 1.
+        ``seen`` and ``elsewhere`` are log-odds, as of :func:`quest.filter.ray.depths_told`, and ``new`` is how much of
+        it is new evidence, 0 to 1.
         """
         ray = self.error / np.linalg.norm(self.error, axis=-1, keepdims=True)
         ahead = np.einsum("j,kji,ki->k", view.cam_from_world[2, :3], pose[body, :3, :3], ray)
-        told = depths_told(depth_m, ahead, self.along_m, measured_m, noise)
-        sure = np.isfinite(told).all(axis=1) & np.isfinite(measured_m) & (new > 0)
-        told_along = self.told_along + np.where(sure[:, None], new[:, None] * told, 0.0)
+        told = depths_told(depth_m, ahead, self.along_m, measured_m, seen, elsewhere, noise)
+        sure = np.isfinite(told).all(axis=1) & np.isfinite(measured_m)
+        told_along = self.told_along + np.where(sure[:, None], new * told, 0.0)
         told_along -= told_along.max(axis=1, keepdims=True)
         along_m = np.where(sure, most_probable(told_along, noise), self.along_m)
         shift = np.where(sure[:, None], (along_m - self.along_m)[:, None] * ray, 0.0)

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.filter.noise import Noise
-from quest.filter.surfaces import depth_error, depth_ratio
+from quest.filter.surfaces import depth_error, occluded_ratio, seen_ratio
 
 ALONG_M: Float[np.ndarray, " R"] = np.linspace(-0.2, 0.2, 41)
 """How much farther along the ray than the first depth said, metres."""
@@ -25,19 +25,27 @@ def depths_told(
     deeper: Float[np.ndarray, " K"],
     along_m: Float[np.ndarray, " K"],
     measured_m: Float[np.ndarray, " K"],
+    seen: Float[np.ndarray, " K"],
+    elsewhere: Float[np.ndarray, " K"],
     noise: Noise,
 ) -> Float[np.ndarray, "K R"]:
-    """Log-likelihood ratio of each of :data:`ALONG_M`, by a depth measured where queries are seen.
+    """Log-likelihood ratio of each of :data:`ALONG_M`, by a depth measured where queries should be.
+
+    At each the query is seen, or behind what is nearer; or it is elsewhere, and the depth is of something else.
 
     Args:
         depth_m: predicted, metres; NaN where it is not.
         deeper: by how much that grows along the ray, metres a metre.
         along_m: how far along it is predicted.
         measured_m: NaN where nothing was measured.
+        seen: log-odds that it is seen there and not occluded there, by looks alone.
+        elsewhere: log-odds that it is elsewhere and not occluded there.
         noise: parameters.
     """
     expected = depth_m[:, None] + (ALONG_M - along_m[:, None]) * deeper[:, None]
-    return depth_ratio(measured_m[:, None] - expected, depth_error(expected, noise), noise)
+    off_m, spread_m = measured_m[:, None] - expected, depth_error(expected, noise)
+    there = seen[:, None] + seen_ratio(off_m, spread_m, noise)
+    return np.logaddexp(np.logaddexp(there, occluded_ratio(off_m, spread_m, noise)), elsewhere[:, None])
 
 
 def most_probable(told: Float[np.ndarray, "K R"], noise: Noise) -> Float[np.ndarray, " K"]:

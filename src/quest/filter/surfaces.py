@@ -82,6 +82,20 @@ def depth_ratio(
     return np.where(told, np.log(np.where(told, agrees, 1.0) * noise.depths_m), 0.0)
 
 
+def seen_ratio(
+    off_m: Float[np.ndarray, "*N"], spread_m: Float[np.ndarray, "*N"], noise: Noise
+) -> Float[np.ndarray, "*N"]:
+    """The same of what is seen: a depth in front of it is a stray one."""
+    return np.where(off_m < -3 * spread_m, np.log(noise.stray), depth_ratio(off_m, spread_m, noise))
+
+
+def occluded_ratio(
+    off_m: Float[np.ndarray, "*N"], spread_m: Float[np.ndarray, "*N"], noise: Noise
+) -> Float[np.ndarray, "*N"]:
+    """The same of what is there and not seen: a depth behind it is a stray one."""
+    return np.where(off_m > 3 * spread_m, np.log(noise.stray), 0.0)
+
+
 def in_front(
     off_m: Float[np.ndarray, "*N"], spread_m: Float[np.ndarray, "*N"], noise: Noise
 ) -> Float[np.ndarray, "*N"]:

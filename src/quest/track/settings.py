@@ -9,7 +9,7 @@ from typing import TypedDict
 from quest.errors import ConfigError, WeightsError
 from quest.untrusted import build, parse_json, reading
 
-REVISION = 14
+REVISION = 15
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
 _SIZES_PX = (16, 4096)
 """Smallest and largest side that pictures are brought to."""
