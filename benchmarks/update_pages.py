@@ -130,7 +130,7 @@ RESULTS = Page(
             about="Sizes are longer sides in a picture 640 px wide.",
         ),
         tracking("test.json", "Simulated test objects", suite="standard"),
-        discovery("found.json", "Discovery on test objects"),
+        discovery("test.json", "Discovery on test objects"),
         tracking(
             "suites.json",
             "Test objects in kitchens",
@@ -377,8 +377,7 @@ def summary(folder: Path, weights: str = "") -> str:
     report = read_report(folder / weights / "test.json")
     if not report:
         return "No results yet."
-    found = report["rows"] if weights else read_report(folder / "found.json").get("rows", [])
-    rows = [*([] if weights else real(folder / "real")), *simulated(report["rows"], found)]
+    rows = [*([] if weights else real(folder / "real")), *simulated(report["rows"])]
     reports = [report, *(read_report(folder / "real" / file) for file, *_ in REAL if not weights)]
     old = any(old_tracker(each) for each in reports if each)
     seen = "224 × 224 pixels" if weights else "480 × 480 pixels, depth of a simulated stereo camera"
@@ -402,16 +401,16 @@ def real(folder: Path) -> Iterable[str]:
                 yield summary_line(place, "units/targets", measure, where, asked)
 
 
-def simulated(followed: list[dict[str, Any]], found: list[dict[str, Any]]) -> Iterable[str]:
+def simulated(rows: list[dict[str, Any]]) -> Iterable[str]:
     """Lines of the summary about simulated test objects: points that were asked for, and what was found."""
-    rows, unasked = ([r for r in each if r["level"] == 1 and r["suite"] == "standard"] for each in (followed, found))
+    rows = [row for row in rows if row["level"] == 1 and row["suite"] == "standard"]
     for source, place in SOURCES.items():
         moved = {row["tracker"]: row for row in rows if row["source"] == source and matches(row, MOVED)}
         if not moved:
             continue
         for measure, where in (("median error, px", "metrics.median_px"), ("right identity, %", "%metrics.acc")):
             yield summary_line(place, "objects/tracks", measure, where, moved)
-        own = {row["tracker"]: row for row in unasked if row["source"] == source and matches(row, FOUND)}
+        own = {row["tracker"]: row for row in rows if row["source"] == source and matches(row, FOUND)}
         if own:
             yield summary_line(place, "objects/tracks", "not found by itself, %", "!%metrics.recall", own)
 

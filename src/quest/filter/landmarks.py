@@ -48,8 +48,6 @@ class Landmarks:
     """Log-odds of being carried by each body, against being on none of them."""
     surfaces: Surfaces
     bodies: Bodies
-    still: bool = True
-    """Whether the camera never moved, as poses that were given say: then those are exact."""
     world_px2: float = 0.0
     """Variance of where the world's points are seen in the newest frame with depth: poses and lenses err too."""
 
@@ -165,8 +163,7 @@ def observe(
     if depth_m is not None:
         # What was sown without depth has no place; it is sown anew.
         moved = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
-        moved = replace(moved, still=moved.still and given is not None and np.array_equal(given, old.cam_from_world))
-        if given is not None and not moved.still:
+        if given is not None:
             # A given pose errs; what stands still as the picture tells it is no body that moves.
             place = moved.place[moved.rests, 0]
             estimated = estimate_pose(place, moved.uv_px[moved.rests], old.matrix, pose)
