@@ -1,6 +1,6 @@
-"""A program that trains a tiny network on prepared views: the test of many processes runs it by torchrun.
+"""A program that trains a tiny network on prepared views: the tests of many processes run it as it is or by torchrun.
 
-python tests/train/processes.py CACHE OUT ACCUMULATE...
+python tests/train/processes.py CACHE OUT DEVICES ACCUMULATE...
 
 One run for every ACCUMULATE, in ``OUT/ACCUMULATE``.
 """
@@ -22,7 +22,7 @@ from quest.train.windows import WindowSampler
 from tests.paper.tiny import make_paper
 
 
-def train(cache: Path, out: Path, *, accumulate: int) -> list[float]:
+def train(cache: Path, out: Path, *, devices: int, accumulate: int) -> list[float]:
     """Losses of a short run, which the first process also writes to ``out/losses.json``."""
     config = TrainingConfig(
         steps=4,
@@ -32,7 +32,7 @@ def train(cache: Path, out: Path, *, accumulate: int) -> list[float]:
         validation_batches=1,
         precision="32-true",
         accelerator="cpu",
-        devices=1,
+        devices=devices,
         accumulate=accumulate,
     )
     fabric = launch(config)
@@ -52,5 +52,5 @@ def train(cache: Path, out: Path, *, accumulate: int) -> list[float]:
 
 
 if __name__ == "__main__":
-    for accumulate in sys.argv[3:]:
-        train(Path(sys.argv[1]), Path(sys.argv[2]) / accumulate, accumulate=int(accumulate))
+    for accumulate in sys.argv[4:]:
+        train(Path(sys.argv[1]), Path(sys.argv[2]) / accumulate, devices=int(sys.argv[3]), accumulate=int(accumulate))

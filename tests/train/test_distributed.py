@@ -1,4 +1,4 @@
-"""Two processes on the CPU learn what one does."""
+"""Two processes on the CPU learn what one does, however they were started."""
 
 from __future__ import annotations
 
@@ -31,13 +31,23 @@ def one_process(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, l
     """Features, the folder of a run of one process, and its losses."""
     root = tmp_path_factory.mktemp("processes")
     prepare(root, make_paper(), (0, 1))
-    return root / "cache", root / "one", train(root / "cache", root / "one", accumulate=1)
+    return root / "cache", root / "one", train(root / "cache", root / "one", devices=1, accumulate=1)
 
 
-def test_two_processes_learn_what_one_does(one_process: tuple[Path, Path, list[float]], tmp_path: Path):
+@pytest.mark.parametrize(
+    ("start", "devices", "accumulate"),
+    [((), 2, (1,)), (TORCHRUN, 1, (1, 2))],
+    ids=["relaunched", "torchrun"],
+)
+def test_two_processes_learn_what_one_does(
+    one_process: tuple[Path, Path, list[float]],
+    tmp_path: Path,
+    start: tuple[str, ...],
+    devices: int,
+    accumulate: tuple[int, ...],
+):
     cache, one, losses = one_process
-    accumulate = (1, 2)
-    run(*TORCHRUN, PROGRAM, str(cache), str(tmp_path), *map(str, accumulate))
+    run(*start, PROGRAM, str(cache), str(tmp_path), str(devices), *map(str, accumulate))
     for parts in accumulate:
         out = tmp_path / str(parts)
         told = json.loads((out / "losses.json").read_text())

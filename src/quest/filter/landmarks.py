@@ -165,8 +165,9 @@ def observe(
         moved = moved.only(np.flatnonzero(np.isfinite(moved.place[:, 0]).all(axis=-1)))
         if given is not None:
             # A given pose errs; what stands still as the picture tells it is no body that moves.
-            place = moved.place[moved.rests, 0]
-            estimated = estimate_pose(place, moved.uv_px[moved.rests], old.matrix, pose)
+            rests = moved.rests
+            place = moved.place[rests, 0]
+            estimated = estimate_pose(place, moved.uv_px[rests], old.matrix, pose)
             estimated_view = view if estimated is None else replace(view, cam_from_world=estimated[0])
             known = estimated is None or apart_px(place, view, estimated_view) < INLIER_PX
         moved = _observe_bodies(moved, view, estimated_view, known, dt_s, noise)

@@ -85,8 +85,9 @@ def weigh(
     at_px = places.uv_px[each, here]
     judged, left = _judged(queries, places, here, layers, likeness, dt_s, noise)
     ahead_m, measured_m = places.depth_m[each, best], np.where(rides, view.near_depth_at(at_px), np.nan)
-    looks, left = places.looks[each, here] - np.log(_HALF), left - np.log(_HALF)
-    judged = judged.deeper(best, ahead_m, measured_m, looks, left, new, landmarks.pose, view, noise)
+    # Both against being there and occluded.
+    seen, elsewhere = places.looks[each, here] - np.log(_HALF), left - np.log(_HALF)
+    judged = judged.deeper(best, ahead_m, measured_m, seen, elsewhere, new, landmarks.pose, view, noise)
 
     jumps = judged.rival_log_odds > 0
     far_off = (log_odds[each, best] > SURE) & (apart[each, best] > GATE * near[each, best])

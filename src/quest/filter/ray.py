@@ -1,4 +1,4 @@
-"""Evidence of depth along the ray on which a query was named: how deep it lies, by all frames in which it was seen.
+"""Evidence of depth along the ray on which a query was named: how deep it lies, by the depths of all frames.
 
 One depth may well be that of the door behind a thin handle, or be missing. So a histogram filter over places along that
 ray, which goes with the body, gathers the depths of all frames.
