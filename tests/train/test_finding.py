@@ -13,7 +13,7 @@ from PIL import Image
 from quest.data.boxed_pictures import BoxedPicture, may_choose
 from quest.errors import ConfigError
 from quest.model.finder import FINE_PX, OPENINGS, PANELS, PLACES, FinderMaps
-from quest.model.found import read_off
+from quest.model.found import Odds, read_off
 from quest.model.second_look import SecondLook
 from quest.train.dataset import UNSTATED
 from quest.train.finding.dataset import FinderData, open_finder_data
@@ -68,7 +68,7 @@ def test_what_is_cut_off_ends_at_the_cut() -> None:
 def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
     marks = make_marks()
     maps = targets(marks, 256)
-    found = read_off(_perfect(maps), BLIND, scale=np.array([2.0, 2.0]), size=(128, 128))
+    found = read_off(_perfect(maps), BLIND, scale=np.array([2.0, 2.0]), size=(128, 128), odds=Odds())
     likely = found.select(found.logit > 0)
     assert sorted(likely.labels) == ["handle", "rim"]
     grip = likely.labels.index("handle")
@@ -79,11 +79,38 @@ def test_maps_of_perfect_targets_read_back_as_the_marks() -> None:
     assert OPENINGS[likely.panels.opening_p[panel].argmax()] == "left"
 
 
+def test_a_panel_without_a_grip_is_taken_hold_of_by_its_front_or_by_the_edge_across_its_hinge() -> None:
+    """Unless a likelier one takes its place."""
+    box = np.array([[20.0, 10, 120, 210], [140, 20, 240, 60], [80.0, 40, 120, 56], [20, 140, 110, 200]])
+    marks = Marks(
+        kind=np.array([CABINET, CABINET, GRIP, CABINET]),
+        box_px=box,
+        point_px=(box[:, :2] + box[:, 2:]) / 2,
+        knob=np.array([UNKNOWN, UNKNOWN, 0, UNKNOWN]),
+        lift=np.full(4, UNKNOWN),
+        opening=np.array([OPENINGS.index(o) for o in ("left", "slides", "left", "slides")]),
+        known=np.ones(len(KINDS), bool),
+    )
+
+    def found(marks: Marks, odds: Odds) -> dict[str, list[float]]:
+        maps = _perfect(targets(marks, 256))
+        maps.panel[maps.panel > 0] = 4.0
+        maps.panel[0, CABINET - len(PLACES), 170 // 16, 65 // 16] = 3.0
+        seen = read_off(maps, BLIND, scale=np.ones(2), size=(256, 256), odds=odds)
+        likely = seen.select(seen.logit > 0)
+        return {label: uv.tolist() for label, uv in zip(likely.labels, likely.uv_px, strict=True)}
+
+    door = marks.only(np.arange(4) != 2)
+    assert found(marks, Odds()).keys() == {"handle", "front"}
+    assert found(door, Odds()) == {"front": [190, 40], "rim": [120, 110]}
+    assert "front" not in found(door, Odds(panel_bias=-9.0))
+
+
 def test_a_bar_that_reaches_far_out_of_the_picture_has_its_label_from_inside() -> None:
     maps = _perfect(targets(make_marks(), 256))
     maps.longest[0, 8, 0], maps.knob[0, :, 1:] = 99.0, 9.0  # what is not at the edge says knob
     maps.longest_extent[0, :, 8, 0] = torch.tensor([400.0, 8, 8, 8])
-    found = read_off(maps, BLIND, scale=np.ones(2), size=(256, 256))
+    found = read_off(maps, BLIND, scale=np.ones(2), size=(256, 256), odds=Odds())
     assert found.labels[0] == "handle"
     assert found.uv_px[0, 0] == 0
 

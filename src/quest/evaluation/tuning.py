@@ -2,8 +2,9 @@
 
 Both on labelled pictures and on simulated takes of validation objects, each of which counts the same however many
 answers it has. Scores become probabilities by a slope and a shift of their log odds (Platt, *Probabilistic outputs for
-support vector machines*, 1999). At the threshold the least of their precisions and recalls is greatest: what is
-overlooked and what is wrong weigh the same, and no kind of picture pays for the other.
+support vector machines*, 1999): those of handles and knobs by both, those of doors and drawers by the pictures. At the
+threshold the least of their precisions and recalls is greatest: what is overlooked and what is wrong weigh the same,
+and no kind of picture pays for the other.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from quest.errors import ConfigError
-from quest.evaluation.real.measures import score_picture
+from quest.evaluation.real.measures import ScoredPicture, score_picture
 from quest.evaluation.real.run import discover
 from quest.evaluation.real.sets import Picture
 from quest.evaluation.selection import Chosen
+from quest.model.finder import PANELS
 from quest.track import Tracker
 from quest.track.settings import TrackerConfig
-from quest.types import LABELS, Take
+from quest.types import GRIPS, LABELS, Take
 
 _NEAR = 16 / 640
 """An answer in a take is right at its entity's outline, or this close to it, in widths of the picture."""
@@ -46,7 +48,7 @@ class Tuned:
     """What came of it."""
 
     config: TrackerConfig
-    """With the slope, shift and threshold."""
+    """With the slopes, shifts and threshold."""
     of: tuple[str, ...]
     """``pictures`` and ``takes``, those that there are."""
     precision: tuple[float, ...]
@@ -70,26 +72,32 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
     wrong = [name for name, part in parts if part != "validation"]
     if wrong:
         raise ConfigError(f"tuning: expected takes of validation objects only, got {wrong[:3]}")
-    plain = Tracker(tracker.network, replace(tracker.config, gain=1.0, bias=0.0), device=tracker.device)
-    found = {"pictures": _in_pictures(plain, pictures)} if pictures else {}
-    found |= {"takes": _in_takes(plain, takes)} if parts else {}
-    sets = list(found.values())
-    if not any(answers.right.any() for answers in sets):
+    config = replace(tracker.config, gain=1.0, bias=0.0, panel_gain=1.0, panel_bias=0.0)
+    plain = Tracker(tracker.network, config, device=tracker.device)
+    scored = [score_picture(picture, discover(plain, picture.read())) for picture in pictures]
+    grips = {"pictures": _in_pictures(scored)} if scored else {}
+    grips |= {"takes": _in_takes(plain, takes, GRIPS)} if parts else {}
+    if not any(answers.right.any() for answers in grips.values()):
         raise ConfigError(
             "tuning: nothing was found rightly in the pictures and takes given; train first, or give more"
         )
-    gain, bias = _fit(sets)
-    threshold = _best_threshold([replace(a, logit=gain * a.logit + bias) for a in sets])
-    rates = [_rates(replace(a, logit=gain * a.logit + bias), np.array([threshold])) for a in sets]
-    config = replace(tracker.config, gain=gain, bias=bias, threshold=float(expit(threshold)))
+    gain, bias = _fit(list(grips.values()))
+    config = replace(tracker.config, gain=gain, bias=bias)
+    panels = [_panels_in(scored)] if scored else []
+    if any(answers.right.any() for answers in panels):
+        panel_gain, panel_bias = _fit(panels)
+        config = replace(config, panel_gain=panel_gain, panel_bias=panel_bias)
+    found = {name: replace(a, logit=gain * a.logit + bias) for name, a in grips.items()}
+    if parts:
+        found["takes"] = _in_takes(Tracker(tracker.network, config, device=tracker.device), takes, LABELS)
+    threshold = _best_threshold(list(found.values()))
+    rates = [_rates(answers, np.array([threshold])) for answers in found.values()]
     precision, recall = zip(*((float(p[0]), float(r[0])) for p, r in rates), strict=True)
-    return Tuned(config, tuple(found), precision, recall)
+    return Tuned(replace(config, threshold=float(expit(threshold))), tuple(found), precision, recall)
 
 
-def _in_pictures(tracker: Tracker, pictures: Sequence[Picture]) -> Answers:
-    scored = []
-    for picture in pictures:
-        scored.append(score_picture(picture, discover(tracker, picture.read())))
+def _in_pictures(scored: Sequence[ScoredPicture]) -> Answers:
+    """Handles and knobs found in pictures."""
     return Answers(
         np.concatenate([s.score for s in scored]),
         np.concatenate([s.first for s in scored]),
@@ -97,7 +105,15 @@ def _in_pictures(tracker: Tracker, pictures: Sequence[Picture]) -> Answers:
     )
 
 
-def _in_takes(tracker: Tracker, takes: Chosen) -> Answers:
+def _panels_in(scored: Sequence[ScoredPicture]) -> Answers:
+    """Doors and drawers found in pictures."""
+    boxes = [s.boxes[kind] for s in scored for kind in PANELS if kind in s.boxes]
+    score, first = ([getattr(b, name) for b in boxes] for name in ("score", "first"))
+    return Answers(np.concatenate(score), np.concatenate(first), sum(b.labelled for b in boxes))
+
+
+def _in_takes(tracker: Tracker, takes: Chosen, labels: Sequence[str]) -> Answers:
+    """What of some labels was found in first frames."""
     logits: list[float] = []
     right: list[bool] = []
     present = 0
@@ -106,16 +122,16 @@ def _in_takes(tracker: Tracker, takes: Chosen) -> Answers:
         for view in range(len(take.views)):
             clip = take.views[view].clip
             found = tracker.find(clip.rgb[0])
-            found = found.select(np.isin(found.labels, LABELS))
-            hits, seen = _match(take, view, found.uv_px)
+            found = found.select(np.isin(found.labels, labels))
+            hits, seen = _match(take, view, found.uv_px, labels)
             logits, right, present = logits + found.logit.tolist(), right + hits, present + seen
     return Answers(np.array(logits), np.array(right, bool), present)
 
 
-def _match(take: Take, view: int, uv_px: Float[np.ndarray, "A 2"]) -> tuple[list[bool], int]:
-    """Which answers, best first, are right in a take's first frame, and how many entities are seen in it."""
+def _match(take: Take, view: int, uv_px: Float[np.ndarray, "A 2"], labels: Sequence[str]) -> tuple[list[bool], int]:
+    """Which answers, best first, are right in a take's first frame, and how many entities of the labels are seen."""
     truth = take.views[view]
-    entities = [int(e) for e in take.tracked if truth.visible[0, e]]
+    entities = [int(e) for e in take.tracked if truth.visible[0, e] and take.info.entities[int(e)].label in labels]
     height, width = truth.entity_id.shape[1:]
     gap = np.linalg.norm(uv_px[:, None] - truth.uv_px[0, entities], axis=-1)
     column, row = np.clip(uv_px.astype(int), 0, (width - 1, height - 1)).T

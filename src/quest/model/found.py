@@ -10,10 +10,10 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
-from scipy.special import expit
+from scipy.special import expit, log_expit
 from torch import Tensor
 
-from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
+from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, OPENINGS, PLACES, FinderMaps, FinderNetwork
 from quest.model.second_look import SecondLook
 from quest.types import LABELS
 
@@ -29,6 +29,8 @@ _SAME_BOX = 0.5
 """Boxes that share so much of their union are one."""
 APART_PX = 12.0
 """Rims, fronts and hinges closer than this in what the network sees are one."""
+_ACROSS = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+"""Of each of :data:`quest.model.finder.OPENINGS`, from the middle to the edge across the hinge, half sides."""
 GREY = 114
 """Of what the network sees beside the picture."""
 
@@ -87,22 +89,27 @@ class Found:
         return replace(self, **{f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "panels"})
 
 
-def find(
-    network: FinderNetwork,
-    rgb: UInt8[np.ndarray, "H W 3"],
-    *,
-    size_px: int,
-    gain: float = 1.0,
-    bias: float = 0.0,
-) -> Found:
+@dataclass(frozen=True)
+class Odds:
+    """From the network's logits to log odds of being right."""
+
+    gain: float = 1.0
+    """Multiplies the logits of what can be taken hold of ..."""
+    bias: float = 0.0
+    """... and is added to them."""
+    panel_gain: float = 1.0
+    """The same of doors and drawers."""
+    panel_bias: float = 0.0
+
+
+def find(network: FinderNetwork, rgb: UInt8[np.ndarray, "H W 3"], *, size_px: int, odds: Odds | None = None) -> Found:
     """What can be taken hold of in a picture.
 
     Args:
         network: in evaluation mode.
         rgb: the picture.
         size_px: longer side of what the network sees.
-        gain: multiplies the network's logits of what can be taken hold of ...
-        bias: ... and is added to them, so that they are log odds of being right.
+        odds: of what it says; by default its own.
     """
     height, width = rgb.shape[:2]
     device = next(network.parameters()).device
@@ -110,8 +117,7 @@ def find(
     with torch.inference_mode():
         maps = network(torch.from_numpy(canvas).to(device).permute(2, 0, 1)[None] / 255)
         scale = np.array([inside[1] / width, inside[0] / height])
-        found = read_off(maps, network.second, scale=scale, size=(width, height))
-    return replace(found, logit=gain * found.logit + bias)
+        return read_off(maps, network.second, scale=scale, size=(width, height), odds=odds or Odds())
 
 
 def placed(rgb: UInt8[np.ndarray, "H W 3"], size_px: int) -> tuple[UInt8[np.ndarray, "h w 3"], tuple[int, int]]:
@@ -133,18 +139,21 @@ def placed(rgb: UInt8[np.ndarray, "H W 3"], size_px: int) -> tuple[UInt8[np.ndar
     return canvas, (rows, columns)
 
 
-def read_off(maps: FinderMaps, second: SecondLook, *, scale: Float[np.ndarray, "2"], size: tuple[int, int]) -> Found:
-    """What the maps of one picture (B = 1) show.
+def read_off(
+    maps: FinderMaps, second: SecondLook, *, scale: Float[np.ndarray, "2"], size: tuple[int, int], odds: Odds
+) -> Found:
+    """What the maps of one picture (B = 1) show, and doors and drawers without a handle or knob.
 
     Args:
         maps: of the network.
         second: the network's second look at grips.
         scale: pixels of what the network saw per pixel of the source, along x and y.
         size: width and height of the source.
+        odds: of the maps' logits.
     """
     two = np.tile(scale, 2)
     end = np.array(size, np.float64)
-    panels = _panels(maps, two, np.tile(end, 2))
+    panels = _panels(maps, two, np.tile(end, 2), odds)
     levels = (
         _level(maps.place[0], maps.extent[0], FINE_PX),
         _level(maps.longer, maps.longer_extent[0], MIDDLE_PX),
@@ -169,7 +178,43 @@ def read_off(maps: FinderMaps, second: SecondLook, *, scale: Float[np.ndarray, "
     box[keep] = _looked_at_again(box[keep], maps, second)
     uv = _within_grip(uv, box)
     uv, box = np.clip(uv[keep] / scale, 0, end), np.clip(box[keep] / two, 0, np.tile(end, 2))
-    return Found(uv, logit[keep], label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
+    logit = odds.gain * logit[keep] + odds.bias
+    seen = Found(uv, logit, label_p[keep], lift[keep], box, _carrier(uv, panels), panels)
+    return _with(seen, _without_grip(seen), APART_PX / scale)
+
+
+def _without_grip(found: Found) -> Found:
+    """Doors and drawers that carry no grip: the front of what slides, else the middle of the edge across the hinge.
+
+    One is where its panel is one, no grip lies in it, and no likelier panel takes its place.
+    """
+    panels, grip = found.panels, ~np.isnan(found.box_px[:, 0])
+    low, high = panels.box_px[:, :2], panels.box_px[:, 2:]
+    holds = ((found.uv_px >= low[:, None]) & (found.uv_px <= high[:, None])).all(axis=-1) & grip
+    shared_px = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
+    taken = shared_px.clip(0).prod(axis=-1) / (high - low).prod(axis=1).clip(1)[:, None]
+    likelier = np.tri(len(panels), k=-1, dtype=bool)
+    opening = panels.opening_p.argmax(axis=1)
+    log_p = log_expit(panels.logit) + np.log(panels.opening_p[np.arange(len(panels)), opening])
+    log_p += np.where(holds, log_expit(-found.logit), 0.0).sum(axis=1)
+    log_p += np.where(likelier, np.log1p(-expit(panels.logit) * taken), 0.0).sum(axis=1)
+    middle, slides = (low + high) / 2, opening == OPENINGS.index("slides")
+    label_p = np.eye(len(LABELS_FOUND))[np.where(slides, LABELS_FOUND.index("front"), LABELS_FOUND.index("rim"))]
+    none = np.full((len(panels), 4), np.nan)
+    uv_px = np.where(slides[:, None], middle, middle + _ACROSS[opening] * (high - middle))
+    logit = log_p - np.log(-np.expm1(log_p))
+    free = Found(uv_px, logit, label_p, np.zeros(len(panels)), none, np.arange(len(panels)), panels)
+    return free.select(logit > _LEAST)
+
+
+def _with(found: Found, more: Found, apart_px: Float[np.ndarray, "2"]) -> Found:
+    """With others that are not so near what is found of their label already, best first."""
+    same = found.label_p.argmax(axis=1) == more.label_p.argmax(axis=1)[:, None]
+    near = (((found.uv_px - more.uv_px[:, None]) / apart_px) ** 2).sum(axis=-1) < 1
+    more = more.select(~(same & near).any(axis=1))
+    order = np.argsort(-np.concatenate([found.logit, more.logit]), kind="stable")
+    names = [f.name for f in fields(found) if f.name != "panels"]
+    return replace(found, **{n: np.concatenate([getattr(found, n), getattr(more, n)])[order] for n in names})
 
 
 def _level(
@@ -231,7 +276,7 @@ def _boxes(extent: Float[Tensor, "4 h w"], cell: Int[np.ndarray, "N 2"], stride:
     return np.concatenate((centre - out[:, :2], centre + out[:, 2:]), axis=1)
 
 
-def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"]) -> Panels:
+def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"], odds: Odds) -> Panels:
     cell, kind, logit = _highest(maps.panel[0], around=0)
     box = _boxes(maps.panel_extent[0], cell, COARSE_PX)
     keep: list[int] = []
@@ -239,7 +284,8 @@ def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarr
         if not keep or shared(box[i], box[keep]).max() < _SAME_BOX:
             keep.append(i)
     opening = maps.opening[0].softmax(dim=0).double().cpu().numpy()[:, cell[keep, 1], cell[keep, 0]].T
-    return Panels(np.clip(box[keep] / scale, 0, end), kind[keep], logit[keep], opening)
+    logit = odds.panel_gain * logit[keep] + odds.panel_bias
+    return Panels(np.clip(box[keep] / scale, 0, end), kind[keep], logit, opening)
 
 
 def _apart(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"], place: Int[np.ndarray, " N"]) -> list[int]:

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import TypedDict
 
 from quest.errors import ConfigError, WeightsError
+from quest.model.found import Odds
 from quest.untrusted import build, parse_json, reading
 
 REVISION = 15
@@ -19,8 +20,7 @@ class Looking(TypedDict):
     """Arguments of :func:`quest.model.found.find`."""
 
     size_px: int
-    gain: float
-    bias: float
+    odds: Odds
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,9 @@ class TrackerConfig:
     """Multiplies the finder's logits ..."""
     bias: float = 0.0
     """... and is added to them, so that they are log odds of being right."""
+    panel_gain: float = 1.0
+    """The same of doors and drawers."""
+    panel_bias: float = 0.0
     threshold: float = 0.5
     """Probability above which discovery follows what was found."""
     prompt_threshold: float = 0.2
@@ -51,7 +54,7 @@ class TrackerConfig:
     @property
     def looking(self) -> Looking:
         """How the finder looks, as arguments of :func:`quest.model.found.find`."""
-        return {"size_px": self.size_px, "gain": self.gain, "bias": self.bias}
+        return {"size_px": self.size_px, "odds": Odds(self.gain, self.bias, self.panel_gain, self.panel_bias)}
 
     def to_json(self) -> str:
         """One line, stored with the weights."""

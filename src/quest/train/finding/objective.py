@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from quest.data.boxed_pictures import in_boxes
 from quest.errors import ConfigError
 from quest.model.finder import COARSE_PX, CONTEXT_BLOCKS, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
-from quest.model.found import read_off, shared
+from quest.model.found import Odds, read_off, shared
 from quest.train.finding.marks import UNKNOWN
 from quest.train.finding.sampler import FinderInputs, FinderSampler, FinderTruth, whole_view
 from quest.train.finding.settings import VIEW_PX
@@ -177,7 +177,7 @@ class StageFind:
                 view = sampler.view(paths[i], seed=int(i))
                 seen = whole_view(view).to(device)
                 maps = self.network(seen.rgb.float() / 255, context=seen.context)
-                found = read_off(maps, self.network.second, scale=np.ones(2), size=(VIEW_PX, VIEW_PX))
+                found = read_off(maps, self.network.second, scale=np.ones(2), size=(VIEW_PX, VIEW_PX), odds=Odds())
                 found = found.select(~np.isnan(found.box_px[:, 0]))
                 box = view.marks.box_px[view.marks.kind == PLACES.index("grip")]
                 share = np.array([shared(own, box) for own in found.box_px]).reshape(len(found), len(box))
