@@ -125,7 +125,8 @@ RESULTS = Page(
             "tracker = tracker | not found below 16 px % = !%measures.recall_0_to_16_px | 16 to 32 = "
             "!%measures.recall_16_to_32_px | 32 to 64 = !%measures.recall_32_to_64_px | above = "
             "!%measures.recall_above_64_px | AP50 handles = measures.ap50_handle | cabinet doors, drawers = "
-            "measures.ap50_cabinet | doors = measures.ap50_door | refrigerator doors = measures.ap50_refrigerator",
+            "measures.ap50_cabinet | doors = measures.ap50_door | refrigerator doors = measures.ap50_refrigerator | "
+            "bare ones = measures.ap50_bare",
             only={"of": "pictures"},
             about="Sizes are longer sides in a picture 640 px wide.",
         ),

@@ -255,7 +255,7 @@ def grips(uv_px: np.ndarray, score: Sequence[float], *, least: float = -np.inf) 
     return {
         "uv_px": uv_px, "box_px": np.concatenate((uv_px - half, uv_px + half), axis=1), "score": np.array(score),
         "panel_px": np.zeros((0, 4)), "panel_kind": np.zeros(0, int), "panel_score": np.zeros(0),
-        "least": np.array(least),
+        "bare_px": np.zeros((0, 4)), "bare_score": np.zeros(0), "least": np.array(least),
     }  # fmt: skip
 
 
@@ -316,6 +316,14 @@ def test_boxes_are_right_that_share_half_of_their_union() -> None:
     boxes = match_boxes(found, np.array([4.0, 3, 2, 1]), true)
     assert boxes.first.tolist() == [True, False, False, True]
     assert boxes.labelled == 2
+
+
+def test_doors_without_a_labelled_handle_are_told_apart(tmp_path: Path) -> None:
+    doors = np.array([[0.0, 0, 30, 40], [32, 0, 62, 40]])
+    picture = make_picture(tmp_path, "a.png", [(24, 15, 28, 25)], panels={"cabinet": doors})
+    found = grips(np.zeros((0, 2)), []) | {"bare_px": doors, "bare_score": np.array([2.0, 1.0])}
+    bare = score_picture(picture, found).boxes["bare"]
+    assert (bare.first.tolist(), bare.labelled) == ([False, True], 1)
 
 
 def test_pictures_are_split_by_name(tmp_path: Path) -> None:

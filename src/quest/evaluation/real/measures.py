@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Bool, Float
 
+from quest.data.boxed_pictures import in_boxes
 from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value, statistic_value
 from quest.evaluation.drift import ranked_auroc
 from quest.evaluation.metrics import Sums
@@ -119,7 +120,7 @@ class ScoredPicture:
     first: Bool[np.ndarray, " C"]
     """Which candidates are right, and the best one of their handle."""
     boxes: Mapping[str, Boxes]
-    """Handles and panels by their boxes, of those kinds that are labelled in boxes."""
+    """Handles and panels by their boxes, of those kinds that are labelled in boxes; and panels without a handle."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +154,10 @@ def score_picture(picture: Picture, found: Mapping[str, np.ndarray]) -> ScoredPi
             own = found["panel_kind"] == k
             true = picture.panels.get(kind, np.zeros((0, 4)))
             boxes[kind] = match_boxes(found["panel_px"][own], found["panel_score"][own], true)
+        panels = np.concatenate([np.zeros((0, 4)), *picture.panels.values()])
+        middles = (picture.boxes[:, :2] + picture.boxes[:, 2:]) / 2
+        bare = np.array([not in_boxes(box[None], middles).any() for box in panels], bool)
+        boxes["bare"] = match_boxes(found["bare_px"], found["bare_score"], panels[bare])
     return ScoredPicture(
         right[followed & counted] == 1,
         again[followed & counted],

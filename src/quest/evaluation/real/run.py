@@ -189,13 +189,16 @@ def discover(tracker: Tracker, rgb: UInt8[np.ndarray, "H W 3"]) -> dict[str, np.
 
     Returns:
         Best first, however unlikely: ``uv_px``, ``box_px`` and ``score`` (log odds of being right) of grips,
-        ``panel_px``, ``panel_kind`` and ``panel_score`` of panels; and the ``least`` score that discovery follows.
+        ``panel_px``, ``panel_kind`` and ``panel_score`` of panels, ``bare_px`` and ``bare_score`` of panels that are
+        taken hold of by their front or rim; and the ``least`` score that discovery follows.
     """
     found = tracker.find(rgb)
     grips, panels, least = grips_of(found), found.panels, tracker.config.threshold
+    bare = found.select(np.isin(found.labels, ("rim", "front")) & (found.panel >= 0))
     return {
         "uv_px": grips.uv_px, "box_px": grips.box_px, "score": grips.logit, "panel_px": panels.box_px,
-        "panel_kind": panels.kind, "panel_score": panels.logit, "least": logit(least),
+        "panel_kind": panels.kind, "panel_score": panels.logit, "bare_px": panels.box_px[bare.panel],
+        "bare_score": bare.logit, "least": logit(least),
     }  # fmt: skip
 
 

@@ -37,6 +37,7 @@ COLUMNS = (
     Column("ap50_cabinet", "cabinet", 3, 1.0, 4),
     Column("ap50_door", "door", 3, 1.0, 4),
     Column("ap50_refrigerator", "refrig.", 3, 1.0, 4),
+    Column("ap50_bare", "bare", 3, 1.0, 4),
 )
 """What is shown of a row, in this order; the result file has everything."""
 
