@@ -74,6 +74,17 @@ def test_what_no_motion_explains_is_said(what: str) -> None:
     assert any(words in flag for flag in states[BAD.start].flags)
 
 
+@pytest.mark.parametrize("word", ["upside down", "mirrored", "flipped"])
+def test_a_picture_that_is_much_the_same_when_turned_is_said_to_be(word: str) -> None:
+    rows, columns = np.mgrid[:1:60j, :1:80j]
+    height = np.exp(-(((rows - 0.5) / 0.2) ** 2) - ((columns - 0.5) / 0.2) ** 2) + 0.3 * rows + 0.2 * columns
+    rgb = np.repeat((150 * height)[..., None], 3, axis=2).astype(np.uint8)
+    health = Health()
+    assert [health.of_picture(np.roll(rgb, k, axis=1), k) for k in range(3)] == [((), False)] * 3
+    turned = {"upside down": rgb[::-1, ::-1], "mirrored": rgb[:, ::-1], "flipped": rgb[::-1]}[word]
+    assert health.of_picture(np.ascontiguousarray(turned), 3)[0] == (f"{word} at once",)
+
+
 def test_exchanged_colours_are_said() -> None:
     health, rgb = Health(), RNG.integers(0, 256, (60, 80, 3)).astype(np.uint8)
     rgb = cv2.GaussianBlur(rgb, (0, 0), 4.0)
@@ -121,6 +132,9 @@ def test_what_stands_still_is_a_fault_where_there_is_noise_and_none_did_so_far()
     assert come_again(np.concatenate([noisy, noisy[-1:]])) == [False] * 20 + [True]
     assert come_again(np.concatenate([noisy[:9], noisy[8:9], noisy[8:9]])) == [False] * 9 + [True] * 2
     assert not any(come_again(noisy.repeat(2, axis=0)))
+    often = noisy.repeat(np.where(np.arange(20) % 3, 1, 2), axis=0)  # a third of them twice
+    assert come_again(np.concatenate([often, *[noisy[-1:]] * 5]))[-3:] == [True] * 3
+    assert not any(come_again(noisy[:1].repeat(20, axis=0)))  # nobody knows whether it has noise
     moved = np.zeros((20, 80, 80, 3), np.uint8)
     moved[np.arange(20), 0, 0] = np.arange(20)[:, None]  # one corner moves, nothing else has noise
     assert not any(come_again(np.concatenate([moved, moved[-1:]])))

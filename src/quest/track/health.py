@@ -35,7 +35,13 @@ _STILLEST, _STILLEST_DEPTH = 0.97, 0.8
 """Share of pixels as before, in the stillest frame so far, above which pictures have no noise: rendered ones, or video
 in which nothing moves. Most real videos, which compress noise away, come to 0.95 and less; real depth to 0.66."""
 _RARELY = 0.1
-"""Share of repeated pictures so far, below which one is a fault."""
+"""Probability of so many repeated pictures in a row, by those so far, below which they are a fault."""
+_TURNED = {
+    "upside down": (slice(None, None, -1), slice(None, None, -1)),
+    "mirrored": (slice(None), slice(None, None, -1)),
+    "flipped": (slice(None, None, -1), slice(None)),
+}
+"""What a setting of the camera can do to its pictures, as rows and columns of them."""
 
 
 def digest_of(data: np.ndarray) -> int:
@@ -59,21 +65,24 @@ class Repeats:
     """How many came."""
     runs: int = 0
     """How often they stood still and went on."""
-    still: bool = False
-    """Whether they do now."""
+    again: int = 0
+    """How many in a row are now as the one before."""
 
     def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: int | None) -> bool:
         """Whether the next one, with its digest, is that before, and this is not what is usual.
 
-        Without noise, what stands still may be a scene that does.
+        Without noise, what stands still may be a scene that does; nor is noise known before two pictures differ.
         """
         again, some = digest == self.digest, data[::8, ::8].copy()
-        self.runs += self.still and not again
+        self.runs += self.again > 0 and not again
         self.seen += not again
         if not again and self.some is not None:
             self.same = max(self.same, float((some == self.some).mean()))
-        self.digest, self.some, self.still = digest, some, again
-        return again and self.same < self.noiseless and (self.runs + 1) / (self.seen + 2) < _RARELY
+        self.digest, self.some, self.again = digest, some, self.again + 1 if again else 0
+        # How probable so many in a row are, if as many come as so far (the rule of succession).
+        repeats = np.arange(self.again)
+        usual = np.prod((self.runs + 1 + repeats) / (self.seen + 2 + repeats))
+        return again and self.seen > 1 and self.same < self.noiseless and bool(usual < _RARELY)
 
 
 @dataclass
@@ -136,8 +145,12 @@ class Health:
 def _changes(before: Float32[np.ndarray, "h w 3"], now: Float32[np.ndarray, "h w 3"]) -> list[str]:
     """What no motion explains between two coarse pictures, in words."""
     found = []
-    if _correlation(before, now) < _CHANGED:
+    alike = _correlation(before, now)
+    turned = {name: _correlation(before[each], now) for name, each in _TURNED.items()}
+    if alike < _CHANGED:
         found.append(ELSEWHERE)
+    elif max(turned.values()) > alike:
+        found.append(f"{max(turned, key=turned.__getitem__)} at once")
     red, redder = (each[..., 0] - each[..., 2] for each in (before, now))
     if min(red.std(), redder.std()) > _COLOURFUL and _correlation(red, redder) < _EXCHANGED:
         found.append("red and blue exchanged at once")
