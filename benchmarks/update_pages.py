@@ -158,6 +158,8 @@ RESULTS = Page(
             suite="standard",
         ),
         discovery("free.json", "Discovery on free furniture"),
+        discovery("fine_tune/before.json", "Discovery on the tool chest of examples/fine_tune.py, shipped weights"),
+        discovery("fine_tune/after.json", "Discovery on the tool chest, weights taught by other takes of it"),
         Table(
             "predicted_joints.json",
             "Joints from predicted tracks",
@@ -209,10 +211,6 @@ HISTORY = Page(
         alarms(f"{APACHE}/monitor/test.json", "Alarms of the weights trained on procedural objects only"),
         intents("intents", "Open and lift: both rims of a closed laptop"),
         intents("ajar", "Both rims of a laptop, from where they are 16 pixels apart"),
-        tracking("fine_tune/before.json", "The tool chest of examples/fine_tune.py, shipped weights"),
-        discovery("fine_tune/before.json", "Discovery on the tool chest, shipped weights"),
-        tracking("fine_tune/after.json", "The tool chest, weights fitted to it"),
-        discovery("fine_tune/after.json", "Discovery on the tool chest, weights fitted to it"),
         alarms("monitor/long.json", "Streams of 240 frames, alpha for the whole stream"),
         alarms("monitor/long_blocks.json", "Streams of 240 frames, alpha for every 60 frames"),
         Table(
