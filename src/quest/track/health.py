@@ -41,8 +41,7 @@ _TURNED = {(-1, -1): "upside down", (1, -1): "mirrored", (-1, 1): "flipped"}
 """What a setting of the camera can do to its pictures, by the steps of rows and columns."""
 _ALIKE_TURNED = 0.75
 """Correlation with the picture before, turned, above which it is that one. Real pictures that are turned come to 0.84
-and more, but for one clip to 0.43; 1,800 that are not, and are
-more like it than the other, twenty frames later to 0.65."""
+and more, but for one clip to 0.43; of 1,800 that are not, twenty frames later, those that are more like it to 0.65."""
 
 
 def digest_of(data: np.ndarray) -> int:
