@@ -188,6 +188,13 @@ RESULTS = Page(
         ),
         *(table for recipe in TABLES.values() for table in recipe.pages),
         Table(
+            "kills.json",
+            "Commands that are killed at random moments",
+            "command = command | killed = kills | whole before the second run = whole | torn = torn | "
+            "second run failed = failed | ended otherwise than undisturbed = different",
+            about="Twenty times each; the others had ended before.",
+        ),
+        Table(
             "data/verify.json",
             "Takes of all suites, verified",
             "check = key | worst = worst | limit = limit | unit = unit",

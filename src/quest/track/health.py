@@ -36,7 +36,8 @@ _STILLEST, _STILLEST_DEPTH = 0.97, 0.8
 """Share of pixels as before, in the stillest frame so far, above which pictures have no noise: rendered ones, or video
 in which nothing moves. Most real videos, which compress noise away, come to 0.95 and less; real depth to 0.66."""
 _RARELY = 0.1
-"""Probability of so many repeated pictures in a row, by those so far, below which they are a fault."""
+"""Probability of so many repeated pictures in a row, by those so far, below which they are a fault; that of a stiller
+picture than any so far, below which noise is known."""
 _TURNED = {(-1, -1): "upside down", (1, -1): "mirrored", (-1, 1): "flipped"}
 """What a setting of the camera can do to its pictures, by the steps of rows and columns."""
 _ALIKE_TURNED = 0.75
@@ -71,7 +72,7 @@ class Repeats:
     def are_faults(self, data: Shaped[np.ndarray, "H W ..."], digest: int | None) -> bool:
         """Whether the next one, with its digest, is that before, and this is not what is usual.
 
-        Without noise, what stands still may be a scene that does; nor is noise known before two pictures differ.
+        Without noise, what stands still may be a scene that does; whether there is noise takes some pictures to know.
         """
         again, some = digest == self.digest, data[::8, ::8].copy()
         self.runs += self.again > 0 and not again
@@ -79,10 +80,10 @@ class Repeats:
         if not again and self.some is not None:
             self.same = max(self.same, float((some == self.some).mean()))
         self.digest, self.some, self.again = digest, some, self.again + 1 if again else 0
-        # How probable so many in a row are, if as many come as so far (the rule of succession).
-        repeats = np.arange(self.again)
+        # By the rule of succession: that one comes which is stiller than all so far, and so many in a row.
+        stiller, repeats = 1 / (self.seen + 2), np.arange(self.again)
         usual = np.prod((self.runs + 1 + repeats) / (self.seen + 2 + repeats))
-        return again and self.seen > 1 and self.same < self.noiseless and bool(usual < _RARELY)
+        return again and self.same < self.noiseless and bool(max(stiller, usual) < _RARELY)
 
 
 @dataclass
