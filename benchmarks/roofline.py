@@ -110,7 +110,7 @@ class Roofline:
             square = torch.ones(1024, 1024, dtype=getattr(torch, precision))
             rate = 2 * 1024**3 / self._median_s(partial(torch.mm, square, square))
             tracker = quest.load(self.weights, device="cpu", engine=engine)
-            look = partial(find, tracker.network, clip.rgb[0], **tracker.config.looking)
+            look = partial(find, tracker.network, clip.rgb[0], size_px=tracker.config.size_px, odds=tracker.config)
             describe = partial(making.described, tracker.features, grey_of(clip.rgb[0]))
             for network, once in (("finder", look), ("dense descriptors", describe)):
                 flops, took_s = _flops(once), self._median_s(once)

@@ -190,7 +190,7 @@ def _without_grip(found: Found) -> Found:
     """
     panels, grip = found.panels, ~np.isnan(found.box_px[:, 0])
     low, high = panels.box_px[:, :2], panels.box_px[:, 2:]
-    holds = ((found.uv_px >= low[:, None]) & (found.uv_px <= high[:, None])).all(axis=-1) & grip
+    holds = (_inside(found.uv_px, panels) & grip[:, None]).T
     shared_px = np.minimum(high[:, None], high) - np.maximum(low[:, None], low)
     taken = shared_px.clip(0).prod(axis=-1) / (high - low).prod(axis=1).clip(1)[:, None]
     likelier = np.tri(len(panels), k=-1, dtype=bool)
@@ -314,10 +314,15 @@ def shared(box: Float[np.ndarray, "4"], others: Float[np.ndarray, "N 4"]) -> Flo
     return inner / ((box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1) - inner)
 
 
+def _inside(uv: Float[np.ndarray, "N 2"], panels: Panels) -> Bool[np.ndarray, "N M"]:
+    """Which points lie in which panels."""
+    return np.asarray(((uv[:, None] >= panels.box_px[:, :2]) & (uv[:, None] <= panels.box_px[:, 2:])).all(axis=-1))
+
+
 def _carrier(uv: Float[np.ndarray, "N 2"], panels: Panels) -> Int[np.ndarray, " N"]:
     """The smallest panel around each point that is likelier there than not, -1 for none."""
     box = panels.box_px
-    around = ((uv[:, None] >= box[:, :2]) & (uv[:, None] <= box[:, 2:])).all(axis=-1) & (panels.logit > 0)
+    around = _inside(uv, panels) & (panels.logit > 0)
     if not around.any():
         return np.full(len(uv), -1)
     area = np.where(around, (box[:, 2:] - box[:, :2]).prod(axis=1), np.inf)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass
-from typing import TypedDict
 
 from quest.errors import ConfigError, WeightsError
 from quest.model.found import Odds
@@ -16,24 +15,10 @@ _SIZES_PX = (16, 4096)
 """Smallest and largest side that pictures are brought to."""
 
 
-class Looking(TypedDict):
-    """Arguments of :func:`quest.model.found.find`."""
-
-    size_px: int
-    odds: Odds
-
-
 @dataclass(frozen=True)
-class TrackerConfig:
+class TrackerConfig(Odds):
     """Settings of discovery, and how large pictures are at least."""
 
-    gain: float = 1.0
-    """Multiplies the finder's logits ..."""
-    bias: float = 0.0
-    """... and is added to them, so that they are log odds of being right."""
-    panel_gain: float = 1.0
-    """The same of doors and drawers."""
-    panel_bias: float = 0.0
     threshold: float = 0.5
     """Probability above which discovery follows what was found."""
     prompt_threshold: float = 0.2
@@ -50,11 +35,6 @@ class TrackerConfig:
         for name in ("size_px", "follow_px"):
             if not _SIZES_PX[0] <= getattr(self, name) <= _SIZES_PX[1]:
                 raise ConfigError(f"tracker: expected {name} from {_SIZES_PX[0]} to {_SIZES_PX[1]}, got {self}")
-
-    @property
-    def looking(self) -> Looking:
-        """How the finder looks, as arguments of :func:`quest.model.found.find`."""
-        return {"size_px": self.size_px, "odds": Odds(self.gain, self.bias, self.panel_gain, self.panel_bias)}
 
     def to_json(self) -> str:
         """One line, stored with the weights."""

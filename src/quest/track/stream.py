@@ -301,7 +301,7 @@ class Stream:
         return state
 
     def _look(self, rgb: UInt8[np.ndarray, "H W 3"]) -> Found:
-        return find(self._network, rgb, **self._config.looking)
+        return find(self._network, rgb, size_px=self._config.size_px, odds=self._config)
 
     def _find(self, finding: Finding, state: FilterState, rgb: UInt8[np.ndarray, "H W 3"]) -> FilterState:
         """Begin a look if it is time, and take in the last one if it is there: what is likely enough is followed."""

@@ -156,7 +156,7 @@ class Tracker:
         rgb = np.asarray(rgb)
         if rgb.ndim != 3 or rgb.shape[-1] != 3 or rgb.dtype != np.uint8 or not rgb.size:
             raise InputError(f"find: expected colours [H, W, 3] of uint8, got {list(rgb.shape)} of {rgb.dtype}")
-        return find(self.network, rgb, **self.config.looking)
+        return find(self.network, rgb, size_px=self.config.size_px, odds=self.config)
 
     def save(self, stream: Stream) -> bytes:
         """A stream of this tracker as bytes; callbacks are left out."""
