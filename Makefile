@@ -26,7 +26,9 @@ help:
 demo: $(BASE)
 	$(BIN)/quest demo --out $(DEMO_OUT)
 
-test: lint types pytest
+# Side by side: types need one core alone, and tests do not use both all the time.
+test: $(ALL) render-deps
+	$(MAKE) --no-print-directory --jobs 2 lint types pytest
 
 lint: $(ALL)
 	$(BIN)/ruff check

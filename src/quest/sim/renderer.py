@@ -3,8 +3,7 @@
 Links are placed by our own forward kinematics; no physics is stepped. Every entity that has meshes
 of its own (handles, knobs) is a separate scene entity, so that the segmentation image tells it apart.
 
-Use one renderer per process and keep it: the first picture of a process compiles shaders, which takes
-about twenty seconds in software.
+The first picture of a process compiles shaders, which takes about twenty seconds in software.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -51,20 +50,21 @@ class Picture:
 
 
 class Renderer:
-    """SAPIEN's renderer, set up once per process.
+    """SAPIEN's renderer; what it compiles serves all renderers of a process.
 
     Raises:
         RendererError: no device can render; the message says what to install.
         MissingExtraError: SAPIEN is not installed.
     """
 
+    _latest: ClassVar[Stage | None] = None
+    """Kept alive until the next one exists, because SAPIEN drops its compiled shaders with the last camera."""
+
     def __init__(self) -> None:
         self.device = prepare_renderer()
         sapien = require("sapien")
         sapien.render.set_log_level("error")
         self._sapien = sapien
-        # SAPIEN drops its compiled shaders with the last camera: keep a stage alive until the next one exists.
-        self._latest: Stage | None = None
 
     def stage(self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Dress | None = None) -> Stage:
         """A scene with one object and its cameras.
@@ -76,11 +76,11 @@ class Renderer:
                 :meth:`Stage.dress`, which is enough for depth and labels.
         """
         try:
-            with nullcontext() if self._latest is not None else without_known_warnings():
-                self._latest = Stage(self._sapien, sim_object, cameras)
+            with nullcontext() if Renderer._latest is not None else without_known_warnings():
+                stage = Renderer._latest = Stage(self._sapien, sim_object, cameras)
             if dress is not None:
-                self._latest.dress(dress)
-            return self._latest
+                stage.dress(dress)
+            return stage
         except RuntimeError as error:
             raise RendererError(
                 f"{sim_object.object_id}: SAPIEN cannot set up the scene ({error}); {REMEDY}"
