@@ -26,7 +26,7 @@ help:
 demo: $(BASE)
 	$(BIN)/quest demo --out $(DEMO_OUT)
 
-# Side by side: types need one core alone, and tests do not use both all the time.
+# Two at a time, so that tests begin while types are checked.
 test: $(ALL) render-deps
 	$(MAKE) --no-print-directory --jobs 2 lint types pytest
 
