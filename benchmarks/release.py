@@ -159,11 +159,11 @@ class Release:
                     "--training.readers", self.readers)  # fmt: skip
 
     def _edges(self) -> None:
-        """The second look at grips, by the boxes that people draw, a quarter of an hour on two cores."""
+        """The second look, by the boxes that people draw, half an hour on two cores."""
         _quest("train", "--pictures", *self.pictures, "--out", self.work / "edges", *(["--free"] if self.free else []),
-               "--weights", self.work / "refined", "--views", 1, "--finding.second-alone", "--finding.batch", 16,
-               "--training.steps", self.edge_steps, "--training.learning-rate", 1e-3, "--training.warmup-steps", 30,
-               "--training.weight-decay", 0.05, "--training.average-decay", 0.98, "--training.validate-every", 100,
+               "--weights", self.work / "refined", "--views", 2, "--finding.second-alone", "--finding.batch", 8,
+               "--finding.cut-px", 640, "--training.steps", self.edge_steps, "--training.learning-rate", 1e-3,
+               "--training.warmup-steps", 50, "--training.weight-decay", 0.01, "--training.average-decay", 0.99,
                "--training.clip-norm", 5)  # fmt: skip
 
     def _teach(self, out: str, *how: object) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from PIL import Image
 
 from quest.data.boxed_pictures import BoxedPicture, may_choose
 from quest.errors import ConfigError
-from quest.model.finder import FINE_PX, OPENINGS, PANELS, PLACES, FinderMaps
+from quest.model.finder import COARSE_PX, FINE_PX, OPENINGS, PANELS, PLACES, FinderMaps
 from quest.model.found import Odds, read_off
 from quest.model.second_look import SecondLook
 from quest.train.dataset import UNSTATED
@@ -26,7 +27,7 @@ from quest.train.finding.views import PictureCache, ViewCache, draw_view, of_pic
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
-BLIND = SecondLook(8, stride=FINE_PX).eval()
+BLIND = SecondLook((8, 8), strides=(FINE_PX, COARSE_PX)).eval()
 """Has learned nothing, and changes no box."""
 GRIP, CABINET = KINDS.index("grip"), KINDS.index("cabinet")
 
@@ -106,6 +107,23 @@ def test_a_panel_without_a_grip_is_taken_hold_of_by_its_front_or_by_the_edge_acr
     assert "front" not in found(door, Odds(panel_bias=-9.0))
 
 
+def test_a_door_that_two_cells_answer_for_with_other_edges_is_found_once() -> None:
+    class Sure(SecondLook):
+        def forward(
+            self, features: Sequence[torch.Tensor], box_px: torch.Tensor, picture: torch.Tensor
+        ) -> torch.Tensor:
+            return torch.tensor([[20.0, 10, 220, 210]]).repeat(len(box_px), 1)
+
+    maps = _perfect(targets(make_marks().only(np.array([False, True, False])), 256))
+    maps.panel[maps.panel > 0] = 4.0
+    row, column = 3, 3
+    maps.panel[0, CABINET - len(PLACES), row, column] = 3.0
+    maps.panel_extent[0, :, row, column] = 40.0
+    for second, count in ((BLIND, 2), (Sure((8, 8), strides=(FINE_PX, COARSE_PX)), 1)):
+        panels = read_off(maps, second, scale=np.ones(2), size=(256, 256), odds=Odds()).panels
+        assert (panels.logit > 0).sum() == count
+
+
 def test_a_bar_that_reaches_far_out_of_the_picture_has_its_label_from_inside() -> None:
     maps = _perfect(targets(make_marks(), 256))
     maps.longest[0, 8, 0], maps.knob[0, :, 1:] = 99.0, 9.0  # what is not at the edge says knob
@@ -125,7 +143,8 @@ def _perfect(maps: dict[str, np.ndarray]) -> FinderMaps:
     return FinderMaps(
         logit("place"), -torch.ones_like(truth["weight"]), -torch.ones_like(truth["weight"]), truth["extent"],
         logit("longer")[:, 0], truth["longer_extent"], logit("longest")[:, 0], truth["longest_extent"],
-        logit("panel"), truth["panel_extent"], 10 * opening, torch.zeros(1, 8, *truth["weight"].shape[1:]),
+        logit("panel"), truth["panel_extent"], 10 * opening,
+        torch.zeros(1, 8, *truth["weight"].shape[1:]), torch.zeros(1, 8, *truth["panel_weight"].shape[1:]),
     )  # fmt: skip
 
 
@@ -247,7 +266,7 @@ def test_a_network_has_only_so_many_blocks_to_learn() -> None:
 def test_a_second_look_learns_the_edges_of_a_blob() -> None:
     """Boxes that are moved by chance come back to where the features are 1."""
     torch.manual_seed(0)
-    look, rng = SecondLook(8, stride=FINE_PX), np.random.default_rng(0)
+    look, rng = SecondLook((8,), strides=(FINE_PX,)), np.random.default_rng(0)
     optimizer = torch.optim.AdamW(look.parameters(), lr=2e-3)
 
     def drawn(count: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -260,16 +279,16 @@ def test_a_second_look_learns_the_edges_of_a_blob() -> None:
 
     for _ in range(200):
         features, box, first = drawn(64)
-        loss = (look(features, first, torch.arange(64)) - box).abs().mean()
+        loss = (look([features], first, torch.arange(64)) - box).abs().mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
     features, box, first = drawn(64)
     look.eval()
     with torch.no_grad():
-        second = look(features, first, torch.arange(64))
+        second = look([features], first, torch.arange(64))
         shuffled = torch.randperm(64)
-        again = look(features, first[shuffled], shuffled)
+        again = look([features], first[shuffled], shuffled)
     assert float((second - box).abs().mean()) < 0.5 * float((first - box).abs().mean())
     torch.testing.assert_close(again, second[shuffled])
 

@@ -146,14 +146,14 @@ def read_off(
 
     Args:
         maps: of the network.
-        second: the network's second look at grips.
+        second: the network's second look.
         scale: pixels of what the network saw per pixel of the source, along x and y.
         size: width and height of the source.
         odds: of the maps' logits.
     """
     two = np.tile(scale, 2)
     end = np.array(size, np.float64)
-    panels = _panels(maps, two, np.tile(end, 2), odds)
+    panels = _panels(maps, second, two, np.tile(end, 2), odds)
     levels = (
         _level(maps.place[0], maps.extent[0], FINE_PX),
         _level(maps.longer, maps.longer_extent[0], MIDDLE_PX),
@@ -235,12 +235,13 @@ def _within_grip(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"]) ->
 
 
 def _looked_at_again(box: Float[np.ndarray, "N 4"], maps: FinderMaps, second: SecondLook) -> Float[np.ndarray, "N 4"]:
-    """Boxes of grips after a second look, edges in order; NaN where there was none."""
+    """Boxes after a second look, edges in order; NaN where there was none."""
     box, grip = box.copy(), ~np.isnan(box[:, 0])
     if not grip.any():
         return box
+    levels = maps.features, maps.deep_features
     first = torch.from_numpy(box[grip]).to(maps.features)
-    edges = second(maps.features, first, torch.zeros(len(first), dtype=torch.long, device=first.device))
+    edges = second(levels, first, torch.zeros(len(first), dtype=torch.long, device=first.device))
     edges = edges.detach().double().cpu().numpy().reshape(-1, 2, 2)
     box[grip] = np.concatenate((edges.min(axis=1), edges.max(axis=1)), axis=1)
     return box
@@ -276,16 +277,27 @@ def _boxes(extent: Float[Tensor, "4 h w"], cell: Int[np.ndarray, "N 2"], stride:
     return np.concatenate((centre - out[:, :2], centre + out[:, 2:]), axis=1)
 
 
-def _panels(maps: FinderMaps, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"], odds: Odds) -> Panels:
+def _panels(
+    maps: FinderMaps, second: SecondLook, scale: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"], odds: Odds
+) -> Panels:
+    """Doors and drawers; cells that answer for one, but with other edges, are told to be one by the second look."""
     cell, kind, logit = _highest(maps.panel[0], around=0)
     box = _boxes(maps.panel_extent[0], cell, COARSE_PX)
-    keep: list[int] = []
-    for i in range(len(kind)):
-        if not keep or shared(box[i], box[keep]).max() < _SAME_BOX:
-            keep.append(i)
+    keep = _different(box)
+    box[keep] = _looked_at_again(box[keep], maps, second)
+    keep = keep[_different(box[keep])]
     opening = maps.opening[0].softmax(dim=0).double().cpu().numpy()[:, cell[keep, 1], cell[keep, 0]].T
     logit = odds.panel_gain * logit[keep] + odds.panel_bias
     return Panels(np.clip(box[keep] / scale, 0, end), kind[keep], logit, opening)
+
+
+def _different(box: Float[np.ndarray, "N 4"]) -> Int[np.ndarray, " M"]:
+    """Of boxes, best first, those that are not the box of a better one."""
+    keep: list[int] = []
+    for i in range(len(box)):
+        if not keep or shared(box[i], box[keep]).max() < _SAME_BOX:
+            keep.append(i)
+    return np.array(keep, np.int64)
 
 
 def _apart(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"], place: Int[np.ndarray, " N"]) -> list[int]:

@@ -127,7 +127,8 @@ _MAPS = (
     TensorInfo("panel", (1, len(PANELS), *_COARSE), "float32", "log odds", ", ".join(PANELS)),
     TensorInfo("panel_extent", (1, 4, *_COARSE), "float32", "pixels of rgb", _EXTENT),
     TensorInfo("opening", (1, len(OPENINGS), *_COARSE), "float32", "logits of a softmax", ", ".join(OPENINGS)),
-    TensorInfo("features", (1, "C", *_FINE), "float32", "1", "what quest's second look at grips sees"),
+    TensorInfo("features", (1, "C", *_FINE), "float32", "1", "what quest's second look at boxes sees"),
+    TensorInfo("deep_features", (1, "D", *_COARSE), "float32", "1", "and what it sees beside these"),
 )
 _FEATURES = (
     TensorInfo("descriptors", (1, 64, *_EIGHTH), "float32", "1", "descriptors of length 1"),

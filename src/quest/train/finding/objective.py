@@ -30,6 +30,8 @@ WEIGHTS = {
     "longest_extent": 0.5, "panel_extent": 1.0, "second": 1.0, "knob": 0.1, "lift": 0.1, "opening": 0.1,
 }  # fmt: skip
 """How much every loss counts."""
+_LOOKS = 128
+"""How many second looks a step learns from."""
 _MOVED, _MOVED_PX = 0.1, 1.5
 """Standard deviation by which edges are moved before the second look, in sides of the box and in pixels."""
 _LEAST_SIDE_PX = 4.0
@@ -73,7 +75,7 @@ class StageFind:
         network: the finder.
         changes: weights of losses that are to differ; 0 turns one off.
         learned_blocks: last blocks of the transformer that learn too.
-        second_alone: whether only the second look at grips learns.
+        second_alone: whether only the second look learns.
 
     Raises:
         ConfigError: the transformer has fewer blocks.
@@ -116,6 +118,9 @@ class StageFind:
 
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
         """Every loss, unweighted; that of the second look alone, if it learns alone."""
+        if self._second_alone:  # all else is as it will be when it is used
+            self.network.eval()
+            self.network.second.train()
         with torch.set_grad_enabled(torch.is_grad_enabled() and not self._second_alone):
             maps = self.network(frames.rgb.float() / 255, context=frames.context)
         if self._second_alone:
@@ -138,15 +143,16 @@ class StageFind:
         }
 
     def _second(self, maps: FinderMaps, truth: FinderTruth) -> Float[Tensor, ""]:
-        """How far edges are off after the second look, in sides of the box; every grip counts as much.
+        """How far boxes are off after the second look; every grip, door and drawer counts as much.
 
-        It looks at what the first look said in the cells of a grip, moved by chance: the first look is nearer to the
+        It looks at what the first look said in some of their cells, moved by chance: the first look is nearer to the
         truth where it has learned than where it is used.
         """
         levels = (
             (maps.extent, truth.extent, truth.weight, FINE_PX),
             (maps.longer_extent, truth.longer_extent, truth.longer_share[:, 0], MIDDLE_PX),
             (maps.longest_extent, truth.longest_extent, truth.longest_share[:, 0], COARSE_PX),
+            (maps.panel_extent, truth.panel_extent, truth.panel_weight, COARSE_PX),
         )
         parts: list[tuple[Tensor, ...]] = []
         for said, true, weight, stride in levels:
@@ -158,11 +164,18 @@ class StageFind:
             )
             parts.append((first, goal, weight[picture, row, column], picture))
         first, goal, share, picture = (torch.cat(part) for part in zip(*parts, strict=True))
+        drawn = torch.multinomial(share, min(_LOOKS, len(share))) if len(share) else picture
+        first, goal, picture = first[drawn], goal[drawn], picture[drawn]
         side = (goal[:, 2:] - goal[:, :2]).clamp(min=_LEAST_SIDE_PX).repeat(1, 2)
         first = first + torch.randn_like(first) * (_MOVED * side + _MOVED_PX)
-        off = (self.network.second(maps.features.detach(), first, picture) - goal) / side
-        loss = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none", beta=_SHARP).sum(dim=1)
-        return (loss * share).sum() / pooled(share.sum()).clamp(min=1e-6)
+        levels = maps.features.detach(), maps.deep_features.detach()
+        second = self.network.second(levels, first, picture)
+        off = (second - goal) / side
+        edges = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none", beta=_SHARP).sum()
+        middle = (goal[:, :2] + goal[:, 2:]).repeat(1, 2) / 2
+        outward = torch.tensor([-1, -1, 1, 1], device=goal.device)
+        said, true = (((box - middle) * outward)[..., None, None] for box in (second, goal))
+        return edges / pooled(edges.new_tensor(len(off))).clamp(min=1) + _giou(said, true, torch.ones_like(said[:, 0]))
 
     def validate(self, sampler: FinderSampler, *, batches: int, device: torch.device) -> FinderScores:
         """Scores on the same whole views at every call, as many as ``batches`` batches have."""

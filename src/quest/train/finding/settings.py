@@ -20,7 +20,7 @@ class FinderSamplerConfig:
     """Last blocks of the vision transformer that learn too, and with them all of EfficientNet. That takes a GPU. With
     0 what the transformer sees in a picture is kept, and a step takes a tenth of the time."""
     second_alone: bool = False
-    """Only the second look at grips learns, and all else of the finder stays as it is."""
+    """Only the second look learns, and all else of the finder stays as it is."""
     cut_px: int = 320
     """Side of a cut, a multiple of 32."""
     take_share: float = 0.3
