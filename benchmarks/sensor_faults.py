@@ -61,6 +61,11 @@ def one_plane(depth_m: np.ndarray) -> np.ndarray:
     return np.full_like(depth_m, np.median(depth_m[depth_m > 0]) if depth_m.any() else 1.0)
 
 
+def shifted(depth_m: np.ndarray, share: float) -> np.ndarray:
+    """Moved to the right by a share of the width."""
+    return np.roll(depth_m, round(share * depth_m.shape[1]), axis=1)
+
+
 def frozen_depth(depth_m: np.ndarray, last: Frame) -> np.ndarray:
     """That of the last frame before the fault."""
     return depth_m if last.depth_m is None else last.depth_m
@@ -91,6 +96,8 @@ DEPTH: dict[str, Fault] = {
     "no depth": depths(lambda d, last: np.zeros_like(d)),
     "frozen depth": depths(frozen_depth),
     "depth of one plane": depths(lambda d, last: one_plane(d)),
+    "depth shifted by 1.3 % of the width": depths(lambda d, last: shifted(d, 0.013)),
+    "depth shifted by 4 % of the width": depths(lambda d, last: shifted(d, 0.04)),
 }
 """Faults of the depth."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -13,6 +14,7 @@ import pytest
 
 from quest.data.recording import open_recording
 from quest.track.health import ELSEWHERE, Health, Repeats, digest_of
+from quest.track.preprocess import grey_of
 from quest.track.state import StreamState
 from quest.types import Query, State
 from tests.filter.scenes import scene
@@ -103,22 +105,46 @@ def test_exchanged_colours_are_said() -> None:
     assert not blind
 
 
+def blank(depth_m: np.ndarray) -> np.ndarray:
+    """Luminance in which nothing is seen, of the depth's size."""
+    return np.full(depth_m.shape, 128, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("name", "by_px"),
+    [("sample", (27, 0)), ("sample", (0, -14)), ("sample-alarm", (9, 0)), ("sample-alarm", (-20, 15))],
+)
+def test_depth_that_shifts_against_the_colours_is_not_used_until_it_lies_on_them_again(
+    name: str, by_px: tuple[int, int]
+) -> None:
+    health = Health()
+    for t, frame in enumerate(open_recording(name)):
+        bad = 20 <= t < 40
+        assert frame.depth_m is not None
+        depth_m = np.roll(frame.depth_m, by_px, axis=(1, 0)) if bad else frame.depth_m
+        wrong = health.of_depth(depth_m, grey_of(frame.rgb), ())
+        assert (wrong is not None) == bad, t
+        if wrong is not None:
+            off = [int(n) for n in re.findall(r"-?\d+", wrong)]
+            np.testing.assert_allclose(off, by_px, atol=2)
+
+
 def test_depth_that_cannot_be_is_not_used() -> None:
     depth_m = RNG.uniform(1.0, 2.0, (30, 40)).astype(np.float32)
     health = Health()
-    assert health.of_depth(depth_m, elsewhere=False) is None
-    assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5), elsewhere=False))
+    assert health.of_depth(depth_m, blank(depth_m), ()) is None
+    assert "everywhere" in str(health.of_depth(np.full_like(depth_m, 1.5), blank(depth_m), ()))
     for t in range(9):  # however it changes meanwhile
         moved = np.roll(depth_m, 10 * t, axis=1) if t % 2 else depth_m
-        assert "10 times" in str(health.of_depth(10 * moved, elsewhere=False))
-    assert health.of_depth(depth_m + np.float32(0.01), elsewhere=False) is None
+        assert "10 times" in str(health.of_depth(10 * moved, blank(depth_m), ()))
+    assert health.of_depth(depth_m + np.float32(0.01), blank(depth_m), ()) is None
 
 
 def test_at_another_place_another_depth_is_no_other_unit() -> None:
     health = Health()
-    for far, elsewhere in ((1.0, False), (4.0, True), (4.0, False)):
+    for far, flags in ((1.0, ()), (4.0, (ELSEWHERE,)), (4.0, ())):
         wall = (far * RNG.uniform(1.0, 1.02, (30, 40))).astype(np.float32)
-        assert health.of_depth(wall, elsewhere=elsewhere) is None
+        assert health.of_depth(wall, blank(wall), flags) is None
 
 
 def test_a_hand_before_the_lens_is_no_other_unit() -> None:
@@ -126,7 +152,7 @@ def test_a_hand_before_the_lens_is_no_other_unit() -> None:
     near = depth_m.copy()
     near[:, :60] = RNG.uniform(0.1, 0.3, (64, 60))
     health = Health()
-    assert [health.of_depth(each, elsewhere=False) for each in (depth_m, near, depth_m)] == [None] * 3
+    assert [health.of_depth(each, blank(depth_m), ()) for each in (depth_m, near, depth_m)] == [None] * 3
 
 
 def come_again(frames: np.ndarray) -> list[bool]:
@@ -154,7 +180,7 @@ def test_still_parts_of_the_packaged_clips_are_no_faults(name: str) -> None:
     for frame in open_recording(name):
         assert frame.depth_m is not None
         assert health.of_picture(frame.rgb, digest_of(frame.rgb)) == ((), False)
-        assert health.of_depth(frame.depth_m, elsewhere=False) is None
+        assert health.of_depth(frame.depth_m, grey_of(frame.rgb), ()) is None
 
 
 @pytest.mark.slow
@@ -168,8 +194,8 @@ def test_cameras_in_good_health_are_told_so() -> None:
         health = Health()
         for frame in open_recording(folder):
             flags, _ = health.of_picture(frame.rgb, digest_of(frame.rgb))
-            elsewhere = ELSEWHERE in flags
-            wrong = None if frame.depth_m is None else health.of_depth(frame.depth_m, elsewhere=elsewhere)
+            grey = grey_of(frame.rgb)
+            wrong = None if frame.depth_m is None else health.of_depth(frame.depth_m, grey, flags)
             flagged, frames = flagged + (bool(flags) or wrong is not None), frames + 1
     assert frames > 1500
     assert flagged <= frames / 1000

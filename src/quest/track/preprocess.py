@@ -14,7 +14,7 @@ from quest.filter.picture import GreyPicture
 from quest.filter.surfaces import depth_growth
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.model.xfeat import LEAST_PX
-from quest.track.health import ELSEWHERE, Health, digest_of
+from quest.track.health import Health, digest_of
 from quest.types import Camera
 from quest.untrusted import reading
 
@@ -187,7 +187,7 @@ class Preprocessor:
             if beyond > _LEAST_BEYOND:
                 state.flags += (f"depth beyond {PLAUSIBLE_DEPTH_M[1]:g} m ignored: {beyond:.0%} of the pixels",)
             depth_m = np.where((depth_m > 0) & (depth_m <= PLAUSIBLE_DEPTH_M[1]), depth_m, np.float32(0))
-            wrong = state.health.of_depth(depth_m, elsewhere=ELSEWHERE in flags)
+            wrong = state.health.of_depth(depth_m, grey_of(rgb), flags)
             if wrong is not None:
                 state.flags += (f"depth ignored: {wrong}",)
                 depth_m = None
