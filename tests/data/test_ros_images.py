@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from quest.data.ros_frames import NO_DEPTH, NO_POSE
-from quest.data.rvl import decode_rvl
+from quest.data.ros_images import decode_rvl
 from tests.data.bag_drive import (
     BEGIN,
     DEPTH_MM,

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quest.data import bags
 from quest.data.distortion import Distortion, Rectifier
 from quest.data.frame_source import Parts
 from quest.data.recording import open_recording, read_recording
@@ -72,18 +73,16 @@ def test_every_storage_gives_the_same_frames(writer: Callable[[Path, Sequence[Se
 
 
 def test_frames_come_before_the_bag_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    from quest.data.mcap_file import McapMessages
-
     path = write_mcap(tmp_path / "bag.mcap", recording(), chunk_size=4096)
-    read, original = [], McapMessages.read
+    read, original = [], bags._read_mcap
 
-    def counted(self: McapMessages, topics: Any) -> Any:
-        for found in original(self, topics):
+    def counted(*arguments: Any) -> Any:
+        for found in original(*arguments):
             read.append(found[0])
             yield found
 
     source = open_recording(path)
-    monkeypatch.setattr(McapMessages, "read", counted)
+    monkeypatch.setattr(bags, "_read_mcap", counted)
     iterator = iter(source)
     next(iterator)
     assert read.count(COLOUR) <= 3
@@ -113,14 +112,14 @@ def test_depth_before_the_first_colours_is_not_kept(tmp_path: Path):
     early = [depths(0, at_ns=BEGIN - i * STEP) for i in range(200, 0, -1)]
     source = open_recording(write_mcap(tmp_path / "bag.mcap", [info(), *early, colours(0), depths(0)]))
     held = []
-    original = _Play._take
+    original = _Play.take
 
     def watched(self: _Play, topic: str, log_ns: int, message: Any) -> None:
         original(self, topic, log_ns, message)
-        held.append(len(self._depths))
+        held.append(len(self.depths))
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(_Play, "_take", watched)
+        patched.setattr(_Play, "take", watched)
         (frame,) = source
     assert len(held) > 200
     assert max(held) < 100

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,63 +12,10 @@ from quest.data.camera_file import CameraFile, find_setup
 from quest.data.depth_file import read_depth_file
 from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.layouts import Layout, find_layout, is_layout, list_depth
-from quest.data.pictures import TURNED, colours_of, is_turned, open_image, upright
 from quest.data.registration import Rig
-from quest.data.video import SUFFIXES, play_video, probe_video
 from quest.depth import metres
 from quest.errors import RecordingError
 from quest.types import Frame
-
-
-@dataclass(frozen=True)
-class _Colours:
-    """Where the colours come from: images in order, or a video."""
-
-    images: tuple[Path, ...]
-    """Paths; empty for a video."""
-    video: Path | None
-    """Its path; None for images."""
-    number: int | None
-    """Of frames; for a video by its header."""
-    size: tuple[int, int]
-    """Width and height, upright."""
-    turned: bool
-    """Whether the pixels of the video are not upright."""
-
-    @classmethod
-    def of(cls, source: Path, layout: Layout) -> _Colours:
-        if not layout.colours:
-            raise RecordingError(
-                f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
-            )
-        first = layout.colours[0]
-        if source.is_file() or first.suffix.lower() in SUFFIXES:
-            info = probe_video(first)
-            return cls((), first, info.frames or None, (info.width, info.height), info.turns != 0)
-        return cls(layout.colours, None, len(layout.colours), upright(open_image(first)).size, False)
-
-    def pictures(self, *, paired: bool) -> Iterator[tuple[np.ndarray, float]]:
-        """Upright pictures and their times; those of images follow a nominal rate of 30 a second.
-
-        Args:
-            paired: whether depth images of the same pixels go with them, which must not be turned then.
-        """
-        if self.video is not None:
-            if self.turned and paired:
-                raise RecordingError(f"video {self.video}: {TURNED}")
-            yield from play_video(self.video)
-            return
-        for t, path in enumerate(self.images):
-            pixels = open_image(path)
-            if paired and is_turned(pixels):
-                raise RecordingError(f"image {path}: {TURNED}")
-            image = upright(pixels)
-            if image.size != self.size:
-                raise RecordingError(
-                    f"image {path}: {image.width} x {image.height}, but {self.images[0].name} is {self.size[0]} x "
-                    f"{self.size[1]}; all frames must be of one size"
-                )
-            yield colours_of(image, f"image {path}"), t / 30.0
 
 
 def _accepts(where: str) -> bool:
@@ -76,14 +23,14 @@ def _accepts(where: str) -> bool:
     return path.is_file() if not path.is_dir() else is_layout(path)
 
 
-def _open(where: str, options: ReadOptions) -> FrameSource:
+def open_folder(where: str, options: ReadOptions) -> FrameSource:
+    """A recording folder or a video."""
     source, notes = Path(where), Notes()
     layout = find_layout(source)
     if options.depth is not None:
         layout = replace(layout, depth_folder=options.depth, depths=list_depth(options.depth), paired=False)
-    colours, depths = _Colours.of(source, layout), layout.depths
-    own = layout.setup(colours.size)
-    setup = find_setup(where, options, own, size=colours.size, depth=depths is not None, notes=notes)
+    colours, depths = layout.colours, layout.depths
+    setup = find_setup(where, options, layout.setup, size=colours.size, depth=depths is not None, notes=notes)
     for note in layout.notes:
         notes.say(note)
     if colours.size != (setup.camera.width, setup.camera.height):
@@ -91,9 +38,9 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
             f"recording {source}: frames are {colours.size[0]} x {colours.size[1]} but the camera is for "
             f"{setup.camera.width} x {setup.camera.height}; give the intrinsics of these frames in the camera file"
         )
-    exact = colours.video is None and layout.numbered
+    exact = layout.numbered and not colours.video
     if exact:
-        _check_counts(source, setup, layout, len(colours.images), partners=True)
+        _check_counts(source, setup, layout, len(colours.paths), partners=True)
     elif depths is not None and not depths:
         raise _unequal(layout.depth_folder, 0, colours.number or 0)
     first = next((path for path in depths or () if path is not None), None)
@@ -103,7 +50,7 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     return FrameSource(
         source.stem if source.is_file() else source.resolve().name,
         setup.camera,
-        lambda: _frames(source, setup, colours, layout, unit_m, notes),
+        lambda: _frames(source, setup, layout, unit_m, notes),
         length=colours.number,
         exact=exact,
         notes=notes,
@@ -111,21 +58,14 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     )
 
 
-READER = Reader(
-    "a folder or video",
-    "images, or rgb/ with images or a video such as rgb.mp4; .mp4 and the like",
-    _accepts,
-    _open,
-    options=("depth", "camera", "depth_scale_m", "fov_deg"),
-)
+_FORM = "images, or rgb/ with images or a video such as rgb.mp4; .mp4 and the like"
+READERS = (Reader("a folder or video", _FORM, _accepts, open_folder, ("depth", "camera", "depth_scale_m", "fov_deg")),)
 
 
-def _frames(
-    source: Path, setup: CameraFile, colours: _Colours, layout: Layout, unit_m: float, notes: Notes
-) -> Iterator[Frame]:
+def _frames(source: Path, setup: CameraFile, layout: Layout, unit_m: float, notes: Notes) -> Iterator[Frame]:
     number, first_s, depths = 0, 0.0, layout.depths
     known = [length for _, length in setup.lengths] + ([] if depths is None else [len(depths)])
-    for t, (rgb, time_s) in enumerate(colours.pictures(paired=depths is not None)):
+    for t, (rgb, time_s) in enumerate(layout.colours.pictures(paired=depths is not None)):
         number, first_s = t + 1, time_s if t == 0 else first_s
         if known and t >= min(known):
             continue  # only counted, so that the message can say how many there are
@@ -154,7 +94,7 @@ def _check_counts(source: Path, setup: CameraFile, layout: Layout, frames: int, 
     if partners and not layout.paired:
         # Where depth images are named as colours are, each must have its own; where none is, they go in order.
         depth_of = {path.stem for path in layout.depths if path is not None}
-        colour_of = {path.stem for path in layout.colours}
+        colour_of = {path.stem for path in layout.colours.paths}
         alone = sorted(depth_of ^ colour_of)
         if alone and depth_of & colour_of:
             raise RecordingError(

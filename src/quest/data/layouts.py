@@ -10,7 +10,7 @@ calibration of its three cameras); Shotton et al. 2013 (7-Scenes).
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,9 @@ from quest.data.camera_file import CameraFile, completed, read_camera
 from quest.data.depth_file import DEPTH_SUFFIXES, read_depth_file
 from quest.data.distortion import Distortion
 from quest.data.frame_source import Parts
-from quest.data.pictures import PICTURES
+from quest.data.pictures import PICTURES, TURNED, colours_of, is_turned, open_image, upright
 from quest.data.transforms import STALE_S, Edge
-from quest.data.video import SUFFIXES
+from quest.data.video import SUFFIXES, play_video, probe_video
 from quest.errors import RecordingError
 from quest.geometry.poses import is_rigid, nearest_rigid
 from quest.types import Camera
@@ -55,17 +55,66 @@ _PLUMB_BOB = ("k1", "k2", "p1", "p2", "k3")
 
 
 @dataclass(frozen=True)
+class Colours:
+    """Where the colours come from: images in order, or a video."""
+
+    paths: tuple[Path, ...]
+    """The images, or the one video."""
+    size: Size
+    """Width and height, upright."""
+    number: int | None
+    """Of frames; for a video by its header, None where that does not tell."""
+    video: bool = False
+    turned: bool = False
+    """Whether the pixels of the video are not upright."""
+
+    @classmethod
+    def of(cls, source: Path, paths: Sequence[Path]) -> Colours:
+        """Those of a recording; a RecordingError where there are none."""
+        if not paths:
+            raise RecordingError(
+                f"recording {source}: no frames; expected images in {source / 'rgb'}, or a video such as rgb.mp4"
+            )
+        if source.is_file() or paths[0].suffix.lower() in SUFFIXES:
+            info = probe_video(paths[0])
+            return cls(tuple(paths), (info.width, info.height), info.frames or None, True, info.turns != 0)
+        return cls(tuple(paths), upright(open_image(paths[0])).size, len(paths))
+
+    def pictures(self, *, paired: bool) -> Iterator[tuple[np.ndarray, float]]:
+        """Upright pictures and their times; those of images follow a nominal rate of 30 a second.
+
+        Args:
+            paired: whether depth images of the same pixels go with them, which must not be turned then.
+        """
+        if self.video:
+            if self.turned and paired:
+                raise RecordingError(f"video {self.paths[0]}: {TURNED}")
+            yield from play_video(self.paths[0])
+            return
+        for t, path in enumerate(self.paths):
+            pixels = open_image(path)
+            if paired and is_turned(pixels):
+                raise RecordingError(f"image {path}: {TURNED}")
+            image = upright(pixels)
+            if image.size != self.size:
+                raise RecordingError(
+                    f"image {path}: {image.width} x {image.height}, but {self.paths[0].name} is {self.size[0]} x "
+                    f"{self.size[1]}; all frames must be of one size"
+                )
+            yield colours_of(image, f"image {path}"), t / 30.0
+
+
+@dataclass(frozen=True)
 class Layout:
     """The pictures of a recording, in order, and what its files say of the camera."""
 
-    colours: tuple[Path, ...]
-    """Images, or one video."""
+    colours: Colours
     depth_folder: Path
     """Where depth is or would be, for messages."""
     depths: tuple[Path | None, ...] | None = None
     """One for every frame, None where a frame has none; None where there is no depth at all."""
-    setup: Callable[[Size], CameraFile | None] = lambda size: None
-    """What is known of the camera, for colours of a size."""
+    setup: CameraFile | None = None
+    """What is known of the camera."""
     paired: bool = False
     """Whether its own lists tell which depth goes with which colours; else their names or their order do."""
     numbered: bool = True
@@ -78,38 +127,30 @@ def find_layout(source: Path) -> Layout:
     """What a video, or a folder of one of the known layouts, holds.
 
     Raises:
-        RecordingError: a file in it is missing, or says what makes no sense.
+        RecordingError: there are no colours, or a file is missing, or says what makes no sense.
     """
     if source.suffix.lower() == ".r3d":
         raise RecordingError(f"recording {source}: .r3d is compressed as LZFSE; export it from Record3D as EXR + RGB")
     if source.is_file():
-        root, depth = source.parent, source.parent / "depth"
-        found = Layout((source,), depth, list_depth(depth) if depth.exists() else None, setup=_own_camera(root))
+        root, colours = source.parent, Colours.of(source, [source])
+        found = Layout(colours, root / "depth", _depth_beside(root), _own_camera(root, colours.size))
     else:
         root = source / "EXR_RGBD" if (source / "EXR_RGBD" / "metadata.json").is_file() else source
-        found = _of_folder(root)
-    own = root / "camera.json"
-    if not own.exists():
+        there = {path.name for path in root.iterdir()}
+        if "rgb.txt" in there:
+            found = _tum(root)
+        elif "metadata.json" in there and any((root / "depth").glob("*.exr")):
+            found = _record3d(root)
+        elif "transforms.json" in there:
+            found = _nerfstudio(root)
+        elif {"odometry.csv", "camera_matrix.csv"} <= there:
+            found = _stray(root)
+        else:
+            found = _side_by_side(root) or _folders(root)
+    if not (root / "camera.json").exists():
         return found
-
-    def setup(size: Size) -> CameraFile:
-        camera, known = read_camera(own), found.setup(size)
-        return camera if known is None else completed(camera, known)
-
-    return replace(found, setup=setup)
-
-
-def _of_folder(root: Path) -> Layout:
-    there = {path.name for path in root.iterdir()}
-    if "rgb.txt" in there:
-        return _tum(root)
-    if "metadata.json" in there and any((root / "depth").glob("*.exr")):
-        return _record3d(root)
-    if "transforms.json" in there:
-        return _nerfstudio(root)
-    if {"odometry.csv", "camera_matrix.csv"} <= there:
-        return _stray(root)
-    return _side_by_side(root) or _folders(root)
+    camera = read_camera(root / "camera.json")
+    return replace(found, setup=camera if found.setup is None else completed(camera, found.setup))
 
 
 def _first_of(root: Path, *names: str) -> Path | None:
@@ -119,18 +160,14 @@ def _first_of(root: Path, *names: str) -> Path | None:
 
 def is_layout(folder: Path) -> bool:
     """Whether a folder holds colours."""
-    marks = ("camera.json", "rgb.txt", "transforms.json", "EXR_RGBD")
-    return any((folder / name).exists() for name in (*marks, *_COLOURS)) or any(map(_is_colours, folder.iterdir()))
+    marks = ("camera.json", "rgb.txt", "transforms.json", "EXR_RGBD", *_COLOURS)
+    return any((folder / name).exists() for name in marks) or bool(list_images(folder, (*PICTURES, *SUFFIXES)))
 
 
 def list_images(folder: Path, suffixes: Sequence[str]) -> list[Path]:
     """Files with some endings, in the natural order of their names."""
     paths = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".")]
     return sorted(paths, key=_natural)
-
-
-def _is_colours(path: Path) -> bool:
-    return path.suffix.lower() in (*PICTURES, *SUFFIXES) and not path.name.startswith(".")
 
 
 def _natural(path: Path) -> list[tuple[float, float, str]]:
@@ -141,23 +178,6 @@ def _natural(path: Path) -> list[tuple[float, float, str]]:
     for part in parts:
         key.append((1, float(part), "") if (time and part) or part.isdecimal() else (0, 0, part))
     return [*key, (0, 0, path.suffix)]
-
-
-# --- Layouts ----------------------------------------------------------------------------------------------------------
-
-
-def _folders(root: Path) -> Layout:
-    """Colours in a folder of their own, or in the root; depth, poses and intrinsics beside them."""
-    inner = next((root / name for name in _COLOURS if (root / name).is_dir()), root)
-    videos = [] if inner != root else list_images(root, SUFFIXES)
-    if len(videos) > 1:
-        found = ", ".join(video.name for video in videos)
-        raise RecordingError(f"recording {root}: expected one video, got {found}; name the video itself")
-    colours = tuple(videos or list_images(inner, PICTURES))
-    depth = root / "depth"
-    poses, notes = (None, ()) if videos else _beside(root, colours)
-    depths = list_depth(depth) if depth.exists() else None
-    return Layout(colours, depth, depths, setup=_own_camera(root, cam_from_world=poses), notes=notes)
 
 
 def list_depth(folder: Path) -> tuple[Path, ...]:
@@ -175,69 +195,85 @@ def list_depth(folder: Path) -> tuple[Path, ...]:
     return tuple(found)
 
 
+# --- Layouts ----------------------------------------------------------------------------------------------------------
+
+
+def _pictures(root: Path) -> Layout:
+    """Colours in a folder of their own, or in the root, and depth beside them."""
+    inner = next((root / name for name in _COLOURS if (root / name).is_dir()), root)
+    videos = [] if inner != root else list_images(root, SUFFIXES)
+    if len(videos) > 1:
+        found = ", ".join(video.name for video in videos)
+        raise RecordingError(f"recording {root}: expected one video, got {found}; name the video itself")
+    return Layout(Colours.of(root, videos or list_images(inner, PICTURES)), root / "depth", _depth_beside(root))
+
+
+def _depth_beside(root: Path) -> tuple[Path, ...] | None:
+    return list_depth(root / "depth") if (root / "depth").exists() else None
+
+
+def _folders(root: Path) -> Layout:
+    """Pictures in folders; poses and intrinsics beside them."""
+    found = _pictures(root)
+    poses, notes = (None, ()) if found.colours.video else _beside(root, len(found.colours.paths))
+    own = _own_camera(root, found.colours.size)
+    return replace(found, setup=own and replace(own, cam_from_world=poses), notes=notes)
+
+
 def _side_by_side(root: Path) -> Layout | None:
     """7-Scenes, 3RScan and others: ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt``."""
-    colours = {m[1]: p for p in list_images(root, PICTURES) if (m := _SIDE_BY_SIDE.fullmatch(p.name)) is not None}
-    if not colours:
+    paths = {m[1]: p for p in list_images(root, PICTURES) if (m := _SIDE_BY_SIDE.fullmatch(p.name)) is not None}
+    if not paths:
         return None
     there = {path.name.lower(): path for path in root.iterdir()}
     depths = [
         next((there[name] for end in DEPTH_SUFFIXES if (name := f"{stem}depth{end}".lower()) in there), None)
-        for stem in colours
+        for stem in paths
     ]
-    poses = [there.get(f"{stem}pose.txt".lower()) for stem in colours]
+    poses = [there.get(f"{stem}pose.txt".lower()) for stem in paths]
     cam_from_world, notes = _poses_of_files(poses) if None not in poses else (None, ())
-    own = _own_camera(root)
-
-    def setup(size: Size) -> CameraFile | None:
-        info = _first_of(root, "_info.txt", "info.txt")
-        known = own(size) or (None if info is None else _scan_info(info))
-        if known is None and size == (640, 480) and colours.keys() == {s for s in colours if s.startswith("frame-")}:
-            known = CameraFile(Camera(585.0, 585.0, 320.0, 240.0, *size))  # as the page of 7-Scenes has it
-        return known and replace(known, cam_from_world=cam_from_world)
-
-    return Layout(tuple(colours.values()), root, _some(depths), setup=setup, paired=True, notes=notes)
+    colours = Colours.of(root, list(paths.values()))
+    info = _first_of(root, "_info.txt", "info.txt")
+    known = _own_camera(root, colours.size) or (None if info is None else _scan_info(info))
+    if known is None and colours.size == (640, 480) and all(stem.startswith("frame-") for stem in paths):
+        known = CameraFile(Camera(585.0, 585.0, 320.0, 240.0, 640, 480))  # as the page of 7-Scenes has it
+    setup = known and replace(known, cam_from_world=cam_from_world)
+    return Layout(colours, root, _some(depths), setup, paired=True, notes=notes)
 
 
 def _tum(root: Path) -> Layout:
     """TUM RGB-D and those who follow it: lists of pictures by time, and where the camera was."""
-    colours = _timed_files(root, "rgb.txt")
-    stamp_s = np.array([time for time, _ in colours])
+    listed = _timed_files(root, "rgb.txt")
+    stamp_s = np.array([time for time, _ in listed])
     depths: list[Path | None] = []
     if (root / "depth.txt").is_file():
-        listed = _timed_files(root, "depth.txt")
-        near = [listed[i] for i in nearest(np.array([time for time, _ in listed]), stamp_s)]
+        timed = _timed_files(root, "depth.txt")
+        near = [timed[i] for i in nearest(np.array([time for time, _ in timed]), stamp_s)]
         depths = [
             path if abs(at_s - t) <= Parts.sync_s else None for (at_s, path), t in zip(near, stamp_s, strict=True)
         ]
     poses, notes = None, list[str]()
     if (truth := root / "groundtruth.txt").is_file():
-        table = _table(truth, 8)
-        poses, stale = _poses_at(table, stamp_s, truth)
+        poses, stale = _poses_at(_table(truth, 8), stamp_s, truth)
         notes += [f"no pose within {STALE_S:g} s: the nearest is used in {counted(stale, 'frame')}"] * (stale > 0)
+    colours = Colours.of(root, [path for _, path in listed])
     camera = re.search(r"freiburg([123])", root.resolve().name)
-    known = None if camera is None else _FREIBURG[camera[1]]
-    own = _own_camera(root)
-    if known is None and not (root / "camera.json").exists() and own((640, 480)) is None:
+    values, lens = ((525.0, 525.0, 319.5, 239.5), ()) if camera is None else _FREIBURG[camera[1]]
+    setup = _own_camera(root, colours.size)
+    if setup is None and camera is None and not (root / "camera.json").exists():
         notes.append("no camera file: the intrinsics are those that TUM RGB-D recommends for any of its cameras")
-
-    def setup(size: Size) -> CameraFile | None:
-        values, lens = known or ((525.0, 525.0, 319.5, 239.5), ())
-        found = own(size)
-        if found is None and size == (640, 480):
-            found = CameraFile(_camera(np.array(values), size), distortion=Distortion(coefficients=lens))
-        scale_m = (found and found.depth_scale_m) or 1 / 5000
-        return found and replace(found, depth_scale_m=scale_m, stamp_s=stamp_s - stamp_s[0], cam_from_world=poses)
-
-    paths = tuple(path for _, path in colours)
-    return Layout(paths, root / "depth", _some(depths), setup=setup, paired=True, notes=tuple(notes))
+    if setup is None and colours.size == (640, 480):
+        setup = CameraFile(_camera(np.array(values), colours.size), distortion=Distortion(coefficients=lens))
+    if setup is not None:
+        scale_m = setup.depth_scale_m or 1 / 5000
+        setup = replace(setup, depth_scale_m=scale_m, stamp_s=stamp_s - stamp_s[0], cam_from_world=poses)
+    return Layout(colours, root / "depth", _some(depths), setup, paired=True, notes=tuple(notes))
 
 
 def _record3d(root: Path) -> Layout:
     """What Record3D exports as EXR + RGB: ``rgb/``, ``depth/`` in metres, and ``metadata.json``."""
     file = root / "metadata.json"
-    fields = _object(file)
-    layout = _folders(root)
+    fields, found = _object(file), _pictures(root)
     with _asking(file):
         width, height = int(fields["w"]), int(fields["h"])
         lenses = np.array(fields.get("perFrameIntrinsicCoeffs") or [], np.float64).reshape(-1, 4)
@@ -256,33 +292,25 @@ def _record3d(root: Path) -> Layout:
         )
     steady = not len(lenses) or np.ptp(lenses[:, 0]) < 0.01 * values[0]
     notes = () if steady else ("the focal length changes: its median is used",)
-    return replace(layout, setup=lambda size: setup, notes=(*layout.notes, *notes), numbered=False)
+    return replace(found, setup=setup, notes=notes, numbered=False)
 
 
 def _stray(root: Path) -> Layout:
     """What the Stray Scanner app leaves: a video, ``depth/``, ``odometry.csv`` and ``camera_matrix.csv``."""
     file = root / "odometry.csv"
-    layout = _folders(root)
+    found = _pictures(root)
     with _asking(file):
         names = [name.strip() for name in _lines(file)[0].split(",")]
-        table = _table(file, len(names), skip=1)
-        column = dict(zip(names, table.T, strict=True))
+        column = dict(zip(names, _table(file, len(names), skip=1).T, strict=True))
         stamps = column["timestamp"]
         position, quaternion = (np.stack([column[name] for name in group], -1) for group in ("xyz", _QUATERNION))
         poses = _cam_from_world(_matrices(position, quaternion))
-    own = _own_camera(root)
-    depth_size = read_depth_file(layout.depths[0]).shape[::-1] if layout.depths and layout.depths[0] else None
-
-    def setup(size: Size) -> CameraFile | None:
-        found = own(size)
-        return found and replace(
-            found,
-            stamp_s=stamps - stamps[0],
-            cam_from_world=poses,
-            depth_camera=None if depth_size is None else _scaled(found.camera, depth_size),
-        )
-
-    return replace(layout, setup=setup, numbered=False)
+    setup = _own_camera(root, found.colours.size)
+    if setup is not None:
+        depth_size = read_depth_file(found.depths[0]).shape[::-1] if found.depths and found.depths[0] else None
+        small = None if depth_size is None else _scaled(setup.camera, depth_size)
+        setup = replace(setup, stamp_s=stamps - stamps[0], cam_from_world=poses, depth_camera=small)
+    return replace(found, setup=setup, numbered=False)
 
 
 def _nerfstudio(root: Path) -> Layout:
@@ -291,7 +319,7 @@ def _nerfstudio(root: Path) -> Layout:
     fields = _object(file)
     with _asking(file):
         frames = sorted(fields["frames"], key=lambda frame: _natural(Path(frame["file_path"])))
-        colours = tuple(_inside(root, frame["file_path"], file) for frame in frames)
+        colours = [_inside(root, frame["file_path"], file) for frame in frames]
         named = [frame.get("depth_file_path") for frame in frames]
         depths = _some([None if name is None else _inside(root, name, file) for name in named])
         fx, fy, cx, cy = (float(fields[name]) for name in ("fl_x", "fl_y", "cx", "cy"))
@@ -306,22 +334,18 @@ def _nerfstudio(root: Path) -> Layout:
             distortion=Distortion("equidistant" if fisheye else "plumb_bob", lens if fisheye or any(lens) else ()),
         )
     notes = () if depths is not None else ("transforms.json has no depth: its poses are of unknown scale and not used",)
-    return Layout(colours, root, depths, setup=lambda size: setup, paired=True, notes=notes)
+    return Layout(Colours.of(root, colours), root, depths, setup, paired=True, notes=notes)
 
 
 # --- Cameras ----------------------------------------------------------------------------------------------------------
 
 
-def _own_camera(root: Path, *, cam_from_world: np.ndarray | None = None) -> Callable[[Size], CameraFile | None]:
+def _own_camera(root: Path, size: Size) -> CameraFile | None:
     """What a folder's own file says of the camera: Open3D's JSON, or a matrix as text."""
-
-    def setup(size: Size) -> CameraFile | None:
-        open3d, matrix = _first_of(root, *_OPEN3D), _first_of(root, *_MATRICES)
-        if open3d is not None:
-            return replace(_open3d_camera(open3d), cam_from_world=cam_from_world)
-        return None if matrix is None else replace(_matrix_camera(matrix, size), cam_from_world=cam_from_world)
-
-    return setup
+    if (open3d := _first_of(root, *_OPEN3D)) is not None:
+        return _open3d_camera(open3d)
+    matrix = _first_of(root, *_MATRICES)
+    return None if matrix is None else _matrix_camera(matrix, size)
 
 
 def _camera(values: Float[np.ndarray, "..."], size: Size) -> Camera:
@@ -379,21 +403,21 @@ def _scan_info(file: Path) -> CameraFile:
 # --- Poses ------------------------------------------------------------------------------------------------------------
 
 
-def _beside(root: Path, colours: Sequence[Path]) -> tuple[np.ndarray | None, tuple[str, ...]]:
+def _beside(root: Path, frames: int) -> tuple[np.ndarray | None, tuple[str, ...]]:
     """Poses in a folder with a matrix for every picture, or in Open3D's ``trajectory.log``; with notes."""
     folder = next((root / name for name in _POSES if (root / name).is_dir()), None)
     if folder is not None and (files := list_images(folder, (".txt",))):
-        if len(files) == len(colours):
+        if len(files) == frames:
             return _poses_of_files(files)
-        return None, (f"{len(files)} poses for {len(colours)} pictures: not used",)
+        return None, (f"{len(files)} poses for {frames} pictures: not used",)
     log = _first_of(root, "trajectory.log", "scene/trajectory.log")
     if log is None:
         return None, ()
     with _asking(log):
         lines = [line.split() for t, line in enumerate(_lines(log)) if t % 5]
         rows = np.array(lines, np.float64).reshape(-1, 4, 4)
-        if len(rows) != len(colours):
-            return None, (f"{len(rows)} poses for {len(colours)} pictures: not used",)
+        if len(rows) != frames:
+            return None, (f"{len(rows)} poses for {frames} pictures: not used",)
         return _cam_from_world(rows), ()
 
 

@@ -29,23 +29,13 @@ from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Clip
 from quest.untrusted import reading
 
-__all__ = [
-    "FrameSource",
-    "Parts",
-    "Reader",
-    "open_recording",
-    "read_recording",
-    "readers",
-    "write_recording",
-]
-
-_READERS = ("live_camera", "realsense", "sample", "store", "lerobot", "mcap_file", "rosbag", "folder")
-"""Modules of this room with a ``READER``; the first that accepts a path reads it. A new reader is a line here."""
+_READERS = ("live_camera", "sample", "store", "lerobot", "bags", "folder")
+"""Modules of this room with ``READERS``; the first that accepts a path reads it. A new module is a line here."""
 
 
 def readers() -> tuple[Reader, ...]:
     """All readers of recordings, in the order in which they are asked."""
-    return tuple(import_module(f"quest.data.{name}").READER for name in _READERS)
+    return tuple(reader for name in _READERS for reader in import_module(f"quest.data.{name}").READERS)
 
 
 def open_recording(

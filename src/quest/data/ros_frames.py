@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -36,36 +37,9 @@ BAG_OPTIONS = (
 
 NO_POSE = "no tf joins the camera to another frame: the world is the camera"
 NO_DEPTH = "no topic of depth: colours only"
-STALE = f"tf has nothing within {STALE_S} s: the nearest pose is used"
 LATE = "colours out of order: omitted"
 NO_STAMP = "headers have no time: that of logging is used"
 CAMERA_CHANGED = "camera_info changes on the way: the first is used"
-
-
-@dataclass(frozen=True)
-class _Bag:
-    """What holds for all frames of a bag."""
-
-    messages: Messages
-    chosen: Chosen
-    rig: Rig
-    options: ReadOptions
-    colour_frame: str
-    """Tf frame of the colours."""
-    world: str | None
-    """Tf frame that is the world; None without tf."""
-    pose: np.ndarray | None
-    """Of every frame, where the camera file gives one."""
-    by_log: bool
-    """Whether times are those of logging, because nobody set those of the headers."""
-
-    @property
-    def tolerance_ns(self) -> int:
-        """How far apart colours and depth may be."""
-        return round(self.options.sync_s * 1e9)
-
-    def where(self, topic: str, number: int) -> str:
-        return f"{self.messages.where}: message {number} of {topic}"
 
 
 def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
@@ -108,11 +82,11 @@ def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
     if by_log:
         notes.say(NO_STAMP)
     unit_m = 1.0 if chosen.depth is None else options.depth_scale_m or unit_of(messages.first(chosen.depth))
-    bag = _Bag(messages, chosen, rig, options, colour_frame, world, pose, by_log)
+    play = partial(_Play, messages, chosen, rig, options, notes, colour_frame, world, pose, by_log)
     return FrameSource(
         messages.path.stem if messages.path.is_file() else messages.path.resolve().name,
         rig.camera,
-        lambda: _Play(bag, notes).frames(),
+        lambda: play().frames(),
         length=messages.topics[chosen.rgb].number,
         exact=False,
         notes=notes,
@@ -226,95 +200,109 @@ def _window(info: Any, whole: tuple[int, ...]) -> tuple[tuple[int, int], tuple[i
     return corner, bins, (height // bins[1], width // bins[0])
 
 
+@dataclass
 class _Play:
     """One pass over a bag."""
 
-    def __init__(self, bag: _Bag, notes: Notes) -> None:
-        self._bag, self._notes = bag, notes
-        self._transforms = _scan_transforms(bag.messages, bag.chosen)[0]
-        self._colours: deque[tuple[int, int, Any]] = deque()
-        self._depths: deque[tuple[int, int, Any]] = deque()
-        self._newest_ns = 0
-        self._emitted_ns: int | None = None
-        self._frame = 0
-        self._numbers = {name: 0 for name in (bag.chosen.rgb, bag.chosen.depth) if name is not None}
+    messages: Messages
+    chosen: Chosen
+    rig: Rig
+    options: ReadOptions
+    notes: Notes
+    colour_frame: str
+    """Tf frame of the colours."""
+    world: str | None
+    """Tf frame that is the world; None without tf."""
+    pose: np.ndarray | None
+    """Of every frame, where the camera file gives one."""
+    by_log: bool
+    """Whether times are those of logging, because nobody set those of the headers."""
+    colours: deque[tuple[int, int, Any]] = field(default_factory=deque)
+    """Those that wait, in order: time, which message of the topic, and the message; so the depths."""
+    depths: deque[tuple[int, int, Any]] = field(default_factory=deque)
+    newest_ns: int = 0
+    emitted_ns: int | None = None
+    emitted: int = 0
+
+    def __post_init__(self) -> None:
+        self.tolerance_ns = round(self.options.sync_s * 1e9)
+        self.numbers = {name: 0 for name in (self.chosen.rgb, self.chosen.depth) if name is not None}
+        self.transforms = _scan_transforms(self.messages, self.chosen)[0]
 
     def frames(self) -> Iterator[Frame]:
-        chosen, messages = self._bag.chosen, self._bag.messages
-        wanted = {*self._numbers, *chosen.moving, *([chosen.info] if chosen.info else [])}
-        for topic, log_ns, message in messages.read(sorted(wanted)):
-            if topic in self._numbers:
-                self._take(topic, log_ns, message)
-            elif topic != chosen.info:
-                self._transforms.add(message, static=False, log_ns=log_ns)
-            elif not np.allclose(_numbers(message)[0], _numbers(messages.first(topic))[0]):
-                self._notes.say(CAMERA_CHANGED)
-            while self._colours and self._ready(self._colours[0][0]):
-                yield self._frame_of(*self._colours.popleft())
-        while self._colours:
-            yield self._frame_of(*self._colours.popleft())
+        info = self.chosen.info
+        wanted = {*self.numbers, *self.chosen.moving, *([info] if info else [])}
+        for topic, log_ns, message in self.messages.read(sorted(wanted)):
+            if topic in self.numbers:
+                self.take(topic, log_ns, message)
+            elif topic != info:
+                self.transforms.add(message, static=False, log_ns=log_ns)
+            elif not np.allclose(_numbers(message)[0], _numbers(self.messages.first(topic))[0]):
+                self.notes.say(CAMERA_CHANGED)
+            while self.colours and self._ready(self.colours[0][0]):
+                yield self._frame(*self.colours.popleft())
+        while self.colours:
+            yield self._frame(*self.colours.popleft())
 
-    def _take(self, topic: str, log_ns: int, message: Any) -> None:
-        number = self._numbers[topic]
-        self._numbers[topic] += 1
-        at_ns = log_ns if self._bag.by_log else header_ns(message)
-        if topic == self._bag.chosen.depth:
-            self._depths.append((at_ns, number, message))
+    def take(self, topic: str, log_ns: int, message: Any) -> None:
+        """Let a picture wait for what goes with it."""
+        number = self.numbers[topic]
+        self.numbers[topic] += 1
+        at_ns = log_ns if self.by_log else header_ns(message)
+        if topic == self.chosen.depth:
+            self.depths.append((at_ns, number, message))
             # Without colours nothing else would make room.
-            oldest_ns = max(self._newest_ns, at_ns) - _PATIENCE_NS - self._bag.tolerance_ns
-            while not self._colours and self._depths[0][0] < oldest_ns:
-                self._depths.popleft()
+            oldest_ns = max(self.newest_ns, at_ns) - _PATIENCE_NS - self.tolerance_ns
+            while not self.colours and self.depths[0][0] < oldest_ns:
+                self.depths.popleft()
         else:
-            last_ns = self._colours[-1][0] if self._colours else self._emitted_ns
+            last_ns = self.colours[-1][0] if self.colours else self.emitted_ns
             if last_ns is not None and at_ns < last_ns:
                 if last_ns - at_ns > _LATE_NS:
                     raise RecordingError(
-                        f"{self._bag.where(topic, number)}: time goes back by {(last_ns - at_ns) * 1e-9:.3f} s; cut "
-                        "the bag there"
+                        f"{self._where(topic, number)}: time goes back by {(last_ns - at_ns) * 1e-9:.3f} s; cut the "
+                        "bag there"
                     )
-                self._notes.count(LATE, number)
+                self.notes.count(LATE, number)
                 return
-            self._colours.append((at_ns, number, message))
-        self._newest_ns = max(self._newest_ns, at_ns)
+            self.colours.append((at_ns, number, message))
+        self.newest_ns = max(self.newest_ns, at_ns)
+
+    def _where(self, topic: str, number: int) -> str:
+        return f"{self.messages.where}: message {number} of {topic}"
 
     def _ready(self, at_ns: int) -> bool:
         """Whether nothing better can come for colours of a time."""
-        if self._newest_ns - at_ns > _PATIENCE_NS:
+        if self.newest_ns - at_ns > _PATIENCE_NS:
             return True
-        depth = self._bag.chosen.depth is None or (bool(self._depths) and self._depths[-1][0] >= at_ns)
-        world = self._bag.world
-        return depth and (world is None or self._transforms.gap(self._bag.colour_frame, world, at_ns) == 0)
+        depth = self.chosen.depth is None or (bool(self.depths) and self.depths[-1][0] >= at_ns)
+        return depth and (self.world is None or self.transforms.gap(self.colour_frame, self.world, at_ns) == 0)
 
-    def _frame_of(self, at_ns: int, number: int, message: Any) -> Frame:
-        bag, t = self._bag, self._frame
-        self._frame, self._emitted_ns = t + 1, at_ns
-        where = bag.where(bag.chosen.rgb, number)
+    def _frame(self, at_ns: int, number: int, message: Any) -> Frame:
+        t, where = self.emitted, self._where(self.chosen.rgb, number)
+        self.emitted, self.emitted_ns = t + 1, at_ns
         with naming(where):
-            rgb = bag.rig.rgb(rgb_of(message, where))
-        return Frame(rgb, self._depth_of(at_ns, t), at_ns * 1e-9, self._pose_of(at_ns, t))
+            rgb = self.rig.rgb(rgb_of(message, where))
+        return Frame(rgb, self._depth(at_ns, t), at_ns * 1e-9, self._pose(at_ns, t))
 
-    def _depth_of(self, at_ns: int, t: int) -> np.ndarray | None:
-        bag, topic = self._bag, self._bag.chosen.depth
-        if topic is None:
+    def _depth(self, at_ns: int, t: int) -> np.ndarray | None:
+        if self.chosen.depth is None:
             return None
-        while self._depths and self._depths[0][0] < at_ns - bag.tolerance_ns:
-            self._depths.popleft()
-        nearest = min(self._depths, key=lambda depth: abs(depth[0] - at_ns), default=None)
-        if nearest is None or abs(nearest[0] - at_ns) > bag.tolerance_ns:
-            self._notes.count(f"no depth within {bag.options.sync_s:g} s of the colours", t)
+        while self.depths and self.depths[0][0] < at_ns - self.tolerance_ns:
+            self.depths.popleft()
+        nearest = min(self.depths, key=lambda depth: abs(depth[0] - at_ns), default=None)
+        if nearest is None or abs(nearest[0] - at_ns) > self.tolerance_ns:
+            self.notes.count(f"no depth within {self.options.sync_s:g} s of the colours", t)
             return None
-        where = bag.where(topic, nearest[1])
+        where = self._where(self.chosen.depth, nearest[1])
         with naming(where):
-            return bag.rig.depth(depth_of(nearest[2], where, scale_m=bag.options.depth_scale_m))
+            return self.rig.depth(depth_of(nearest[2], where, scale_m=self.options.depth_scale_m))
 
-    def _pose_of(self, at_ns: int, t: int) -> np.ndarray:
-        bag = self._bag
-        if bag.pose is not None:
-            return bag.pose
-        if bag.world is None:
-            return np.eye(4)
-        if self._transforms.gap(bag.colour_frame, bag.world, at_ns) > STALE_S:
-            self._notes.count(STALE, t)
-        pose = self._transforms.lookup(bag.colour_frame, bag.world, at_ns)
-        self._transforms.forget(at_ns)
+    def _pose(self, at_ns: int, t: int) -> np.ndarray:
+        if self.pose is not None or self.world is None:
+            return np.eye(4) if self.pose is None else self.pose
+        if self.transforms.gap(self.colour_frame, self.world, at_ns) > STALE_S:
+            self.notes.count(f"tf has nothing within {STALE_S} s: the nearest pose is used", t)
+        pose = self.transforms.lookup(self.colour_frame, self.world, at_ns)
+        self.transforms.forget(at_ns)
         return np.eye(4) if pose is None else pose

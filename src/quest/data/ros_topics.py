@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ PICTURES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage")
 INFO = "sensor_msgs/CameraInfo"
 TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage")
 """Types of messages; the second of transforms is that of ROS 1."""
-NO_DEPTH = "none"
 
 _TRANSPORTS = re.compile(r"/(compressed|compressedDepth)$")
 _COLOUR = re.compile(r"colou?r|rgb", re.IGNORECASE)
@@ -35,26 +33,23 @@ class Topic:
     """Of messages; None if the bag does not tell."""
 
 
-class Messages(ABC):
-    """The messages of a bag; how they are stored is a matter of what inherits this.
+@dataclass(frozen=True)
+class Messages:
+    """The messages of a bag, however they are stored."""
 
-    Args:
-        path: the file or folder.
-        topics: the topics in it.
-    """
+    path: Path
+    """The file or folder."""
+    topics: dict[str, Topic]
+    """By name."""
+    read: Callable[[Collection[str]], Iterator[tuple[str, int, Any]]]
+    """Topic, time of logging in nanoseconds and message, of some topics, in the order of logging; a RecordingError
+    where the bag is corrupt or a message cannot be decoded."""
+    _firsts: dict[str, Any] = field(default_factory=dict)
 
-    def __init__(self, path: Path, topics: dict[str, Topic]) -> None:
-        self.path, self.topics = path, topics
-        self.where = f"bag {path}"
-        self._firsts: dict[str, Any] = {}
-
-    @abstractmethod
-    def read(self, topics: Collection[str]) -> Iterator[tuple[str, int, Any]]:
-        """Topic, time of logging in nanoseconds and message, of some topics, in the order of logging.
-
-        Raises:
-            RecordingError: the bag is corrupt, or a message cannot be decoded.
-        """
+    @property
+    def where(self) -> str:
+        """The bag, for messages."""
+        return f"bag {self.path}"
 
     def first(self, topic: str) -> Any | None:
         """The first message of a topic, which is read once; None if it has none."""
@@ -66,12 +61,13 @@ class Messages(ABC):
         """The topics of some types."""
         return sorted(name for name, topic in self.topics.items() if topic.kind in kinds)
 
-    def listed(self) -> str:
-        """The topics of the bag, for messages."""
-        return "topics found: " + ", ".join(
+    def error(self, words: str) -> RecordingError:
+        """An error that lists the topics that there are."""
+        listed = ", ".join(
             f"{name} ({topic.kind}, {'some' if topic.number is None else topic.number})"
             for name, topic in sorted(self.topics.items())
         )
+        return RecordingError(f"{self.where}: {words}; topics found: {listed}")
 
 
 @dataclass(frozen=True)
@@ -79,13 +75,10 @@ class Chosen:
     """The topics that make a recording; each has a message, but for those of transforms."""
 
     rgb: str
-    """Of colours."""
     depth: str | None
-    """Of depth; None without."""
     info: str | None
-    """CameraInfo of the colours; None if there is none."""
+    """CameraInfo of the colours; None if there is none, as of the depth."""
     depth_info: str | None
-    """CameraInfo of the depth; None if there is none."""
     moving: tuple[str, ...]
     """Of transforms that change."""
     static: tuple[str, ...]
@@ -105,9 +98,9 @@ def choose(messages: Messages, parts: Parts) -> Chosen:
 
     rgb = _named(messages, "--topic-rgb", parts.topic_rgb, PICTURES) or _colours(messages)
     if there(rgb) is None:
-        raise RecordingError(f"{messages.where}: topic {rgb} has no messages; {messages.listed()}")
+        raise messages.error(f"topic {rgb} has no messages")
     depth = depth_info = None
-    if parts.topic_depth != NO_DEPTH:
+    if parts.topic_depth != "none":
         depth = there(_named(messages, "--topic-depth", parts.topic_depth, PICTURES) or _depth(messages, rgb))
     info = _named(messages, "--topic-info", parts.topic_info, (INFO,)) or _info_of(messages, rgb)
     if depth is not None:
@@ -129,12 +122,9 @@ def _named(messages: Messages, argument: str, topic: str | None, kinds: tuple[st
         return None
     known = messages.topics.get(topic)
     if known is None:
-        raise RecordingError(f"{messages.where}: no topic {topic} ({argument}); {messages.listed()}")
+        raise messages.error(f"no topic {topic} ({argument})")
     if known.kind not in kinds:
-        raise RecordingError(
-            f"{messages.where}: {argument} {topic} is of type {known.kind}, expected {' or '.join(kinds)}; "
-            f"{messages.listed()}"
-        )
+        raise messages.error(f"{argument} {topic} is of type {known.kind}, expected {' or '.join(kinds)}")
     return topic
 
 
@@ -150,7 +140,7 @@ def _colours(messages: Messages) -> str:
     coloured = [name for name in pictures if not is_grey(messages.first(name))] or pictures
     named = [name for name in coloured if _COLOUR.search(name)] or coloured
     if not named:
-        raise RecordingError(f"{messages.where}: no topic of colour images (sensor_msgs/Image); {messages.listed()}")
+        raise messages.error("no topic of colour images (sensor_msgs/Image)")
     return _one(messages, "--topic-rgb", "colours", named)
 
 

@@ -421,4 +421,4 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     )
 
 
-READER = Reader("a take", "STORE/NAME.zarr", _accepts, _open, options=("view",))
+READERS = (Reader("a take", "STORE/NAME.zarr", _accepts, _open, options=("view",)),)
