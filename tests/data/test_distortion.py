@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quest.data.distortion import Distortion, Rectifier
+from quest.data.registration import Distortion, Rectifier
 from quest.errors import InputError
 from quest.types import Camera
 

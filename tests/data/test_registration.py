@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from scipy.spatial.transform import Rotation
 
-from quest.data.distortion import Distortion
-from quest.data.registration import Rig, register_depth
+from quest.data.registration import Distortion, Rig, register_depth
 from quest.errors import InputError
 from quest.types import Camera
 

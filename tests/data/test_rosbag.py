@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from quest.data import bags
-from quest.data.distortion import Distortion, Rectifier
 from quest.data.frame_source import Parts
 from quest.data.recording import open_recording, read_recording
+from quest.data.registration import Distortion, Rectifier
 from quest.data.ros_frames import CAMERA_CHANGED, LATE, NO_DEPTH, NO_POSE, NO_STAMP, _Play
 from quest.errors import RecordingError
 from quest.types import Camera

@@ -5,14 +5,13 @@ Reference: the MCAP specification, mcap.dev/spec.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from quest.data.frame_source import FrameSource, Reader, ReadOptions
-from quest.data.ros_frames import BAG_OPTIONS, open_messages
-from quest.data.ros_topics import Messages, Topic
+from quest.data.frame_source import Reader
+from quest.data.ros_frames import BAG_OPTIONS, Messages, Topic, open_messages
 from quest.errors import RecordingError
 from quest.extras import require
 from quest.untrusted import reading
@@ -129,15 +128,13 @@ def _is_bag(where: str) -> bool:
     return (path.suffix.lower() in (".bag", ".db3", ".active") and path.is_file()) or (path / "metadata.yaml").is_file()
 
 
-def _open_mcap(where: str, options: ReadOptions) -> FrameSource:
-    return open_messages(open_mcap(Path(where)), options)
-
-
-def _open_bag(where: str, options: ReadOptions) -> FrameSource:
-    return open_messages(open_bag(Path(where)), options)
+def _reader(kind: str, form: str, accepts: Callable[[str], bool], messages: Callable[[Path], Messages]) -> Reader:
+    return Reader(
+        kind, form, accepts, lambda where, options: open_messages(messages(Path(where)), options), BAG_OPTIONS
+    )
 
 
 READERS = (
-    Reader("an MCAP file", ".mcap", _is_mcap, _open_mcap, BAG_OPTIONS),
-    Reader("a ROS bag", "a folder with metadata.yaml, .db3 or .bag", _is_bag, _open_bag, BAG_OPTIONS),
+    _reader("an MCAP file", ".mcap", _is_mcap, open_mcap),
+    _reader("a ROS bag", "a folder with metadata.yaml, .db3 or .bag", _is_bag, open_bag),
 )

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from quest.data.camera_file import CameraFile, find_setup
-from quest.data.depth_file import read_depth_file
 from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.data.layouts import Layout, find_layout, is_layout, list_depth
+from quest.data.pictures import read_depth_file
 from quest.data.registration import Rig
 from quest.depth import metres
 from quest.errors import RecordingError

@@ -20,10 +20,18 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from quest.data.camera_file import CameraFile, completed, read_camera
-from quest.data.depth_file import DEPTH_SUFFIXES, read_depth_file
-from quest.data.distortion import Distortion
 from quest.data.frame_source import Parts
-from quest.data.pictures import PICTURES, TURNED, colours_of, is_turned, open_image, upright
+from quest.data.pictures import (
+    DEPTH_SUFFIXES,
+    PICTURES,
+    TURNED,
+    colours_of,
+    is_turned,
+    open_image,
+    read_depth_file,
+    upright,
+)
+from quest.data.registration import Distortion
 from quest.data.transforms import STALE_S, Edge
 from quest.data.video import SUFFIXES, play_video, probe_video
 from quest.errors import RecordingError

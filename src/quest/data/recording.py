@@ -13,7 +13,7 @@ import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Literal
@@ -78,13 +78,16 @@ def open_recording(
         depth_scale_m=_checked_scale(where, depth_scale_m, RecordingError),
         fov_deg=fov_deg,
     )
-    known = readers()
+    known, there = readers(), Path(where)
     reader = next((reader for reader in known if reader.accepts(where)), None)
     if reader is None:
-        if not Path(where).exists():
-            raise RecordingError(f"recording {where}: no such file or folder; {_near(Path(where))}")
+        if not there.exists():
+            beside = [p.name for p in there.parent.iterdir()] if there.parent.is_dir() else []
+            close = difflib.get_close_matches(there.name, beside, n=1)
+            advice = f"did you mean {there.parent / close[0]}?" if close else "check the path"
+            raise RecordingError(f"recording {where}: no such file or folder; {advice}")
         kinds = "; ".join(f"{reader.kind} ({reader.form})" for reader in known)
-        what = "an empty folder" if not any(Path(where).iterdir()) else "a folder with nothing of these in it"
+        what = "an empty folder" if not any(there.iterdir()) else "a folder with nothing of these in it"
         raise RecordingError(f"recording {where}: this is {what}; expected {kinds}")
     for name, value in options.given().items():
         if name not in reader.options:
@@ -108,13 +111,6 @@ def read_recording(
     return open_recording(
         path, depth=depth, camera=camera, depth_scale_m=depth_scale_m, fov_deg=fov_deg, parts=parts
     ).clip()
-
-
-def _near(path: Path) -> str:
-    """Advice for a path that leads nowhere."""
-    there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    close = difflib.get_close_matches(path.name, there, n=1)
-    return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
 def _checked_scale(where: str | Path, depth_scale_m: float | int | None, kind: type[QuestError]) -> float | None:
@@ -160,15 +156,9 @@ def write_recording(
             for t, image in enumerate(units):
                 _write_png(partial / "depth" / f"{t:06d}.png", image)
         static = (clip.cam_from_world == clip.cam_from_world[0]).all()
+        file = CameraFile(clip.camera, depth_scale_m=scale, frames_per_s=frame_rate(clip.stamp_s), stamp_s=clip.stamp_s)
         poses = clip.cam_from_world[0] if static else clip.cam_from_world
-        file = CameraFile(
-            clip.camera,
-            depth_scale_m=scale,
-            frames_per_s=frame_rate(clip.stamp_s),
-            stamp_s=clip.stamp_s,
-            cam_from_world=poses,
-        )
-        write_camera(file, partial / "camera.json")
+        write_camera(replace(file, cam_from_world=poses), partial / "camera.json")
 
 
 @contextmanager
