@@ -13,20 +13,18 @@ import pytest
 
 from quest.data.ros_frames import NO_DEPTH, NO_POSE
 from quest.data.ros_images import decode_rvl
-from tests.data.bag_drive import (
+from tests.data.bags import (
     BEGIN,
+    COLOUR,
+    DEPTH,
     DEPTH_MM,
     IMAGE,
     RGB,
     colours,
-    frames_of,
-    info,
-)
-from tests.data.bags import (
-    COLOUR,
-    DEPTH,
     compressed,
+    frames_of,
     image,
+    info,
     png,
     rvl,
     write_mcap,

@@ -111,11 +111,7 @@ class TakeStore:
 
     @property
     def root(self) -> Path:
-        """The folder; see :attr:`is_folder`.
-
-        Raises:
-            TakeError: the takes are in an object store.
-        """
+        """The folder; a TakeError if the takes are in an object store (:attr:`is_folder`)."""
         return self._as_folder().folder
 
     @property
@@ -205,35 +201,21 @@ class TakeStore:
         return Take(info=info, views=parts, **arrays)
 
     def read_view(self, name: str, view: int, *, frames: slice | None = None) -> View:
-        """One camera's frames of a take with their ground truth, loading nothing else.
-
-        Raises:
-            TakeError: as :meth:`read`.
-        """
+        """One camera's frames of a take with their ground truth, loading nothing else; raises as :meth:`read`."""
         with self._opened(name, frames) as stored:
             return stored.view(view)
 
     def read_clip(self, name: str, view: int = 0, *, frames: slice | None = None) -> Clip:
-        """One camera's frames of a take without any ground truth, loading nothing else.
-
-        Raises:
-            TakeError: as :meth:`read`.
-        """
+        """One camera's frames of a take without any ground truth, loading nothing else; raises as :meth:`read`."""
         with self._opened(name, frames) as stored:
             return stored.clip(view)
 
     def read_small_arrays(self, name: str) -> dict[str, np.ndarray]:
-        """Every array of a take but its pixels, by path in the group, such as ``view_0/visible``.
-
-        Raises:
-            TakeError: the take is missing, torn or of another format version.
-        """
+        """Every array of a take but its pixels, by path such as ``view_0/visible``; raises as :meth:`read`."""
         small = [key for key in ("cam_from_world", *VIEW_ARRAYS) if key not in PIXEL_ARRAYS]
         with self._opened(name) as stored:
-            views = range(len(stored.header.cameras))
-            return {
-                path: stored.read(path) for path in [*TAKE_ARRAYS, *(f"view_{v}/{k}" for v in views for k in small)]
-            }
+            of_views = [f"view_{v}/{key}" for v in range(len(stored.header.cameras)) for key in small]
+            return {path: stored.read(path) for path in (*TAKE_ARRAYS, *of_views)}
 
     def verify(self, name: str) -> None:
         """Read every array of a take and compare with its recorded hash.
@@ -317,9 +299,8 @@ def locate_take(path: str | Path) -> tuple[TakeStore, str]:
     parent, _, last = str(path).replace("\\", "/").rstrip("/").rpartition("/")
     if not last.endswith(SUFFIX):
         raise TakeError(f"take {last!r}: expected a folder <name>{SUFFIX}, got {path}")
-    if isinstance(path, Path) or "://" not in parent:
-        return TakeStore(Path(path).parent), last.removesuffix(SUFFIX)
-    return TakeStore(parent), last.removesuffix(SUFFIX)
+    root = Path(path).parent if isinstance(path, Path) or "://" not in parent else parent
+    return TakeStore(root), last.removesuffix(SUFFIX)
 
 
 def open_clip(path: str | Path, *, view: int = 0, frames: slice | None = None) -> Clip:
@@ -513,7 +494,7 @@ class _Folder:
                 if self.path(name).exists():
                     raise _written_meanwhile(self, name) from error
                 raise
-            _sync_folder(self.folder)
+            _sync_one(self.folder)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
@@ -549,24 +530,21 @@ def _is_running(pid: int) -> bool:
 def _sync(folder: Path) -> None:
     """Force every file and folder under ``folder`` to the disk, so that the rename cannot come first."""
     walked = list(os.walk(folder))
-    files = [Path(parent) / file for parent, _, names in walked for file in names]
     # Side by side, because a disk takes many at a time and each waits for it.
     with ThreadPoolExecutor(_SYNCS_AT_ONCE) as pool:
-        list(pool.map(_sync_file, files))
-        list(pool.map(_sync_folder, [Path(parent) for parent, _, _ in walked]))
+        list(pool.map(_sync_one, [Path(parent) / file for parent, _, names in walked for file in names]))
+        list(pool.map(_sync_one, [Path(parent) for parent, _, _ in walked]))
 
 
-def _sync_file(file: Path, flags: int = os.O_RDWR) -> None:
-    descriptor = os.open(file, flags)
+def _sync_one(path: Path) -> None:
+    folder = path.is_dir()
+    if folder and os.name != "posix":  # folders cannot be opened elsewhere
+        return
+    descriptor = os.open(path, os.O_RDONLY if folder else os.O_RDWR)
     try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _sync_folder(folder: Path) -> None:
-    if os.name == "posix":  # folders cannot be opened elsewhere
-        _sync_file(folder, os.O_RDONLY)
 
 
 class _Bucket:
