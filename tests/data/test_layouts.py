@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from quest.data.layouts import nearest
+from quest.data.folder import nearest
 from quest.data.pictures import read_depth_file
 from quest.data.recording import open_recording, read_recording
 from quest.errors import RecordingError

@@ -48,11 +48,9 @@ class BoxedPicture:
 
 
 def read_boxed_pictures(path: Path) -> list[BoxedPicture]:
-    """Read a labelled set.
+    """Read a labelled set: a COCO file; ``data.yaml`` of a YOLO set, or its folder; or a folder with ``pictures``.
 
-    Args:
-        path: a COCO file; ``data.yaml`` of a YOLO set, or its folder; or a folder with ``pictures`` and ``labels.csv``
-            (columns file, class, x0, y0, x1, y1 and, if there is one, licence).
+    The last has ``labels.csv`` with columns file, class, x0, y0, x1, y1 and, if there is one, licence.
 
     Raises:
         InputError: it is none of these, or a label cannot be understood.

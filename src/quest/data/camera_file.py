@@ -91,11 +91,7 @@ def read_camera(path: Path) -> CameraFile:
 
 
 def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None = None) -> CameraFile:
-    """A camera file that is read, made of intrinsics, or taken as it is, with another depth scale if one is given.
-
-    Raises:
-        RecordingError: the file is missing or makes no sense.
-    """
+    """A camera file that is read, made of intrinsics, or taken as it is, with another depth scale if one is given."""
     if isinstance(camera, Path):
         camera = read_camera(camera)
     setup = CameraFile(camera) if isinstance(camera, Camera) else camera

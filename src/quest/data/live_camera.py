@@ -32,12 +32,7 @@ _PATIENCE_S = 5.0
 def newest(frames: Callable[[], Iterator[Frame]], notes: Notes) -> Generator[Frame]:
     """Frames of a thread that reads as fast as they come; those that nobody takes in time are dropped and counted.
 
-    Args:
-        frames: begins to read; called in the thread.
-        notes: where dropped frames are counted.
-
-    Raises:
-        Exception: whatever reading raises, after the frames before it.
+    Whatever reading raises comes after the frames before it.
     """
     ready, over = threading.Condition(), threading.Event()
     slot: list[Frame] = []

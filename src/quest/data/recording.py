@@ -2,7 +2,7 @@
 
 A recording folder holds ``rgb/`` (images, in natural order of their names) or one video, optionally ``depth/`` (16-bit
 PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The other forms are as their makers describe them
-(:mod:`quest.data.layouts` for folders).
+(:mod:`quest.data.folder` for folders).
 """
 
 from __future__ import annotations

@@ -126,16 +126,8 @@ def register_depth(
 ) -> Float32[np.ndarray, "H W"]:
     """Depth image of another camera, from that of a depth camera.
 
-    Every depth pixel is lifted, moved and drawn as a square of the size that it covers; the nearest one wins.
-
-    Args:
-        depth_m: depth along +z of the depth camera in metres, 0 where missing.
-        depth_camera: its intrinsics.
-        camera: the camera to see it from.
-        colour_from_depth: rigid transform from the depth camera's axes to the other camera's, metres.
-
-    Returns:
-        Depth along +z of ``camera``, 0 where no depth pixel falls.
+    Every depth pixel is lifted, moved and drawn as a square of the size that it covers; the nearest one wins. Depth is
+    along +z of each camera, metres; 0 is missing, or where no depth pixel falls.
     """
     rows, columns = np.nonzero(depth_m > 0)
     z = depth_m[rows, columns].astype(np.float64)

@@ -216,11 +216,8 @@ def _one(messages: Messages, argument: str, what: str, topics: list[str]) -> str
 def open_messages(messages: Messages, options: ReadOptions) -> FrameSource:
     """The RGB-D frames of a bag.
 
-    Args:
-        messages: the bag.
-        options: topics, frames and tolerance, where they are not to be found; a camera file, which overrules the bag's
-            colour camera, and that of depth that is registered to it, and the depth camera, if it has one; metres per
-            unit of depth, by default millimetres in 16 bits, metres in floats.
+    A camera file overrules the bag's colour camera, and that of depth that is registered to it, and the depth camera,
+    if it has one. Depth is in millimetres in 16 bits and metres in floats, unless it is said otherwise.
 
     Raises:
         RecordingError: no colours, no intrinsics, unknown lens, or depth of a camera whose place is unknown.

@@ -120,12 +120,7 @@ def rgb_of(message: Any, where: str) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float32[np.ndarray, "H W"]:
-    """Depth in metres of an Image or CompressedImage, 0 where missing.
-
-    Args:
-        message: the picture.
-        where: its name in errors.
-        scale_m: metres per unit; by default that of :func:`unit_of`.
+    """Depth in metres of an Image or CompressedImage, 0 where missing; by default in the units of :func:`unit_of`.
 
     Raises:
         RecordingError: the picture is corrupt, or of an encoding that is not of depth.

@@ -100,11 +100,7 @@ class StoreStats:
 
 
 def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda done, of: None) -> StoreStats:
-    """Read descriptions, the small arrays and a few depth images of every take.
-
-    Args:
-        store: the store.
-        report: told how many takes are done, of how many.
+    """Read descriptions, the small arrays and a few depth images of every take; reports how many are done, of how many.
 
     Raises:
         TakeError: a take's arrays cannot be decoded.

@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -85,24 +84,6 @@ class _View:
     has_depth: bool
 
 
-def _header(attributes: Mapping[str, Any]) -> TakeHeader:
-    """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
-    views = build(list[_View], attributes["views"], "views")
-    header = TakeHeader(
-        info=build(TakeInfo, attributes["info"], "info"),
-        frames=build(int, attributes["frames"], "frames"),
-        cameras=tuple(view.camera for view in views),
-        clip_names=tuple(view.name for view in views),
-        has_depth=tuple(view.has_depth for view in views),
-        data_hash=build(str, attributes["data_hash"], "data_hash"),
-        files=build(dict[str, int], attributes["files"], "files"),
-        arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
-    )
-    if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
-        raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
-    return header
-
-
 def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
     """Header of a take from the content of its :data:`HEADER_FILE`; None if there is no such file.
 
@@ -124,7 +105,19 @@ def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
             f"{' or '.join(map(str, VERSIONS))}; generate it again, or use the version of quest that wrote it"
         )
     with reading(file, TakeError, REMEDY):
-        header = _header(attributes)
+        views = build(list[_View], attributes["views"], "views")
+        header = TakeHeader(
+            info=build(TakeInfo, attributes["info"], "info"),
+            frames=build(int, attributes["frames"], "frames"),
+            cameras=tuple(view.camera for view in views),
+            clip_names=tuple(view.name for view in views),
+            has_depth=tuple(view.has_depth for view in views),
+            data_hash=build(str, attributes["data_hash"], "data_hash"),
+            files=build(dict[str, int], attributes["files"], "files"),
+            arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
+        )
+        if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
+            raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
     if header.info.name != name or not is_name(name):
         raise TakeError(f"{file} is of a take of another name, {header.info.name!r}; give its folder that name")
     if outside := [path for path in header.files if not is_inside(path)]:

@@ -42,14 +42,7 @@ def write_urdf(tracks: Tracks, path: str | Path) -> UrdfNames:
     is ``NAME_joint``, from ``world``, with the axis and the range that were seen. A turning joint's frame must lie on
     its axis, so that it moves the link ``NAME_hinge``, to which the entity's link is fixed. Efforts and velocities are
     not known: 1000 stands for no limit. A comment above each joint holds, as JSON, the name that the track had, and
-    how uncertain axis and origin are.
-
-    Args:
-        tracks: with joints.
-        path: the file.
-
-    Returns:
-        Which links there are, and which tracks were left out because nothing is known of their joint.
+    how uncertain axis and origin are. Returned is which links there are, and which tracks were left out.
 
     Raises:
         InputError: the tracks have no joints.

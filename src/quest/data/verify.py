@@ -86,13 +86,7 @@ def check_truth(take: Take) -> Iterator[Check]:
 
 
 def check_view(take: Take, view: View, number: int) -> Iterator[Check]:
-    """Checks of one view against what is true of the take.
-
-    Args:
-        take: the truth, which has passed the checks of indices and finite numbers.
-        view: one camera's frames.
-        number: its number, for messages.
-    """
+    """Checks of one view, by its number, against a take that has passed the checks of indices and finite numbers."""
     where, pose, camera = f"view {number}", view.clip.cam_from_world, view.clip.camera
     yield _check_rotations("camera poses", pose, len(take), f"{where}, ")
     point = moved_points(pose, take.point_world.astype(np.float64))
@@ -347,13 +341,7 @@ def verify_take(store: TakeStore, name: str) -> TakeReport:
 def verify_store(
     store: TakeStore, names: Sequence[str] | None = None, *, report: Callable[[TakeReport], None] = lambda _: None
 ) -> StoreReport:
-    """Check takes of a store.
-
-    Args:
-        store: the store.
-        names: the takes; by default all, those that cannot be read included.
-        report: told about each take as soon as it is done.
-    """
+    """Check takes of a store, by default all, also those that cannot be read; reports each as soon as it is done."""
     done = []
     for name in names if names is not None else sorted({*store.names(), *store.problems()}):
         done.append(verify_take(store, name))
