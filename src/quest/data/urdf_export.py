@@ -10,6 +10,7 @@ import re
 import unicodedata
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -121,16 +122,10 @@ def _valid(name: str) -> str:
 def _unique(names: list[str]) -> list[str]:
     """Valid names for links, so that neither they nor the names made of them clash."""
     taken, unique = {WORLD}, []
-    for name in names:
-        valid, number = _valid(name), 1
-        made = _made_of(valid)
-        while taken & made:
-            number += 1
-            made = _made_of(f"{valid}_{number}")
-        taken |= made
-        unique.append(valid if number == 1 else f"{valid}_{number}")
+    for valid in map(_valid, names):
+        tried = (valid if number == 1 else f"{valid}_{number}" for number in count(1))
+        made = ([name, f"{name}_joint", f"{name}_hinge", f"{name}_fixed"] for name in tried)
+        free = next(clashing for clashing in made if not taken & {*clashing})
+        taken |= {*free}
+        unique.append(free[0])
     return unique
-
-
-def _made_of(name: str) -> set[str]:
-    return {name, f"{name}_joint", f"{name}_hinge", f"{name}_fixed"}
