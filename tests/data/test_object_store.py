@@ -93,14 +93,10 @@ def test_read_returns_what_was_written(url: str, take: Take, tmp_path: Path) -> 
     near.write(take)
     assert_equal(TakeStore(tmp_path / "copied").read("panels"), take)
     assert store.data_hash("panels") == near.data_hash("panels")
-
-
-def test_many_takes(url: str) -> None:
-    store, small = TakeStore(url), make_take(frames=2, views=1, entities=1, size=(8, 8))
-    names = [f"take-{n:02d}" for n in range(3)]
-    for name in names:
+    small = make_take(frames=2, views=1, entities=1, size=(8, 8))
+    for name in ("a", "b"):
         store.write(replace(small, info=replace(small.info, name=name)))
-    assert store.names() == list(store.headers()) == names
+    assert store.names() == list(store.headers()) == ["a", "b", "panels"]
 
 
 def test_a_writer_that_was_killed_leaves_no_take_and_is_in_nobodys_way(url: str, take: Take) -> None:
