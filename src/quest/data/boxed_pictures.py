@@ -38,7 +38,6 @@ class BoxedPicture:
     """A picture and what is boxed in it."""
 
     path: Path
-    """The picture."""
     names: tuple[str, ...]
     """Class of each box, as the labels say it."""
     box_px: Float[np.ndarray, "N 4"]

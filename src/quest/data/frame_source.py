@@ -120,7 +120,6 @@ class FrameSource:
     """Frames of one camera, read as they are asked for; every loop over them begins anew."""
 
     name: str
-    """Name of the recording."""
     camera: Camera
     """Intrinsics of every frame, without distortion."""
     frames: Callable[[], Iterator[Frame]]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import cv2
 import numpy as np
@@ -65,9 +66,8 @@ class Distortion:
     @property
     def none(self) -> bool:
         """Whether the lens is a pinhole; an equidistant one never is, even with coefficients of zero."""
-        if self._kind == "equidistant" and self.coefficients:
-            return False
-        return all(abs(value) < _NEAR_ZERO for value in self.coefficients)
+        bent = self._kind == "equidistant" and bool(self.coefficients)
+        return not bent and all(abs(value) < _NEAR_ZERO for value in self.coefficients)
 
     @property
     def _kind(self) -> str:
@@ -78,10 +78,9 @@ class Distortion:
         matrix = camera.matrix
         matrix[:2, 2] -= 0.5
         values = np.array(self.coefficients, dtype=np.float64)
+        lens: Any = cv2.fisheye if self._kind == "equidistant" else cv2
         size = (camera.width, camera.height)
-        if self._kind == "equidistant":
-            return cv2.fisheye.initUndistortRectifyMap(matrix, values, np.eye(3), matrix, size, cv2.CV_32FC1)
-        return cv2.initUndistortRectifyMap(matrix, values, np.eye(3), matrix, size, cv2.CV_32FC1)
+        return lens.initUndistortRectifyMap(matrix, values, np.eye(3), matrix, size, cv2.CV_32FC1)
 
 
 class Rectifier:

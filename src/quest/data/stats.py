@@ -22,9 +22,7 @@ class Spread:
     """How a quantity is spread over its n values; NaN where there is none."""
 
     n: int
-    """Number of values."""
     least: float
-    """The least."""
     low: float
     """10 % lie below."""
     median: float
@@ -32,7 +30,6 @@ class Spread:
     high: float
     """90 % lie below."""
     most: float
-    """The most."""
 
     @classmethod
     def of(cls, values: Iterable[np.ndarray | float]) -> Spread:
@@ -48,7 +45,6 @@ class StoreStats:
     """What is in a store. Entities are those that a tracker follows: hinges are counted, and left out of the rest."""
 
     takes: int
-    """Whole takes."""
     unreadable: int
     """Groups that look like takes and cannot be read."""
     objects: int
@@ -62,13 +58,10 @@ class StoreStats:
     stored_bytes: int
     """On disk."""
     sources: Mapping[str, int]
-    """Takes per source."""
+    """Takes per source; so of categories, levels and suites."""
     categories: Mapping[str, int]
-    """Takes per category."""
     levels: Mapping[str, int]
-    """Takes per level."""
     suites: Mapping[str, int]
-    """Takes per suite."""
     labels: Mapping[str, int]
     """Entities per label."""
     moving_cameras: int

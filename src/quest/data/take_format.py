@@ -44,15 +44,11 @@ class TakeHeader:
     """Everything about a stored take but its arrays."""
 
     info: TakeInfo
-    """Description of the take."""
     frames: int
-    """Number of frames."""
     cameras: tuple[Camera, ...]
-    """One per view."""
+    """One per view, as are names and whether there is depth."""
     clip_names: tuple[str, ...]
-    """One per view."""
     has_depth: tuple[bool, ...]
-    """Whether each view carries depth."""
     data_hash: str
     """Digest of arrays and description, see :func:`hash_take`."""
     files: Mapping[str, int]

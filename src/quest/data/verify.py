@@ -274,11 +274,9 @@ class TakeReport:
     """What verifying one take found."""
 
     name: str
-    """The take."""
     frames: int
-    """Its frames; 0 if it cannot be read."""
+    """0 if it cannot be read, as of views."""
     views: int
-    """Its views."""
     checks: tuple[Check, ...]
     """Every check, those of views once per view."""
     problem: str = ""
