@@ -1,4 +1,4 @@
-"""Clips as MCAP files of ROS 2 messages, which Foxglove, rosbag2 and :mod:`quest.data.mcap_file` read."""
+"""Clips as MCAP files of ROS 2 messages, which Foxglove, rosbag2 and :mod:`quest.data.bags` read."""
 
 from __future__ import annotations
 
