@@ -25,11 +25,9 @@ from quest.data.store import TakeStore
 from quest.errors import QuestError
 from quest.model.weights import save_network
 from quest.sim.objects import load_object
-from quest.track import Tracker
 from quest.tracks import read_tracks, write_tracks
-from quest.types import Query
-from tests.data.bag_drive import recording
-from tests.data.bags import write_bag, write_mcap
+from quest.types import Clip, Query
+from tests.data.bags import recording, write_bag, write_mcap, write_ros1
 from tests.data.layout_writers import nerfstudio, record3d, rscan, stray, tum
 from tests.sim.small_objects import write_cabinet
 from tests.synthetic import make_take
@@ -44,30 +42,15 @@ MOST_KIB = 2**20
 NASTY = st.sampled_from(
     [
         *(None, True, False, [], {}, [[]], [None], {"": None}, ""),
-        *(
-            "x",
-            "../x",
-            "/",
-            "\0",
-            "\x1b[2J",
-            "n" * 300,
-            "{",
-            "{chunk_index:2000000000d}",
-            "{0.__class__}",
-            "NaN",
-            "1e999",
-        ),
+        *("x", "../x", "/", "\0", "\x1b[2J", "n" * 300, "NaN", "1e999"),
+        *("{", "{chunk_index:2000000000d}", "{0.__class__}"),
         *(0, -1, 1, 3, 2**31, 2**63, -(2**63), 10**40, 0.5, -0.0, 1e-300, 1e300),
     ]
 )
 
 
-def write_folder(folder: Path) -> None:
-    write_recording(make_clip(frames=3, size=(40, 32)), folder / "r", rgb="png")
-
-
-def write_video(folder: Path) -> None:
-    write_recording(make_clip(frames=3, size=(40, 32)), folder / "r")
+def make_small() -> Clip:
+    return make_clip(frames=3, size=(40, 32))
 
 
 def write_takes(folder: Path) -> None:
@@ -84,10 +67,6 @@ def read_takes(folder: Path) -> None:
     store_stats(store, report=lambda done, total: None)
 
 
-def write_dataset(folder: Path) -> None:
-    export_lerobot([Episode.of_take(make_take(frames=3, views=1, entities=1, size=(32, 32)))], folder / "d")
-
-
 def write_answers(folder: Path) -> None:
     clip = make_clip(frames=3)
     write_tracks(make_tracker().track(clip, [Query.point(0, 20.0, 20.0)]), folder / "t.parquet")
@@ -100,22 +79,23 @@ def write_stream(folder: Path) -> None:
     (folder / "stream.bin").write_bytes(tracker.save(stream))
 
 
-def write_weights(folder: Path) -> None:
-    save_network(folder / "w.safetensors", make_finder(), settings="{}", about="made up")
-
-
-def load_weights(folder: Path) -> None:
-    assert isinstance(quest.load(folder / "w.safetensors", monitor=False), Tracker)
-
-
 KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
-    "folder": (write_folder, lambda folder: read_recording(folder / "r")),
-    "video": (write_video, lambda folder: read_recording(folder / "r")),
+    "folder": (
+        lambda f: write_recording(make_small(), f / "r", rgb="png"),
+        lambda folder: read_recording(folder / "r"),
+    ),
+    "video": (lambda f: write_recording(make_small(), f / "r"), lambda folder: read_recording(folder / "r")),
     "takes": (write_takes, read_takes),
-    "lerobot": (write_dataset, lambda folder: read_recording(folder / "d")),
+    "lerobot": (
+        lambda f: export_lerobot([Episode.of_take(make_take(frames=3, views=1, entities=1, size=(32, 32)))], f / "d"),
+        lambda folder: read_recording(folder / "d"),
+    ),
     "tracks": (write_answers, lambda folder: read_tracks(folder / "t.parquet")),
     "stream": (write_stream, lambda folder: make_tracker().restore((folder / "stream.bin").read_bytes())),
-    "weights": (write_weights, load_weights),
+    "weights": (
+        lambda f: save_network(f / "w.safetensors", make_finder(), settings="{}", about="made up"),
+        lambda f: quest.load(f / "w.safetensors", monitor=False),
+    ),
     "object": (lambda folder: write_cabinet(folder / "cabinet"), lambda folder: load_object(folder / "cabinet")),
     "mcap": (lambda f: write_mcap(f / "b.mcap", recording()), lambda folder: read_recording(folder / "b.mcap")),
     "tum": (tum, lambda folder: read_recording(folder / "rgbd_dataset_own")),
@@ -124,6 +104,15 @@ KINDS: dict[str, tuple[Callable[[Path], object], Callable[[Path], object]]] = {
     "stray": (stray, read_recording),
     "nerfstudio": (nerfstudio, read_recording),
     "bag": (lambda f: write_bag(f / "b", recording()), lambda folder: read_recording(folder / "b")),
+    "ros1": (lambda f: write_ros1(f / "b.bag", recording()), lambda folder: read_recording(folder / "b.bag")),
+    "ros1-bz2": (
+        lambda f: write_ros1(f / "b.bag", recording(), compression="BZ2"),
+        lambda f: read_recording(f / "b.bag"),
+    ),
+    "ros1-lz4": (
+        lambda f: write_ros1(f / "b.bag", recording(), compression="LZ4"),
+        lambda f: read_recording(f / "b.bag"),
+    ),
 }
 """What writes files of each kind into a folder, and what reads them."""
 

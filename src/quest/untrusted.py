@@ -32,13 +32,9 @@ def reading(
     *,
     known: type[QuestError] | None = None,
 ) -> Iterator[None]:
-    """Whatever a library throws at bad bytes becomes one error that names what was read.
+    """Whatever a library throws at bad bytes becomes one error of a class that says what was read, and what to do.
 
-    Args:
-        where: what is read, such as a path.
-        error: the error's class.
-        remedy: what to do about it.
-        known: errors that name what was read already; by default the class itself.
+    Errors that are ``known`` name it already, and pass; by default those of the class itself.
     """
     passed = (known or error, MissingExtraError)
     try:
@@ -54,14 +50,7 @@ def reading(
 def require_file(
     path: Path, error: type[QuestError], remedy: str = "check the path", *, most: int | None = None
 ) -> None:
-    """Refuse what is no ordinary file: a pipe would be waited for without end.
-
-    Args:
-        path: of the file.
-        error: the error's class.
-        remedy: what to do about it.
-        most: bytes that it may have; any number by default.
-    """
+    """Refuse what is no ordinary file, as a pipe would be waited for without end, or has more than ``most`` bytes."""
     with reading(path, error, remedy):
         try:
             found = path.stat()
@@ -94,32 +83,22 @@ def read_json(path: Path, error: type[QuestError], remedy: str = "restore it") -
 
 
 def parse_json(text: str | bytes, where: object, error: type[QuestError], remedy: str = "restore it") -> Any:
-    """JSON as the standard says it: without NaN and infinities.
+    """JSON as the standard says it, without NaN and infinities; else an error that names where it stands."""
 
-    Args:
-        text: the JSON.
-        where: what it stands in, for messages.
-        error: the error's class.
-        remedy: what to do about it.
-    """
+    def no_number(word: str) -> float:
+        raise ValueError(f"{word} is no number of JSON")
+
     with reading(where, error, remedy):
-        return json.loads(text, parse_constant=_no_number)
-
-
-def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
+        return json.loads(text, parse_constant=no_number)
 
 
 def build(kind: Any, value: Any, name: str = "it") -> Any:
     """A value that JSON holds, as an annotation says: its words, numbers and lists checked, dataclasses made.
 
-    Args:
-        kind: type, with arguments or without; what has none that is known is taken as it is.
-        value: of JSON.
-        name: of the value, for messages.
+    A value of an annotation that is not known is taken as it is.
 
     Raises:
-        ValueError: it is of another type, or a field is missing or not known.
+        ValueError: it is of another type, or a field is missing or not known; the message names the value.
     """
     origin, args = get_origin(kind), get_args(kind)
     if NoneType in args:
@@ -145,22 +124,17 @@ def build(kind: Any, value: Any, name: str = "it") -> Any:
     elif kind is dict or origin is dict or origin is Mapping:
         _expect(isinstance(value, dict), name, "an object", value)
         return {key: build(args[1], item, f"{name}.{key}") for key, item in value.items()} if args else value
-    elif is_dataclass(kind):
-        return _built(kind, value, name)
+    elif isinstance(kind, type) and is_dataclass(kind):
+        _expect(isinstance(value, dict), name, "an object", value)
+        known = [f for f in fields(kind) if f.init]
+        needed = [f.name for f in known if f.default is MISSING and f.default_factory is MISSING]
+        unknown, missing = sorted(set(value) - {f.name for f in known}), [key for key in needed if key not in value]
+        if unknown or missing:
+            lacks, has = ", ".join(missing) or "nothing", ", ".join(unknown) or "none"
+            raise ValueError(f"{name}: lacks {lacks}, has unknown {has}")
+        hints = get_type_hints(kind)
+        return kind(**{key: build(hints[key], item, f"{name}.{key}") for key, item in value.items()})
     return value
-
-
-def _built(kind: Any, value: Any, name: str) -> Any:
-    _expect(isinstance(value, dict), name, "an object", value)
-    known = {f.name: f for f in fields(kind) if f.init}
-    unknown = sorted(set(value) - set(known))
-    missing = [
-        f.name for f in known.values() if f.name not in value and f.default is MISSING and f.default_factory is MISSING
-    ]
-    if unknown or missing:
-        raise ValueError(f"{name}: lacks {', '.join(missing) or 'nothing'}, has unknown {', '.join(unknown) or 'none'}")
-    hints = get_type_hints(kind)
-    return kind(**{key: build(hints[key], item, f"{name}.{key}") for key, item in value.items()})
 
 
 def _expect(right: bool, name: str, what: str, value: Any) -> None:

@@ -12,8 +12,7 @@ from pathlib import Path
 def whole_file(path: Path) -> Iterator[Path]:
     """Where to write a file that gets its name when all is written; a failure leaves what was there before.
 
-    Args:
-        path: the file; its folder is made. What is written beside it meanwhile has the same suffix.
+    Its folder is made. What is written beside it meanwhile has the same suffix.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.partial-{uuid.uuid4().hex[:8]}{path.suffix}")

@@ -1,9 +1,9 @@
-"""Small bags for the tests: ROS 2 messages as dictionaries, written as MCAP or as a rosbag2 folder."""
+"""Small bags for the tests: a robot that drives past with a colour camera and depth, as ROS messages in any storage."""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from quest.types import Camera
+from quest.data.frame_source import Parts
+from quest.data.recording import open_recording
+from quest.types import Camera, Frame
 
 SECOND = 1_000_000_000
 COLOUR, DEPTH = "/camera/color/image_raw", "/camera/depth/image_rect_raw"
@@ -39,15 +41,9 @@ def image(
     order = pixels.astype(pixels.dtype.newbyteorder(">" if big_endian else "<"))
     rows = np.ascontiguousarray(order).reshape(pixels.shape[0], -1).view(np.uint8)
     padded = np.pad(rows, ((0, 0), (0, pad)), constant_values=170)
-    return {
-        "header": header(frame, stamp_ns),
-        "height": pixels.shape[0],
-        "width": pixels.shape[1],
-        "encoding": encoding,
-        "is_bigendian": int(big_endian),
-        "step": padded.shape[1],
-        "data": padded.tobytes(),
-    }
+    size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": padded.shape[1]}
+    how = {"header": header(frame, stamp_ns), "encoding": encoding, "is_bigendian": int(big_endian)}
+    return {**how, **size, "data": padded.tobytes()}
 
 
 def compressed(data: bytes, kind: str, stamp_ns: int, *, frame: str = COLOUR_FRAME) -> dict[str, Any]:
@@ -96,31 +92,19 @@ def camera_info(
     d: Sequence[float] = (0.0,) * 5,
 ) -> dict[str, Any]:
     k = [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
-    return {
-        "header": header(frame, stamp_ns),
-        "height": camera.height,
-        "width": camera.width,
-        "distortion_model": model,
-        "d": list(d),
-        "k": k,
-        "r": np.eye(3).ravel().tolist(),
-        "p": [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
-        "binning_x": 0,
-        "binning_y": 0,
-        "roi": {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False},
-    }
+    size = {"header": header(frame, stamp_ns), "height": camera.height, "width": camera.width}
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    lens = {"distortion_model": model, "d": list(d), "k": k, "r": np.eye(3).ravel().tolist(), "p": p}
+    roi = {"x_offset": 0, "y_offset": 0, "height": 0, "width": 0, "do_rectify": False}
+    return {**size, **lens, "binning_x": 0, "binning_y": 0, "roi": roi}
 
 
 def transform(parent: str, child: str, parent_from_child: np.ndarray, stamp_ns: int) -> dict[str, Any]:
     """A TFMessage of one transform."""
-    x, y, z = parent_from_child[:3, 3].tolist()
-    qx, qy, qz, qw = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat().tolist()
-    stamped = {
-        "header": header(parent, stamp_ns),
-        "child_frame_id": child,
-        "transform": {"translation": {"x": x, "y": y, "z": z}, "rotation": {"x": qx, "y": qy, "z": qz, "w": qw}},
-    }
-    return {"transforms": [stamped]}
+    moved = dict(zip("xyz", parent_from_child[:3, 3].tolist(), strict=True))
+    turned = dict(zip("xyzw", Rotation.from_matrix(parent_from_child[:3, :3]).as_quat().tolist(), strict=True))
+    both = {"translation": moved, "rotation": turned}
+    return {"transforms": [{"header": header(parent, stamp_ns), "child_frame_id": child, "transform": both}]}
 
 
 def write_mcap(path: Path, sent: Sequence[Sent], **options: Any) -> Path:
@@ -198,3 +182,66 @@ def _message(store: Any, kind: str, fields: dict[str, Any]) -> Any:
                 value = np.array(value, {"float64": np.float64, "float32": np.float32}[element[0]])
         values[name] = value
     return store.types[kind](**values)
+
+
+CAMERA = Camera(40.0, 41.0, 16.2, 12.1, 32, 24)
+IMAGE, INFO, TF = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "tf2_msgs/msg/TFMessage"
+FRAMES = 8
+BEGIN = 1_700_000_000 * SECOND
+STEP = SECOND // 20
+RNG = np.random.default_rng(0)
+RGB = RNG.integers(0, 256, (FRAMES, 24, 32, 3)).astype(np.uint8)
+DEPTH_MM = RNG.integers(500, 3000, (FRAMES, 24, 32)).astype(np.uint16)
+OPTICAL = np.eye(4)
+OPTICAL[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+
+WRITERS: dict[str, Callable[[Path, Sequence[Sent]], Path]] = {
+    "mcap": lambda folder, sent: write_mcap(folder / "bag.mcap", sent),
+    "sqlite3 folder": lambda folder, sent: write_bag(folder / "bag", sent),
+    "mcap folder": lambda folder, sent: write_bag(folder / "bag", sent, storage="mcap"),
+    "ros1": lambda folder, sent: write_ros1(folder / "bag.bag", sent),
+}
+
+
+def base_at(seconds: float) -> np.ndarray:
+    """Where the robot is: it drives and turns evenly."""
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", 0.4 * seconds).as_matrix()
+    pose[:3, 3] = [0.5 * seconds, 0.1, 0.3]
+    return pose
+
+
+def colours(t: int, *, at_ns: int | None = None, **changes: Any) -> Sent:
+    stamp = BEGIN + t * STEP if at_ns is None else at_ns
+    return COLOUR, IMAGE, image(RGB[t], "rgb8", stamp) | changes, stamp
+
+
+def depths(t: int, *, at_ns: int | None = None, topic: str = DEPTH) -> Sent:
+    stamp = BEGIN + t * STEP if at_ns is None else at_ns
+    return topic, IMAGE, image(DEPTH_MM[t], "16UC1", stamp), stamp
+
+
+def info(t: int = 0, camera: Camera = CAMERA, **changes: Any) -> Sent:
+    return COLOUR_INFO, INFO, camera_info(camera, BEGIN + t * STEP, **changes), BEGIN + t * STEP
+
+
+def recording() -> list[Sent]:
+    """A driving robot: colours, aligned depth a little later, cameras, and transforms between the frames' times."""
+    mount = np.eye(4)
+    mount[:3, 3] = [0.1, 0.02, 0.5]
+    sent: list[Sent] = [
+        ("/tf_static", TF, transform("base", "camera_link", mount, BEGIN), BEGIN),
+        ("/tf_static", TF, transform("camera_link", COLOUR_FRAME, OPTICAL, BEGIN), BEGIN),
+    ]
+    for t in range(FRAMES):
+        sent += [info(t), colours(t), depths(t, at_ns=BEGIN + t * STEP + STEP // 10)]
+    for k in range(-2, 4 * FRAMES):
+        at = BEGIN + k * STEP // 3
+        sent.append(("/tf", TF, transform("odom", "base", base_at((at - BEGIN) / SECOND), at), at))
+    return sorted(sent, key=lambda one: one[3])
+
+
+def frames_of(path: Path, **parts: Any) -> tuple[list[Frame], tuple[str, ...]]:
+    source = open_recording(path, parts=Parts(**parts))
+    frames = list(source)
+    return frames, source.flags

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from quest.data.depth_file import read_depth_file
-from quest.data.layouts import nearest
+from quest.data.folder import nearest
+from quest.data.pictures import read_depth_file
 from quest.data.recording import open_recording, read_recording
 from quest.errors import RecordingError
 from quest.types import Camera

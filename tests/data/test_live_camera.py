@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, ClassVar
+from unittest.mock import MagicMock
 
 import cv2
 import numpy as np
@@ -118,52 +118,20 @@ def test_a_webcam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
         open_recording("camera:0", depth_scale_m=0.001)
 
 
-class FakePipeline:
-    """As librealsense's, as far as it is used; it sends two frames."""
-
-    running: ClassVar[set[int]] = set()
-
-    def __init__(self) -> None:
-        self.sent = 0
-
-    def start(self, config: Any) -> Any:
-        if config.serial not in (None, "123"):
-            raise RuntimeError("No device connected")
-        self.running.add(id(self))
-        lens = SimpleNamespace(fx=600.0, fy=601.0, ppx=320.0, ppy=240.0, width=640, height=480, coeffs=[0.0] * 5)
-        stream = SimpleNamespace(as_video_stream_profile=lambda: SimpleNamespace(get_intrinsics=lambda: lens))
-        sensor = SimpleNamespace(get_depth_scale=lambda: 0.001)
-        device = SimpleNamespace(first_depth_sensor=lambda: sensor)
-        return SimpleNamespace(get_stream=lambda kind: stream, get_device=lambda: device)
-
-    def wait_for_frames(self) -> Any:
-        self.sent += 1
-        if self.sent > 2:
-            raise RuntimeError("Frame didn't arrive within 5000")
-        pixels = (np.zeros((480, 640, 3), np.uint8), np.full((480, 640), 1250, np.uint16))
-        colour, depth = (SimpleNamespace(get_data=lambda of=of: of, get_timestamp=lambda: 1500.0) for of in pixels)
-        return SimpleNamespace(get_color_frame=lambda: colour, get_depth_frame=lambda: depth)
-
-    def stop(self) -> None:
-        self.running.discard(id(self))
-
-
-class FakeConfig:
-    serial: str | None = None
-
-    def enable_device(self, serial: str) -> None:
-        self.serial = serial
-
-    def enable_stream(self, *_: Any) -> None:
-        pass
-
-
 def test_a_realsense(monkeypatch: pytest.MonkeyPatch):
-    names = SimpleNamespace(color="color", depth="depth", rgb8="rgb8", z16="z16")
-    align = lambda kind: SimpleNamespace(process=lambda frames: frames)  # noqa: E731
-    fake = SimpleNamespace(pipeline=FakePipeline, config=FakeConfig, stream=names, format=names, align=align)
-    monkeypatch.setitem(sys.modules, "pyrealsense2", fake)
+    rs = MagicMock()  # as librealsense: a camera that sends two frames
+    monkeypatch.setitem(sys.modules, "pyrealsense2", rs)
+    pipeline, both = rs.pipeline.return_value, rs.align.return_value.process.return_value
+    lens = SimpleNamespace(fx=600.0, fy=601.0, ppx=320.0, ppy=240.0, width=640, height=480, coeffs=[0.0] * 5)
+    stream, device = (getattr(pipeline.start.return_value, name).return_value for name in ("get_stream", "get_device"))
+    stream.as_video_stream_profile.return_value.get_intrinsics.return_value = lens
+    device.first_depth_sensor.return_value.get_depth_scale.return_value = 0.001
+    both.get_color_frame.return_value.get_data.return_value = np.zeros((480, 640, 3), np.uint8)
+    both.get_color_frame.return_value.get_timestamp.return_value = 1500.0
+    both.get_depth_frame.return_value.get_data.return_value = np.full((480, 640), 1250, np.uint16)
+    pipeline.wait_for_frames.side_effect = [None, None, RuntimeError("Frame didn't arrive within 5000")]
     source = open_recording("realsense:123")
+    rs.config.return_value.enable_device.assert_called_once_with("123")
     assert source.camera == Camera(600, 601, 320.5, 240.5, 640, 480)
     frames = iter(source)
     frame = next(frames)
@@ -171,6 +139,7 @@ def test_a_realsense(monkeypatch: pytest.MonkeyPatch):
     assert (float(frame.depth_m[0, 0]), frame.stamp_s) == (1.25, 1.5)
     with pytest.raises(RecordingError, match="sends no frames any more"):
         list(frames)
+    assert pipeline.start.call_count == pipeline.stop.call_count == 2
+    pipeline.start.side_effect = RuntimeError("No device connected")
     with pytest.raises(RecordingError, match="No device connected"):
         open_recording("realsense:9")
-    assert not FakePipeline.running

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from quest.data.camera_file import CameraFile, read_camera, write_camera
-from quest.data.distortion import Distortion, Rectifier
 from quest.data.frame_source import Notes, Parts
 from quest.data.recording import open_recording, read_recording, readers, write_recording
+from quest.data.registration import Distortion, Rectifier
 from quest.data.store import TakeStore
 from quest.data.video import write_video
 from quest.errors import InputError, RecordingError, TakeError

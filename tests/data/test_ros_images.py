@@ -12,21 +12,19 @@ import numpy as np
 import pytest
 
 from quest.data.ros_frames import NO_DEPTH, NO_POSE
-from quest.data.rvl import decode_rvl
-from tests.data.bag_drive import (
+from quest.data.ros_images import decode_rvl
+from tests.data.bags import (
     BEGIN,
+    COLOUR,
+    DEPTH,
     DEPTH_MM,
     IMAGE,
     RGB,
     colours,
-    frames_of,
-    info,
-)
-from tests.data.bags import (
-    COLOUR,
-    DEPTH,
     compressed,
+    frames_of,
     image,
+    info,
     png,
     rvl,
     write_mcap,

@@ -70,13 +70,6 @@ def test_read_returns_what_was_written(store: TakeStore, take: Take, tmp_path: P
     assert files[0] == files[1]
 
 
-def test_frames_beyond_one_shard_come_back(tmp_path: Path):
-    take = make_take(frames=62, views=1, entities=1, size=(8, 6), name="long")
-    store = TakeStore(tmp_path)
-    store.write(take)
-    assert_equal(store.read("long"), take)
-
-
 def test_some_views_and_frames(store: TakeStore, take: Take):
     part = store.read("panels", views=[1], frames=slice(2, 9, 3))
     assert (len(part), len(part.views)) == (3, 1)

@@ -70,6 +70,18 @@ def test_short_and_long_takes_pass(frames: int, tmp_path: Path):
     assert failed(make_take(frames=frames, views=1, entities=1, size=(32, 32)), tmp_path) == {}
 
 
+def test_the_made_up_take_moves_and_is_the_same_every_time():
+    take, again, other = (make_take(frames=24, hinges=True, seed=seed) for seed in (3, 3, 4))
+    np.testing.assert_array_equal(take.views[0].clip.rgb, again.views[0].clip.rgb)
+    assert (take.views[0].clip.rgb != other.views[0].clip.rgb).any()
+    assert (take.point_world[:8] == take.point_world[0]).all()
+    np.testing.assert_allclose(take.joint_position[0], 0, atol=1e-9)
+    assert take.moved[take.tracked].all()
+    assert not take.moved[-2], "the hinge of a door rests"
+    visible = np.concatenate([view.visible[:, take.tracked] for view in take.views])
+    assert 0.5 < visible.mean() < 1
+
+
 def with_clip(take: Take, change: Callable[[Clip], dict[str, Any]]) -> Take:
     return with_view(take, lambda view: replace(view, clip=replace(view.clip, **change(view.clip))))
 

@@ -38,7 +38,6 @@ class BoxedPicture:
     """A picture and what is boxed in it."""
 
     path: Path
-    """The picture."""
     names: tuple[str, ...]
     """Class of each box, as the labels say it."""
     box_px: Float[np.ndarray, "N 4"]
@@ -48,11 +47,9 @@ class BoxedPicture:
 
 
 def read_boxed_pictures(path: Path) -> list[BoxedPicture]:
-    """Read a labelled set.
+    """Read a labelled set: a COCO file; ``data.yaml`` of a YOLO set, or its folder; or a folder with ``pictures``.
 
-    Args:
-        path: a COCO file; ``data.yaml`` of a YOLO set, or its folder; or a folder with ``pictures`` and ``labels.csv``
-            (columns file, class, x0, y0, x1, y1 and, if there is one, licence).
+    The last has ``labels.csv`` with columns file, class, x0, y0, x1, y1 and, if there is one, licence.
 
     Raises:
         InputError: it is none of these, or a label cannot be understood.
@@ -123,14 +120,13 @@ def _coco(path: Path) -> Iterator[BoxedPicture]:
         for mark in raw["annotations"]:
             x, y, width, height = map(float, mark["bbox"])
             boxes.setdefault(mark["image_id"], []).append((names[mark["category_id"]], [x, y, x + width, y + height]))
-        pictures = [(image["id"], str(image["file_name"]), licences.get(image.get("license"), "")) for image in
-                    raw["images"]]  # fmt: skip
-    for number, file, licence in pictures:
+        images = [(each["id"], str(each["file_name"]), licences.get(each.get("license"), "")) for each in raw["images"]]
+    for number, file, licence in images:
         _check_inside(file, path)
         beside = [folder / file for folder in (path.parent, path.parent / "images", path.parent.parent / "images")]
         place = next((p for p in beside if p.is_file()), beside[0])
         own = boxes.get(number, [])
-        yield BoxedPicture(place, tuple(name for name, _ in own), _stacked([box for _, box in own]), licence)
+        yield _boxed(place, own, licence)
 
 
 def _yolo(folder: Path, config: Path) -> Iterator[BoxedPicture]:
@@ -157,8 +153,9 @@ def _yolo(folder: Path, config: Path) -> Iterator[BoxedPicture]:
                 else:  # an outline
                     low, high = xy.reshape(-1, 2).min(axis=0), xy.reshape(-1, 2).max(axis=0)
                 own.append((names[int(number)], [*(low * size).tolist(), *(high * size).tolist()]))
-        yield BoxedPicture(path, tuple(name for name, _ in own), _stacked([box for _, box in own]))
+        yield _boxed(path, own)
 
 
-def _stacked(boxes: list[list[float]]) -> Float[np.ndarray, "N 4"]:
-    return np.array(boxes, np.float64).reshape(-1, 4)
+def _boxed(path: Path, own: list[tuple[str, list[float]]], licence: str = "") -> BoxedPicture:
+    box_px = np.array([box for _, box in own], np.float64).reshape(-1, 4)
+    return BoxedPicture(path, tuple(name for name, _ in own), box_px, licence)

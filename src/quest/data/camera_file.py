@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from quest.data.distortion import Distortion
 from quest.data.frame_source import Notes, ReadOptions, naming
-from quest.data.registration import Rig
+from quest.data.registration import Distortion, Rig
 from quest.errors import RecordingError
 from quest.geometry.poses import is_rigid
 from quest.types import Camera
@@ -23,10 +22,8 @@ EXAMPLE = '{"fx": 600, "fy": 600, "cx": 320, "cy": 240, "width": 640, "height": 
 
 _INTRINSICS = ("fx", "fy", "cx", "cy", "width", "height")
 _LENS = ("distortion_model", "distortion")
-_OPTIONAL = (
-    *("pixel_centre", "depth_scale_m", "fps", "stamp_s", "cam_from_world"),
-    *(*_LENS, "depth_camera", "colour_from_depth"),
-)
+_SCALES = ("pixel_centre", "depth_scale_m", "fps", "stamp_s", "cam_from_world")
+_KNOWN = (*_INTRINSICS, *_SCALES, *_LENS, "depth_camera", "colour_from_depth")
 
 
 @dataclass(frozen=True)
@@ -85,22 +82,16 @@ def read_camera(path: Path) -> CameraFile:
     if not isinstance(fields, dict):
         raise RecordingError(f"{where}: expected an object such as {EXAMPLE}, got {type(fields).__name__}")
     missing = [name for name in _INTRINSICS if name not in fields]
-    unknown = sorted(set(fields) - {*_INTRINSICS, *_OPTIONAL})
+    unknown = sorted(set(fields) - set(_KNOWN))
     if missing or unknown:
         said = [f"lacks {', '.join(missing)}"] * bool(missing) + [f"has unknown {', '.join(unknown)}"] * bool(unknown)
-        raise RecordingError(
-            f"{where}: {' and '.join(said)}; known are {', '.join((*_INTRINSICS, *_OPTIONAL))}, for example {EXAMPLE}"
-        )
+        raise RecordingError(f"{where}: {' and '.join(said)}; known are {', '.join(_KNOWN)}, for example {EXAMPLE}")
     with reading(where, RecordingError, remedy):
         return _parse(fields)
 
 
 def read_setup(camera: Path | Camera | CameraFile, depth_scale_m: float | None = None) -> CameraFile:
-    """A camera file that is read, made of intrinsics, or taken as it is, with another depth scale if one is given.
-
-    Raises:
-        RecordingError: the file is missing or makes no sense.
-    """
+    """A camera file that is read, made of intrinsics, or taken as it is, with another depth scale if one is given."""
     if isinstance(camera, Path):
         camera = read_camera(camera)
     setup = CameraFile(camera) if isinstance(camera, Camera) else camera
@@ -127,15 +118,9 @@ def find_setup(
     depth: bool,
     notes: Notes,
 ) -> CameraFile:
-    """The camera of a recording: as the user gives it, else its own, else a guess, which is noted.
+    """The camera of a recording: as the user gives it, else its own, else a guess for frames of a size, which is noted.
 
-    Args:
-        where: the recording, for messages.
-        options: with a camera, or a field of view, or neither.
-        known: the recording's own camera, if it has one; what the user's file leaves out is taken from it.
-        size: width and height of the frames, pixels, for a guess.
-        depth: whether there is depth; without intrinsics it would be of no use.
-        notes: where a guess is noted.
+    What the user's file leaves out is taken from the recording's own.
 
     Raises:
         RecordingError: the camera file makes no sense, a field of view is given beside it or out of range, or there is
@@ -166,19 +151,15 @@ def find_setup(
 
 def write_camera(file: CameraFile, path: Path) -> None:
     """Write a camera file that :func:`read_camera` reads."""
-    camera = file.camera
-    fields: dict[str, Any] = {name: getattr(camera, name) for name in _INTRINSICS}
-    fields |= {"pixel_centre": "half-integer", "depth_scale_m": file.unit_m}
+    fields: dict[str, Any] = asdict(file.camera) | {"pixel_centre": "half-integer", "depth_scale_m": file.unit_m}
     if file.frames_per_s is not None:
         fields["fps"] = file.frames_per_s
-    if file.stamp_s is not None:
-        fields["stamp_s"] = file.stamp_s.tolist()
-    if file.cam_from_world is not None:
-        fields["cam_from_world"] = file.cam_from_world.tolist()
+    for name in ("stamp_s", "cam_from_world"):
+        if (values := getattr(file, name)) is not None:
+            fields[name] = values.tolist()
     fields |= _lens_to_json(file.distortion)
     if file.depth_camera is not None:
-        depth = {name: getattr(file.depth_camera, name) for name in _INTRINSICS}
-        fields["depth_camera"] = depth | _lens_to_json(file.depth_distortion)
+        fields["depth_camera"] = asdict(file.depth_camera) | _lens_to_json(file.depth_distortion)
         fields["colour_from_depth"] = file.colour_from_depth.tolist()
     path.write_text(json.dumps(fields, indent=1) + "\n", encoding="utf-8")
 

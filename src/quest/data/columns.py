@@ -13,12 +13,9 @@ from quest.errors import InputError
 
 
 def read_columns(path: Path, kinds: Mapping[str, type], **optional: type) -> dict[str, np.ndarray]:
-    """Columns of a CSV file; empty numbers are NaN, empty words and what is optional and missing are empty.
+    """Columns of a CSV file, each of ``str``, ``int`` or ``float``, of which some may be missing.
 
-    Args:
-        path: the file.
-        kinds: ``str``, ``int`` or ``float`` of each column that must be there.
-        optional: the same of those that may be missing.
+    Empty numbers are NaN, empty words and what is optional and missing are empty.
 
     Raises:
         InputError: no such file, a column is missing, or a value is of another kind.

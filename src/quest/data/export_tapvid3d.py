@@ -34,16 +34,9 @@ from quest.whole_file import whole_file
 
 
 def export_tapvid3d(take: Take, folder: str | Path, *, jpeg_quality: int = 95, depth: bool = False) -> list[Path]:
-    """Write one ``<take>-v<view>.npz`` per view that shows an entity.
+    """Write one ``<take>-v<view>.npz`` per view that shows an entity, with depth if that is asked for; returns them.
 
-    Args:
-        take: with its views.
-        folder: where to; made if it is not there, and files of the same names are replaced.
-        jpeg_quality: of the images, 1 to 100.
-        depth: write depth too, where the view has it.
-
-    Returns:
-        The files that were written.
+    Files of the same names are replaced.
 
     Raises:
         InputError: the quality is out of range.

@@ -13,6 +13,7 @@ from quest.depth import check_units
 from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Clip, Frame
 from quest.untrusted import reading
+from quest.wording import counted
 
 _ENOUGH_DEPTH = 0.05
 
@@ -101,8 +102,7 @@ class Notes:
 
     def count(self, words: str, frame: int) -> None:
         """Note something of one frame."""
-        found = self._counted.setdefault(words, [0, frame])
-        found[0] += 1
+        self._counted.setdefault(words, [0, frame])[0] += 1
 
     def restart(self) -> None:
         """Forget what was counted: the frames begin again."""
@@ -111,11 +111,8 @@ class Notes:
     @property
     def words(self) -> tuple[str, ...]:
         """All notes; those of frames with how many and which was the first."""
-        counted = (
-            f"{words}: {number} frame{'s' * (number > 1)}, first {first}"
-            for words, (number, first) in self._counted.items()
-        )
-        return (*self._said, *counted)
+        often = (f"{words}: {counted(n, 'frame')}, first {first}" for words, (n, first) in self._counted.items())
+        return (*self._said, *often)
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,6 @@ class FrameSource:
     """Frames of one camera, read as they are asked for; every loop over them begins anew."""
 
     name: str
-    """Name of the recording."""
     camera: Camera
     """Intrinsics of every frame, without distortion."""
     frames: Callable[[], Iterator[Frame]]
@@ -184,10 +180,7 @@ class FrameSource:
             yield frame
 
     def clip(self, *, report: Callable[[int], object] | None = None) -> Clip:
-        """All frames in memory; depth is zero in frames that have none.
-
-        Args:
-            report: called after every frame with the number of frames that are read.
+        """All frames in memory; depth is zero in frames that have none. Reports how many frames are read, after each.
 
         Raises:
             RecordingError: as in reading frame by frame, every pixel of the depth is missing, or it is a live camera.
@@ -217,10 +210,7 @@ class FrameSource:
 
 def source_of_clip(clip: Clip) -> FrameSource:
     """A clip in memory as a source."""
+    count = len(clip)
     return FrameSource(
-        clip.name,
-        clip.camera,
-        lambda: (clip.frame(t) for t in range(len(clip))),
-        length=len(clip),
-        units=(clip.name, 1.0),
+        clip.name, clip.camera, lambda: map(clip.frame, range(count)), length=count, units=(clip.name, 1.0)
     )

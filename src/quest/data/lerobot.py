@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -87,24 +87,23 @@ class _Episode:
     """One episode of a dataset."""
 
     root: Path
-    """Of the dataset."""
     info: dict[str, Any]
-    """Its ``meta/info.json``."""
+    """The dataset's ``meta/info.json``."""
     index: int
-    """Of the episode."""
     row: dict[str, Any]
     """Its row of ``meta/episodes``."""
 
     def feature(self, key: str) -> dict[str, Any]:
         return self.info["features"][key]
 
+    @property
+    def visual(self) -> list[str]:
+        """Features of pictures."""
+        return [key for key, feature in self.info["features"].items() if feature.get("dtype") in ("video", "image")]
+
     def details(self, key: str) -> list[dict[str, Any]]:
         """What a feature says of its pictures, under the name of today and an older one."""
         return [self.feature(key).get(name) or {} for name in ("info", "video_info")]
-
-    @property
-    def visual(self) -> list[str]:
-        return [key for key, feature in self.info["features"].items() if feature.get("dtype") in ("video", "image")]
 
     def is_depth(self, key: str) -> bool:
         return any(told.get("is_depth_map") or told.get("video.is_depth_map") for told in self.details(key))
@@ -112,15 +111,8 @@ class _Episode:
     def error(self, words: str) -> RecordingError:
         return RecordingError(f"dataset {self.root}: {words}")
 
-    @property
-    def data_path(self) -> Path:
-        return self._path("data_path", "data")
-
-    def video_path(self, key: str) -> Path:
-        return self._path("video_path", f"videos/{key}", video_key=key)
-
-    def _path(self, template: str, of: str, **names: str) -> Path:
-        """Where files of the episode are: the template's fields filled in, below the dataset."""
+    def path(self, template: str, of: str, **names: str) -> Path:
+        """Where files of the episode are: a template's fields filled in, below the dataset."""
         where = f"{template} {self.info.get(template)!r:.120} of meta/info.json"
         values: dict[str, Any] = dict(names)
         for part in ("chunk_index", "file_index"):
@@ -154,31 +146,32 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
     setup = find_setup(
         where, options, _own_setup(episode, key), size=_size(episode, key), depth=depth_key is not None, notes=notes
     )
-    shot = _Shot(episode, key, depth_key, setup, options.depth_scale_m)
-    if not shot.posed:
+    given_m, feature = options.depth_scale_m, {} if depth_key is None else episode.feature(depth_key)
+    if feature.get("dtype") == "video" and given_m is not None:
+        raise episode.error(f"{depth_key} is a video, whose metres info.json gives; omit --depth-scale-m")
+    in_metres = feature.get("dtype") == "video" or (feature.get("info") or {}).get("depth_unit") == "m"
+    unit_m = given_m or (1.0 if in_metres else setup.unit_m)
+    shot = _Shot(episode, key, depth_key, setup, *_read_rows(episode, _view(key)), (unit_m, given_m or 1.0))
+    if shot.pose is None and setup.cam_from_world is None:
         notes.say("the dataset has no camera poses: the world is the camera")
     for what, number in setup.lengths:
-        if number != shot.number:
+        if number != len(shot.timestamp):
             raise episode.error(
-                f"{what} of the camera is for {number} frames, expected {shot.number} of episode {episode.index}"
+                f"{what} of the camera is for {number} frames, expected {len(shot.timestamp)} of episode "
+                f"{episode.index}"
             )
     return FrameSource(
         f"{episode.root.resolve().name}-{episode.index:06d}-{_view(key)}",
         setup.camera,
         shot.frames,
-        length=shot.number,
+        length=len(shot.timestamp),
         notes=notes,
-        units=(f"{episode.root} {depth_key}", shot.units_m[0]),
+        units=(f"{episode.root} {depth_key}", unit_m),
     )
 
 
-READER = Reader(
-    "a LeRobot v3 dataset",
-    "a folder with meta/info.json",
-    _accepts,
-    _open,
-    options=("episode", "camera_key", "camera", "depth_scale_m", "fov_deg"),
-)
+_OPTIONS = ("episode", "camera_key", "camera", "depth_scale_m", "fov_deg")
+READERS = (Reader("a LeRobot v3 dataset", "a folder with meta/info.json", _accepts, _open, _OPTIONS),)
 
 
 def _view(key: str) -> str:
@@ -266,65 +259,48 @@ def _size(episode: _Episode, key: str) -> tuple[int, int]:
     return width, height
 
 
+@dataclass(frozen=True)
 class _Shot:
     """The frames of one camera in one episode."""
 
-    def __init__(
-        self, episode: _Episode, key: str, depth_key: str | None, setup: CameraFile, depth_scale_m: float | None
-    ) -> None:
-        self._episode, self._key, self._depth_key, self._setup = episode, key, depth_key, setup
-        feature = {} if depth_key is None else episode.feature(depth_key)
-        video = feature.get("dtype") == "video"
-        if video and depth_scale_m is not None:
-            raise episode.error(f"{depth_key} is a video, whose metres info.json gives; omit --depth-scale-m")
-        in_metres = video or (feature.get("info") or {}).get("depth_unit") == "m"
-        self.units_m = depth_scale_m or (1.0 if in_metres else setup.unit_m), depth_scale_m or 1.0
-        """Metres per unit of depth images in integers, and in floats."""
-        path = episode.data_path
-        present, pose = _columns(path), f"{POSE}.{_view(key)}"
-        wanted = [name for name in ("episode_index", "timestamp", STAMP, pose) if name in present]
-        table = _read_table(path, wanted, filters=[("episode_index", "=", episode.index)])
-        self.number = table.num_rows
-        if self.number == 0:
-            raise episode.error(f"{path.name} has no rows of episode {episode.index}")
-        length = episode.row.get("length", self.number)
-        if length != self.number:
-            raise episode.error(
-                f"{path.name} has {self.number} rows of episode {episode.index}, expected {length}; the file is "
-                "corrupt, copy it again"
-            )
-        self._timestamp = table["timestamp"].to_numpy().astype(np.float64)
-        self._stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else self._timestamp
-        self._pose = np.array(table[pose].to_pylist(), np.float64).reshape(-1, 4, 4) if pose in wanted else None
-        self.posed = self._pose is not None or setup.cam_from_world is not None
+    episode: _Episode
+    key: str
+    """Feature of the colours."""
+    depth_key: str | None
+    setup: CameraFile
+    timestamp: np.ndarray
+    """As LeRobot counts it, by which frames of videos are found."""
+    stamp_s: np.ndarray
+    pose: np.ndarray | None
+    units_m: tuple[float, float]
+    """Metres per unit of depth images in integers, and in floats."""
 
     def frames(self) -> Iterator[Frame]:
-        setup = self._setup
-        colours = self._pictures(self._key, paired=self._depth_key is not None)
-        depths = None if self._depth_key is None else self._pictures(self._depth_key)
-        with naming(f"dataset {self._episode.root}: episode {self._episode.index}"):
+        setup = self.setup
+        colours = self._pictures(self.key, paired=self.depth_key is not None)
+        depths = None if self.depth_key is None else self._pictures(self.depth_key, paired=False)
+        with naming(f"dataset {self.episode.root}: episode {self.episode.index}"):
             for t, picture in enumerate(colours):
                 depth_m = None if depths is None else setup.depth(next(depths))
-                pose = setup.pose(t) if self._pose is None or setup.cam_from_world is not None else self._pose[t]
-                yield Frame(setup.rgb(picture), depth_m, setup.stamp(t, fallback_s=float(self._stamp_s[t])), pose)
+                pose = setup.pose(t) if self.pose is None or setup.cam_from_world is not None else self.pose[t]
+                yield Frame(setup.rgb(picture), depth_m, setup.stamp(t, fallback_s=float(self.stamp_s[t])), pose)
 
-    def _pictures(self, key: str, *, paired: bool = False) -> Iterator[np.ndarray]:
+    def _pictures(self, key: str, *, paired: bool) -> Iterator[np.ndarray]:
         """Colours of uint8, or depth in metres, one per row; ``paired`` are colours that depth goes with."""
-        if self._episode.feature(key)["dtype"] == "image":
-            return self._stored(key, paired=paired)
-        return self._filmed(key, paired=paired)
+        read = self._stored if self.episode.feature(key)["dtype"] == "image" else self._filmed
+        return read(key, paired)
 
-    def _filmed(self, key: str, *, paired: bool) -> Iterator[np.ndarray]:
+    def _filmed(self, key: str, paired: bool) -> Iterator[np.ndarray]:
         """Frames of a video at the times of the rows."""
-        episode, path = self._episode, self._episode.video_path(key)
+        episode, path = self.episode, self.episode.path("video_path", f"videos/{key}", video_key=key)
         if paired and probe_video(path).turns:
             raise episode.error(f"video {path.name} of {key}: {TURNED}")
         half_s = 0.5 / float(episode.info["fps"])
-        times = float(episode.row[f"videos/{key}/from_timestamp"]) + self._timestamp
+        times = float(episode.row[f"videos/{key}/from_timestamp"]) + self.timestamp
         scale = None
         if episode.is_depth(key):
             told = {name: value for details in episode.details(key) for name, value in details.items()}
-            named = {name: told.get(f"video.{name}") for name in DepthRange.__dataclass_fields__}
+            named = {f.name: told.get(f"video.{f.name}") for f in fields(DepthRange)}
             scale = DepthRange(**{name: value for name, value in named.items() if value is not None})
         pixel_format, number = "rgb24" if scale is None else "gray12le", 0
         for picture, time_s in play_video(path, pixel_format=pixel_format, start_s=times[0] - half_s):
@@ -338,25 +314,43 @@ class _Shot:
             "corrupt, copy it again"
         )
 
-    def _stored(self, key: str, *, paired: bool) -> Iterator[np.ndarray]:
+    def _stored(self, key: str, paired: bool) -> Iterator[np.ndarray]:
         """Pictures in the rows themselves, a few in memory at a time."""
-        episode, path = self._episode, self._episode.data_path
+        episode, path = self.episode, self.episode.path("data_path", "data")
         where = f"dataset {episode.root}: a picture of {key} in {path.name}"
         with reading(f"dataset file {path}", RecordingError, known=QuestError), pq.ParquetFile(path) as file:
             for batch in file.iter_batches(batch_size=8, columns=["episode_index", key]):
                 for row in batch.to_pylist():
                     if row["episode_index"] == episode.index:
-                        yield self._decoded(row[key]["bytes"], key, where, paired=paired)
+                        yield self._decoded(row[key]["bytes"], key, where, paired)
 
-    def _decoded(self, data: bytes, key: str, where: str, *, paired: bool) -> np.ndarray:
+    def _decoded(self, data: bytes, key: str, where: str, paired: bool) -> np.ndarray:
         with reading(where, RecordingError), Image.open(io.BytesIO(data)) as image:
             if paired and is_turned(image):
                 raise RecordingError(f"{where}: {TURNED}")
-            if not self._episode.is_depth(key):
+            if not self.episode.is_depth(key):
                 return colours_of(upright(image), where)
             pixels = np.asarray(image)
-        integers_m, floats_m = self.units_m
-        return metres(pixels, floats_m if pixels.dtype.kind == "f" else integers_m)
+        return metres(pixels, self.units_m[pixels.dtype.kind == "f"])
+
+
+def _read_rows(episode: _Episode, view: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+    """Timestamps, true times, and poses of a view if there are any, of all frames of an episode."""
+    path, pose = episode.path("data_path", "data"), f"{POSE}.{view}"
+    wanted = [name for name in _columns(path) if name in ("episode_index", "timestamp", STAMP, pose)]
+    table = _read_table(path, wanted, filters=[("episode_index", "=", episode.index)])
+    if table.num_rows == 0:
+        raise episode.error(f"{path.name} has no rows of episode {episode.index}")
+    length = episode.row.get("length", table.num_rows)
+    if length != table.num_rows:
+        raise episode.error(
+            f"{path.name} has {table.num_rows} rows of episode {episode.index}, expected {length}; the file is "
+            "corrupt, copy it again"
+        )
+    timestamp = table["timestamp"].to_numpy().astype(np.float64)
+    stamp_s = table[STAMP].to_numpy().astype(np.float64) if STAMP in wanted else timestamp
+    poses = np.array(table[pose].to_pylist(), np.float64).reshape(-1, 4, 4) if pose in wanted else None
+    return timestamp, stamp_s, poses
 
 
 def _columns(path: Path) -> list[str]:

@@ -54,7 +54,12 @@ _SIDE = 100
 def feature_stats(values: Shaped[np.ndarray, "T *n"]) -> Stats:
     """Of a number or a vector per frame; what is not finite is left out, and a place without a value has zeros."""
     rows = values.reshape(len(values), -1).astype(np.float64)
-    return _stats(rows) | {"count": np.array([len(rows)])}
+    columns = [column[np.isfinite(column)] for column in rows.T]
+    columns = [column if column.size else np.zeros(1) for column in columns]
+    measures = {"min": np.min, "max": np.max, "mean": np.mean, "std": np.std}
+    found = {name: np.array([measure(column) for column in columns]) for name, measure in measures.items()}
+    found |= {name: np.array([np.quantile(column, q) for column in columns]) for name, q in QUANTILES.items()}
+    return found | {"count": np.array([len(rows)])}
 
 
 def image_stats(pictures: Shaped[np.ndarray, "T H W *C"], scale: float) -> Stats:
@@ -66,8 +71,8 @@ def image_stats(pictures: Shaped[np.ndarray, "T H W *C"], scale: float) -> Stats
     step = max(1, max(pictures.shape[1:3]) // _SIDE)
     sample = pictures[index][:, ::step, ::step]
     channels = sample.shape[3] if sample.ndim == 4 else 1
-    found = _stats(sample.reshape(-1, channels).astype(np.float64) / scale)
-    return {name: value.reshape(channels, 1, 1) for name, value in found.items()} | {"count": np.array([len(index)])}
+    found = feature_stats(sample.reshape(-1, channels).astype(np.float64) / scale)
+    return {name: value.reshape(-1, 1, 1) for name, value in found.items()} | {"count": np.array([len(index)])}
 
 
 def merge_stats(first: Stats | None, second: Stats) -> Stats:
@@ -77,28 +82,13 @@ def merge_stats(first: Stats | None, second: Stats) -> Stats:
     counts = np.array([first["count"][0], second["count"][0]], dtype=np.float64)
     share = counts / counts.sum()
     mean = share[0] * first["mean"] + share[1] * second["mean"]
-    variance = sum(
-        weight * (part["std"] ** 2 + (part["mean"] - mean) ** 2)
-        for weight, part in zip(share, (first, second), strict=True)
-    )
-    merged = {
-        "min": np.minimum(first["min"], second["min"]),
-        "max": np.maximum(first["max"], second["max"]),
-        "mean": mean,
-        "std": np.sqrt(variance),
-        "count": first["count"] + second["count"],
-    }
-    for name, q in QUANTILES.items():
-        merged[name] = (np.minimum if q <= 0.5 else np.maximum)(first[name], second[name])
-    return merged
-
-
-def _stats(rows: np.ndarray) -> Stats:
-    columns = [column[np.isfinite(column)] for column in rows.T]
-    columns = [column if column.size else np.zeros(1) for column in columns]
-    measures = {"min": np.min, "max": np.max, "mean": np.mean, "std": np.std}
-    found = {name: np.array([measure(column) for column in columns]) for name, measure in measures.items()}
-    return found | {name: np.array([np.quantile(column, q) for column in columns]) for name, q in QUANTILES.items()}
+    parts = zip(share, (first, second), strict=True)
+    variance = sum(weight * (part["std"] ** 2 + (part["mean"] - mean) ** 2) for weight, part in parts)
+    outer = {"min": np.minimum, "max": np.maximum}
+    outer |= {name: np.minimum if q <= 0.5 else np.maximum for name, q in QUANTILES.items()}
+    known = {"mean": mean, "std": np.sqrt(variance), "count": first["count"] + second["count"]}
+    names = ("min", "max", *known, *QUANTILES)
+    return {name: known[name] if name in known else outer[name](first[name], second[name]) for name in names}
 
 
 @dataclass(frozen=True)
@@ -122,19 +112,12 @@ class Episode:
         kept = take.tracked
         names = tuple(take.info.entities[i].name for i in kept)
         labels = tuple(take.info.entities[i].label for i in kept)
+        point, shape = take.point_world[:, kept].astype(np.float32), (len(take), len(kept))
+        sure, state = np.ones(shape, np.float32), np.full(shape, State.TRACKING.value)
         tracks = {}
         for v, view in enumerate(take.views):
-            visible = view.visible[:, kept]
-            tracks[f"view_{v}"] = Tracks(
-                names,
-                labels,
-                view.uv_px[:, kept].astype(np.float32),
-                take.point_world[:, kept].astype(np.float32),
-                np.ones(visible.shape, np.float32),
-                visible,
-                np.full(visible.shape, State.TRACKING.value),
-                take.stamp_s,
-            )
+            uv_px, visible = view.uv_px[:, kept].astype(np.float32), view.visible[:, kept]
+            tracks[f"view_{v}"] = Tracks(names, labels, uv_px, point, sure, visible, state, take.stamp_s)
         return cls(
             {f"view_{v}": view.clip for v, view in enumerate(take.views)},
             task or f"open {take.info.category}",
@@ -254,7 +237,7 @@ class _Writer:
         pq.write_table(pa.Table.from_pylist(self.rows), episodes)
         _write_tasks(self._tasks, meta / "tasks.parquet")
         for view, camera in self._cameras.items():
-            self._features[image_key(view)]["info"][CAMERA_KEY] = camera
+            self._features[f"observation.images.{view}"]["info"][CAMERA_KEY] = camera
         info = {
             "codebase_version": VERSION,
             "fps": self._fps,
@@ -318,14 +301,14 @@ class _Writer:
         """Write the videos of a view; feature, what describes it, pictures, and what divides them in statistics."""
         height, width = clip.rgb.shape[1:3]
         info = {"video.height": height, "video.width": width, "video.fps": self._fps, "has_audio": False}
-        key, odd = image_key(view), height % 2 or width % 2
+        key, odd = f"observation.images.{view}", height % 2 or width % 2
         path = self._root / VIDEO_PATH.format(video_key=key, **place)
         write_video(path, clip.rgb, frames_per_s=self._fps, crf=_CRF, keyframe_every=_KEYFRAME_EVERY)
         colours = {"video.codec": "h264", "video.pix_fmt": "yuv444p" if odd else "yuv420p", "video.channels": 3}
         yield key, info | colours | {"is_depth_map": False}, clip.rgb, 255.0
         if clip.depth_m is None:
             return
-        key = depth_key(view)
+        key += "_depth"
         path = self._root / VIDEO_PATH.format(video_key=key, **place)
         codes = (self._depth_range.codes(clean_depth(depth_m)) for depth_m in clip.depth_m)
         write_depth_video(path, codes, frames_per_s=self._fps)
@@ -333,16 +316,6 @@ class _Writer:
         depth |= {"is_depth_map": True, "depth_unit": "m"}
         depth |= {f"video.{name}": value for name, value in asdict(self._depth_range).items()}
         yield key, info | depth, clip.depth_m, 1.0
-
-
-def image_key(view: str) -> str:
-    """Feature of a view's colours."""
-    return f"observation.images.{view}"
-
-
-def depth_key(view: str) -> str:
-    """Feature of a view's depth."""
-    return f"observation.images.{view}_depth"
 
 
 def _contents(episode: Episode) -> str:

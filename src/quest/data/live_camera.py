@@ -1,6 +1,7 @@
 """Live sources: frames come at their own pace, and whoever is busy gets the newest one.
 
-A camera is ``camera:0`` (the system's first), ``camera:/dev/video2``, or the address of a stream: ``camera:rtsp://…``.
+A camera is ``camera:0`` (the system's first), ``camera:/dev/video2``, or the address of a stream: ``camera:rtsp://…``;
+RealSense cameras are ``realsense``, or ``realsense:SERIAL`` where several are connected.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -17,10 +19,12 @@ import numpy as np
 from quest.data.camera_file import CameraFile, read_setup
 from quest.data.frame_source import FrameSource, Notes, Reader, ReadOptions
 from quest.errors import RecordingError
+from quest.extras import require
 from quest.types import GUESSED_CAMERA, Camera, Frame
 
 DROPPED = "frames dropped because the one before took too long"
 _PREFIX = "camera:"
+_REALSENSE_SIZE, _REALSENSE_RATE = (640, 480), 30
 _PATIENCE_S = 5.0
 """For how long a camera may send nothing."""
 
@@ -28,12 +32,7 @@ _PATIENCE_S = 5.0
 def newest(frames: Callable[[], Iterator[Frame]], notes: Notes) -> Generator[Frame]:
     """Frames of a thread that reads as fast as they come; those that nobody takes in time are dropped and counted.
 
-    Args:
-        frames: begins to read; called in the thread.
-        notes: where dropped frames are counted.
-
-    Raises:
-        Exception: whatever reading raises, after the frames before it.
+    Whatever reading raises comes after the frames before it.
     """
     ready, over = threading.Condition(), threading.Event()
     slot: list[Frame] = []
@@ -137,4 +136,63 @@ def _frames(device: str, setup: CameraFile) -> Iterator[Frame]:
             yield Frame(setup.rgb(picture), None, time.monotonic() - begun_s)
 
 
-READER = Reader("a live camera", "camera:0, or camera: and an address", _accepts, _open, ("camera", "fov_deg"))
+def _is_realsense(where: str) -> bool:
+    return where == "realsense" or where.startswith("realsense:")
+
+
+def _open_realsense(where: str, options: ReadOptions) -> FrameSource:
+    serial = where.partition(":")[2]
+    pipeline, profile = _start(serial)
+    try:
+        rs = require("pyrealsense2")
+        lens = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
+    finally:
+        pipeline.stop()
+    matrix = np.array([[lens.fx, 0, lens.ppx], [0, lens.fy, lens.ppy], [0, 0, 1]])
+    camera, notes = Camera.from_opencv(matrix, width=lens.width, height=lens.height), Notes()
+    if any(lens.coeffs):
+        notes.say("the lens' distortion is not corrected")
+    return FrameSource(where, camera, lambda: newest(lambda: _grab(serial), notes), notes=notes, live=True)
+
+
+def _start(serial: str) -> tuple[Any, Any]:
+    """A pipeline that runs, and its profile."""
+    rs = require("pyrealsense2")
+    pipeline, config = rs.pipeline(), rs.config()
+    if serial:
+        config.enable_device(serial)
+    config.enable_stream(rs.stream.color, *_REALSENSE_SIZE, rs.format.rgb8, _REALSENSE_RATE)
+    config.enable_stream(rs.stream.depth, *_REALSENSE_SIZE, rs.format.z16, _REALSENSE_RATE)
+    try:
+        return pipeline, pipeline.start(config)
+    except RuntimeError as error:
+        raise RecordingError(
+            f"realsense {serial}: cannot be started ({error}); check that it is connected, that nothing else uses it, "
+            "and its serial number"
+        ) from error
+
+
+def _grab(serial: str) -> Iterator[Frame]:
+    """Colours, depth registered to them, and the time of the colours by the camera's clock."""
+    rs = require("pyrealsense2")
+    pipeline, profile = _start(serial)
+    try:
+        scale_m = profile.get_device().first_depth_sensor().get_depth_scale()
+        align = rs.align(rs.stream.color)
+        while True:
+            both = align.process(pipeline.wait_for_frames())
+            colours, depth = both.get_color_frame(), both.get_depth_frame()
+            if not colours:
+                continue
+            depth_m = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(scale_m) if depth else None
+            yield Frame(np.array(colours.get_data()), depth_m, colours.get_timestamp() / 1e3)
+    except RuntimeError as error:
+        raise RecordingError(f"realsense {serial}: it sends no frames any more ({error}); connect it again") from error
+    finally:
+        pipeline.stop()
+
+
+READERS = (
+    Reader("a live camera", "camera:0, or camera: and an address", _accepts, _open, ("camera", "fov_deg")),
+    Reader("a RealSense camera", "realsense, or realsense:SERIAL", _is_realsense, _open_realsense),
+)

@@ -1,8 +1,8 @@
-"""Clips as MCAP files of ROS 2 messages, which Foxglove, rosbag2 and :mod:`quest.data.mcap_file` read."""
+"""Clips as MCAP files of ROS 2 messages, which Foxglove, rosbag2 and :mod:`quest.data.bags` read."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -60,28 +60,18 @@ def export_mcap(
         raise InputError(f"clip {clip.name!r}: MCAP has no times before 0, got {clip.stamp_s[0]} s; shift the stamps")
     if tracks is not None and len(tracks) != len(clip):
         raise InputError(f"clip {clip.name!r}: tracks of {len(tracks)} frames for a clip of {len(clip)}")
+    typesys = require("rosbags.typesys")
+    store, schemas = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE), {}
     with whole_file(Path(path)) as partial, partial.open("wb") as file, writer_module.Writer(file) as writer:
-        send = _sender(writer)
         for t in range(len(clip)):
             stamp_ns = round(float(clip.stamp_s[t]) * 1e9)
-            for topic, kind, message in _messages(clip, t, stamp_ns, rgb, depth, quality):
-                send(topic, kind, message, stamp_ns)
+            messages = [*_messages(clip, t, stamp_ns, rgb, depth, quality)]
             if tracks is not None:
-                send(TRACKS, "visualization_msgs/msg/MarkerArray", _markers(tracks, t, stamp_ns), stamp_ns)
-
-
-def _sender(writer: Any) -> Callable[[str, str, dict, int], None]:
-    """Writes a message of a type, whose definition goes into the file with the first one; fields left out are zero."""
-    typesys = require("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    schemas: dict[str, Any] = {}
-
-    def send(topic: str, kind: str, message: dict, stamp_ns: int) -> None:
-        if kind not in schemas:
-            schemas[kind] = writer.register_msgdef(kind, store.generate_msgdef(kind, ros_version=2)[0])
-        writer.write_message(topic, schemas[kind], message, log_time=stamp_ns)
-
-    return send
+                messages.append((TRACKS, "visualization_msgs/msg/MarkerArray", _markers(tracks, t, stamp_ns)))
+            for topic, kind, message in messages:  # fields that are left out are zero
+                if kind not in schemas:
+                    schemas[kind] = writer.register_msgdef(kind, store.generate_msgdef(kind, ros_version=2)[0])
+                writer.write_message(topic, schemas[kind], message, log_time=stamp_ns)
 
 
 def _messages(
@@ -118,43 +108,24 @@ def _header(frame: str, stamp_ns: int) -> dict[str, Any]:
 
 def _image(header: dict[str, Any], encoding: str, pixels: np.ndarray) -> dict[str, Any]:
     little = np.ascontiguousarray(pixels.astype(pixels.dtype.newbyteorder("<")))
-    return {
-        "header": header,
-        "height": pixels.shape[0],
-        "width": pixels.shape[1],
-        "encoding": encoding,
-        "step": little.strides[0],
-        "data": little.tobytes(),
-    }
+    size = {"height": pixels.shape[0], "width": pixels.shape[1], "step": little.strides[0]}
+    return {"header": header, "encoding": encoding, **size, "data": little.tobytes()}
 
 
 def _camera_info(camera: Camera, header: dict[str, Any]) -> dict[str, Any]:
     """CameraInfo, whose pixel centres lie at integers."""
     k = [camera.fx, 0.0, camera.cx - 0.5, 0.0, camera.fy, camera.cy - 0.5, 0.0, 0.0, 1.0]
-    return {
-        "header": header,
-        "height": camera.height,
-        "width": camera.width,
-        "distortion_model": "plumb_bob",
-        "d": [0.0] * 5,
-        "k": k,
-        "r": np.eye(3).ravel().tolist(),
-        "p": [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0],
-    }
+    lens = {"distortion_model": "plumb_bob", "d": [0.0] * 5, "k": k, "r": np.eye(3).ravel().tolist()}
+    p = [*k[:3], 0.0, *k[3:6], 0.0, *k[6:], 0.0]
+    return {"header": header, "height": camera.height, "width": camera.width, **lens, "p": p}
 
 
 def _transform(cam_from_world: Float[np.ndarray, "4 4"], stamp_ns: int) -> dict[str, Any]:
     rotation = cam_from_world[:3, :3].T
-    x, y, z = (-rotation @ cam_from_world[:3, 3]).tolist()
-    qx, qy, qz, qw = Rotation.from_matrix(rotation).as_quat().tolist()
-    return {
-        "header": _header(WORLD, stamp_ns),
-        "child_frame_id": CAMERA,
-        "transform": {
-            "translation": {"x": x, "y": y, "z": z},
-            "rotation": {"x": qx, "y": qy, "z": qz, "w": qw},
-        },
-    }
+    moved = dict(zip("xyz", (-rotation @ cam_from_world[:3, 3]).tolist(), strict=True))
+    turned = dict(zip("xyzw", Rotation.from_matrix(rotation).as_quat().tolist(), strict=True))
+    transform = {"translation": moved, "rotation": turned}
+    return {"header": _header(WORLD, stamp_ns), "child_frame_id": CAMERA, "transform": transform}
 
 
 def _markers(tracks: Tracks, t: int, stamp_ns: int) -> dict[str, Any]:

@@ -12,10 +12,7 @@ from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 
-_QUEST = "quest-tracker"
-PACKAGES = (_QUEST, "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
-
-
+PACKAGES = ("quest-tracker", "torch", "numpy", "scipy", "opencv-python", "sapien", "trimesh")
 _BUT_RESULTS = (":(top)", ":(top,exclude)benchmarks/results")
 
 
@@ -25,15 +22,19 @@ def code_commit() -> str:
     Results of benchmarks may differ: they are written one after the other, and no code reads them.
     """
     folder = Path(__file__).resolve().parent
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
+        return done.stdout.strip()
+
     try:
-        commit = _git(folder, "rev-parse", "HEAD")
-        tracked = _git(folder, "ls-files", Path(__file__).name)
-        if tracked:  # an installed package may lie inside a checkout of something else
-            changed = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", *_BUT_RESULTS)
+        commit = git("rev-parse", "HEAD")
+        if git("ls-files", Path(__file__).name):  # an installed package may lie inside a checkout of something else
+            changed = git("status", "--porcelain", "--untracked-files=no", "--", *_BUT_RESULTS)
             return commit + ("+dirty" if changed else "")
     except (OSError, subprocess.CalledProcessError, subprocess.TimeoutExpired):
         pass  # no git or no checkout: a released version says as much
-    return f"version {metadata.version(_QUEST)}"
+    return f"version {metadata.version(PACKAGES[0])}"
 
 
 def command_line() -> str:
@@ -54,11 +55,6 @@ def code_hash() -> str:
         data = path.read_bytes()
         digest.update(f"{path.relative_to(folder).as_posix()}\0{len(data)}\n".encode() + data)
     return digest.hexdigest()
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=True, timeout=10)
-    return done.stdout.strip()
 
 
 def combined_hash(hashes: Iterable[tuple[str, str]]) -> str:

@@ -2,7 +2,7 @@
 
 A recording folder holds ``rgb/`` (images, in natural order of their names) or one video, optionally ``depth/`` (16-bit
 PNGs), and ``camera.json`` (see :mod:`quest.data.camera_file`). The other forms are as their makers describe them
-(:mod:`quest.data.layouts` for folders).
+(:mod:`quest.data.folder` for folders).
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import shutil
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from importlib import import_module
 from pathlib import Path
 from typing import Literal
@@ -29,23 +29,13 @@ from quest.errors import InputError, QuestError, RecordingError
 from quest.types import Camera, Clip
 from quest.untrusted import reading
 
-__all__ = [
-    "FrameSource",
-    "Parts",
-    "Reader",
-    "open_recording",
-    "read_recording",
-    "readers",
-    "write_recording",
-]
-
-_READERS = ("live_camera", "realsense", "sample", "store", "lerobot", "mcap_file", "rosbag", "folder")
-"""Modules of this room with a ``READER``; the first that accepts a path reads it. A new reader is a line here."""
+_READERS = ("live_camera", "sample", "store", "lerobot", "bags", "folder")
+"""Modules of this room with ``READERS``; the first that accepts a path reads it. A new module is a line here."""
 
 
 def readers() -> tuple[Reader, ...]:
     """All readers of recordings, in the order in which they are asked."""
-    return tuple(import_module(f"quest.data.{name}").READER for name in _READERS)
+    return tuple(reader for name in _READERS for reader in import_module(f"quest.data.{name}").READERS)
 
 
 def open_recording(
@@ -88,13 +78,16 @@ def open_recording(
         depth_scale_m=_checked_scale(where, depth_scale_m, RecordingError),
         fov_deg=fov_deg,
     )
-    known = readers()
+    known, there = readers(), Path(where)
     reader = next((reader for reader in known if reader.accepts(where)), None)
     if reader is None:
-        if not Path(where).exists():
-            raise RecordingError(f"recording {where}: no such file or folder; {_near(Path(where))}")
+        if not there.exists():
+            beside = [p.name for p in there.parent.iterdir()] if there.parent.is_dir() else []
+            close = difflib.get_close_matches(there.name, beside, n=1)
+            advice = f"did you mean {there.parent / close[0]}?" if close else "check the path"
+            raise RecordingError(f"recording {where}: no such file or folder; {advice}")
         kinds = "; ".join(f"{reader.kind} ({reader.form})" for reader in known)
-        what = "an empty folder" if not any(Path(where).iterdir()) else "a folder with nothing of these in it"
+        what = "an empty folder" if not any(there.iterdir()) else "a folder with nothing of these in it"
         raise RecordingError(f"recording {where}: this is {what}; expected {kinds}")
     for name, value in options.given().items():
         if name not in reader.options:
@@ -118,13 +111,6 @@ def read_recording(
     return open_recording(
         path, depth=depth, camera=camera, depth_scale_m=depth_scale_m, fov_deg=fov_deg, parts=parts
     ).clip()
-
-
-def _near(path: Path) -> str:
-    """Advice for a path that leads nowhere."""
-    there = [p.name for p in path.parent.iterdir()] if path.parent.is_dir() else []
-    close = difflib.get_close_matches(path.name, there, n=1)
-    return f"did you mean {path.parent / close[0]}?" if close else "check the path"
 
 
 def _checked_scale(where: str | Path, depth_scale_m: float | int | None, kind: type[QuestError]) -> float | None:
@@ -170,15 +156,9 @@ def write_recording(
             for t, image in enumerate(units):
                 _write_png(partial / "depth" / f"{t:06d}.png", image)
         static = (clip.cam_from_world == clip.cam_from_world[0]).all()
+        file = CameraFile(clip.camera, depth_scale_m=scale, frames_per_s=frame_rate(clip.stamp_s), stamp_s=clip.stamp_s)
         poses = clip.cam_from_world[0] if static else clip.cam_from_world
-        file = CameraFile(
-            clip.camera,
-            depth_scale_m=scale,
-            frames_per_s=frame_rate(clip.stamp_s),
-            stamp_s=clip.stamp_s,
-            cam_from_world=poses,
-        )
-        write_camera(file, partial / "camera.json")
+        write_camera(replace(file, cam_from_world=poses), partial / "camera.json")
 
 
 @contextmanager

@@ -1,7 +1,12 @@
 """Pictures in ROS messages: ``sensor_msgs/Image``, ``CompressedImage`` and the depth that image_transport compresses.
 
+Depth is compressed as PNG or as RVL. In RVL a picture is a row of runs: how many zeros, how many others, and of each of
+these the difference from the one before. Numbers are written in groups of three bits, the lowest first, with a fourth
+bit that says that more follow.
+
 Reference: the message definitions of sensor_msgs; REP 118 (depth images: 16UC1 in millimetres, 32FC1 in metres);
-``compressed_depth_image_transport`` for its header of twelve bytes.
+``compressed_depth_image_transport`` for its header of twelve bytes; Wilson, "Fast lossless depth image compression",
+ISS 2017.
 """
 
 from __future__ import annotations
@@ -13,9 +18,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32, UInt8, UInt16
 
-from quest.data.rvl import decode_rvl
 from quest.depth import clean_depth, metres
 from quest.errors import RecordingError
 from quest.untrusted import reading
@@ -25,6 +29,10 @@ DEPTH_ENCODINGS = ("16UC1", "32FC1", "mono16")
 
 _MILLIMETRE_M = 1e-3
 _HEADER = struct.Struct("<iff")
+_RVL_SIZE = struct.Struct("<II")
+_MOST_RVL_PIXELS = 2**24
+_LONGEST = 11
+"""Groups of three bits in a number of 32."""
 
 
 @dataclass(frozen=True)
@@ -112,12 +120,7 @@ def rgb_of(message: Any, where: str) -> UInt8[np.ndarray, "H W 3"]:
 
 
 def depth_of(message: Any, where: str, *, scale_m: float | None = None) -> Float32[np.ndarray, "H W"]:
-    """Depth in metres of an Image or CompressedImage, 0 where missing.
-
-    Args:
-        message: the picture.
-        where: its name in errors.
-        scale_m: metres per unit; by default that of :func:`unit_of`.
+    """Depth in metres of an Image or CompressedImage, 0 where missing; by default in the units of :func:`unit_of`.
 
     Raises:
         RecordingError: the picture is corrupt, or of an encoding that is not of depth.
@@ -192,3 +195,48 @@ def _decode(data: Any, where: str, flags: int) -> np.ndarray:
             f"{where}: {raw.size} bytes are no JPEG or PNG, or too large; the message is torn, record it again"
         )
     return np.asarray(image)
+
+
+def decode_rvl(data: bytes) -> UInt16[np.ndarray, "H W"]:
+    """A picture from its width and height, four bytes each, and its runs.
+
+    Raises:
+        ValueError: the bytes are no such picture.
+    """
+    if len(data) < _RVL_SIZE.size:
+        raise ValueError(f"{len(data)} bytes")
+    width, height = _RVL_SIZE.unpack_from(data)
+    if not 0 < width * height <= _MOST_RVL_PIXELS:
+        raise ValueError(f"a picture of {width} x {height}")
+    numbers = _rvl_numbers(data[_RVL_SIZE.size :])
+    pixels = np.zeros(width * height, np.int64)
+    where = np.zeros(width * height, bool)
+    spans: list[np.ndarray] = []
+    at, pixel = 0, 0
+    while pixel < len(pixels):
+        if at >= len(numbers):
+            raise ValueError(f"it ends after {pixel} of {len(pixels)} pixels")
+        pixel += int(numbers[at])
+        count = int(numbers[at + 1]) if at + 1 < len(numbers) else 0
+        if pixel + count > len(pixels) or at + 2 + count > len(numbers):
+            raise ValueError(f"a run of {count} from pixel {pixel} on of {len(pixels)}")
+        where[pixel : pixel + count] = True
+        spans.append(numbers[at + 2 : at + 2 + count])
+        at, pixel = at + 2 + count, pixel + count
+    coded = np.concatenate(spans)
+    pixels[where] = np.cumsum((coded >> 1) ^ -(coded & 1))
+    return pixels.astype(np.uint16).reshape(height, width)
+
+
+def _rvl_numbers(data: bytes) -> np.ndarray:
+    """All numbers of a stream of words of 32 bits, each of eight groups, the first in the highest bits."""
+    words = np.frombuffer(data[: len(data) // 4 * 4], "<u4")
+    groups = ((words[:, None] >> np.arange(28, -4, -4, dtype=np.uint32)) & 15).ravel().astype(np.int64)
+    ends = np.flatnonzero(groups < 8)
+    if not len(ends):
+        return np.zeros(0, np.int64)
+    starts = np.concatenate(([0], ends[:-1] + 1))
+    place = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    if place.max() >= _LONGEST:
+        raise ValueError("a number of more than 32 bits")
+    return np.add.reduceat((groups[: ends[-1] + 1] & 7) << (3 * place), starts)

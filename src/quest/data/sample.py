@@ -31,9 +31,13 @@ def sample_folder(name: str = "sample") -> Path:
 
 
 def _open(where: str, options: ReadOptions) -> FrameSource:
-    from quest.data.folder import READER as FOLDER
+    from quest.data.folder import open_folder
 
-    return FOLDER.open(str(sample_folder(where)), options)
+    return open_folder(str(sample_folder(where)), options)
 
 
-READER = Reader("a packaged clip", SAMPLES[0], lambda where: where in SAMPLES and not Path(where).exists(), _open)
+def _accepts(where: str) -> bool:
+    return where in SAMPLES and not Path(where).exists()
+
+
+READERS = (Reader("a packaged clip", SAMPLES[0], _accepts, _open),)

@@ -15,6 +15,8 @@ from quest.types import TakeInfo
 Part = Literal["train", "validation", "test"]
 PARTS: tuple[Part, ...] = ("train", "validation", "test")
 """The parts of the split, in the order of the file."""
+SplitPart = Part | Literal["unlisted"]
+"""A part of the object split; ``unlisted`` objects are in none."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +39,6 @@ def object_split() -> ObjectSplit:
     return ObjectSplit(ids, raw["sweethome3d"], {part: (first, last) for part, (first, last) in seeds.items()})
 
 
-SplitPart = Literal["train", "validation", "test", "unlisted"]
-"""A part of the object split; ``unlisted`` objects are in none."""
-
-
 def part_of_object(source: str, object_id: str) -> Part | None:
     """Which part of the split an object belongs to; None for none.
 
@@ -48,10 +46,9 @@ def part_of_object(source: str, object_id: str) -> Part | None:
         ObjectError: it is procedural and has no seed in its name.
     """
     split = object_split()
-    if source == "partnet-mobility":
-        return next((part for part in PARTS if object_id in split.partnet_mobility[part]), None)
-    if source == "sweethome3d":
-        return next((part for part in PARTS if object_id in split.sweethome3d[part]), None)
+    named = {"partnet-mobility": split.partnet_mobility, "sweethome3d": split.sweethome3d}
+    if source in named:
+        return next((part for part in PARTS if object_id in named[source][part]), None)
     if source != "procedural":
         return None
     match = re.fullmatch(r".+-(\d+)", object_id)
@@ -71,12 +68,12 @@ def split_of(info: TakeInfo) -> Part:
         ObjectError: the object is in no part, so that neither training nor a reported number may use it.
     """
     found = part_of_object(info.source, info.object_id)
-    if found is not None:
-        return found
-    raise ObjectError(
-        f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's objects "
-        f"or a procedural seed in its ranges"
-    )
+    if found is None:
+        raise ObjectError(
+            f"object {info.object_id!r} ({info.source}) is in no part of the split; expected one of split.json's "
+            "objects or a procedural seed in its ranges"
+        )
+    return found
 
 
 def part_of(info: TakeInfo) -> SplitPart:

@@ -10,7 +10,7 @@ import numpy as np
 
 from quest.data.store import TakeStore
 from quest.data.take_format import TakeHeader
-from quest.data.verify import has_sensed_depth
+from quest.data.verify import has_sensed_depth, moved_points
 from quest.types import LABELS
 
 _DEPTH_FRAMES = 4
@@ -22,9 +22,7 @@ class Spread:
     """How a quantity is spread over its n values; NaN where there is none."""
 
     n: int
-    """Number of values."""
     least: float
-    """The least."""
     low: float
     """10 % lie below."""
     median: float
@@ -32,7 +30,6 @@ class Spread:
     high: float
     """90 % lie below."""
     most: float
-    """The most."""
 
     @classmethod
     def of(cls, values: Iterable[np.ndarray | float]) -> Spread:
@@ -48,7 +45,6 @@ class StoreStats:
     """What is in a store. Entities are those that a tracker follows: hinges are counted, and left out of the rest."""
 
     takes: int
-    """Whole takes."""
     unreadable: int
     """Groups that look like takes and cannot be read."""
     objects: int
@@ -62,13 +58,10 @@ class StoreStats:
     stored_bytes: int
     """On disk."""
     sources: Mapping[str, int]
-    """Takes per source."""
+    """Takes per source; so of categories, levels and suites."""
     categories: Mapping[str, int]
-    """Takes per category."""
     levels: Mapping[str, int]
-    """Takes per level."""
     suites: Mapping[str, int]
-    """Takes per suite."""
     labels: Mapping[str, int]
     """Entities per label."""
     moving_cameras: int
@@ -100,11 +93,7 @@ class StoreStats:
 
 
 def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda done, of: None) -> StoreStats:
-    """Read descriptions, the small arrays and a few depth images of every take.
-
-    Args:
-        store: the store.
-        report: told how many takes are done, of how many.
+    """Read descriptions, the small arrays and a few depth images of every take; reports how many are done, of how many.
 
     Raises:
         TakeError: a take's arrays cannot be decoded.
@@ -120,7 +109,38 @@ def store_stats(store: TakeStore, *, report: Callable[[int, int], None] = lambda
                 missing, on_object = view.clip.depth_m == 0, view.link_id > 0
                 pixels += [missing.size, missing.sum(), on_object.sum(), (missing & on_object).sum()]
         report(done, len(headers))
-    return _stats(list(headers.values()), len(store.problems()), parts, pixels.tolist())
+    infos = [header.info for header in headers.values()]
+    frames = [header.frames * len(header.cameras) for header in headers.values()]
+    objects = {(info.source, info.object_id): 2 * info.half_diagonal_m for info in infos}
+    sizes = [header.cameras[0] for header in headers.values() if header.cameras]
+    every, missing, on_object, missing_on_object = pixels.tolist()
+    return StoreStats(
+        takes=len(headers),
+        unreadable=len(store.problems()),
+        objects=len(objects),
+        views=len(parts["moving"]),
+        frames=sum(frames),
+        hours=sum(n / info.frames_per_s for n, info in zip(frames, infos, strict=True)) / 3600,
+        stored_bytes=sum(sum(header.files.values()) for header in headers.values()),
+        sources=_counted(info.source for info in infos),
+        categories=_counted(info.category for info in infos),
+        levels=_counted(str(info.level) for info in infos),
+        suites=_counted(info.suite for info in infos),
+        labels=_counted(entity.label for info in infos for entity in info.entities),
+        moving_cameras=sum(int(moving.sum()) for moving in parts["moving"]),
+        with_depth_sensor=sum(has_sensed_depth(info) for info in infos),
+        visible_share=_share([part for label in LABELS for part in parts[label]]),
+        visible_share_by_label={n: _share(parts[n]) for n in LABELS if sum(map(len, parts[n]))},
+        never_seen=1 - _share(parts["ever"]),
+        moved_share=_share([motion > 0.1 for motion in parts["motion"]]),
+        motion=Spread.of(parts["motion"]),
+        motion_m=Spread.of(parts["motion_m"]),
+        diagonal_m=Spread.of(objects.values()),
+        distance_m=Spread.of(parts["distance_m"]),
+        image_px=_counted(f"{camera.width} x {camera.height}" for camera in sizes),
+        depth_missing_share=_ratio(missing, every),
+        depth_missing_share_on_object=_ratio(missing_on_object, on_object),
+    )
 
 
 def _parts(header: TakeHeader, arrays: Mapping[str, np.ndarray]) -> Iterator[tuple[str, np.ndarray]]:
@@ -137,45 +157,7 @@ def _parts(header: TakeHeader, arrays: Mapping[str, np.ndarray]) -> Iterator[tup
         for label in LABELS:
             yield label, visible[:, labels == label].ravel()
         yield "ever", np.asarray(visible[:, tracked].any(axis=0))
-        pose, ends = pose[[0, -1]], point[[0, -1]]
-        in_camera = np.einsum("tij,tej->tei", pose[:, :3, :3], ends) + pose[:, None, :3, 3]
-        yield "distance_m", np.linalg.norm(in_camera, axis=-1)
-
-
-def _stats(
-    headers: list[TakeHeader], unreadable: int, parts: Mapping[str, list[np.ndarray]], pixels: list[int]
-) -> StoreStats:
-    infos = [header.info for header in headers]
-    frames = [header.frames * len(header.cameras) for header in headers]
-    objects = {(info.source, info.object_id): 2 * info.half_diagonal_m for info in infos}
-    every, missing, on_object, missing_on_object = pixels
-    return StoreStats(
-        takes=len(headers),
-        unreadable=unreadable,
-        objects=len(objects),
-        views=len(parts["moving"]),
-        frames=sum(frames),
-        hours=sum(n / info.frames_per_s for n, info in zip(frames, infos, strict=True)) / 3600,
-        stored_bytes=sum(sum(header.files.values()) for header in headers),
-        sources=_counted(info.source for info in infos),
-        categories=_counted(info.category for info in infos),
-        levels=_counted(str(info.level) for info in infos),
-        suites=_counted(info.suite for info in infos),
-        labels=_counted(entity.label for info in infos for entity in info.entities),
-        moving_cameras=sum(int(moving.sum()) for moving in parts["moving"]),
-        with_depth_sensor=sum(has_sensed_depth(info) for info in infos),
-        visible_share=_share([part for label in LABELS for part in parts[label]]),
-        visible_share_by_label={n: _share(parts[n]) for n in LABELS if sum(map(len, parts[n]))},
-        never_seen=1 - _share(parts["ever"]),
-        moved_share=_share([motion > 0.1 for motion in parts["motion"]]),
-        motion=Spread.of(parts["motion"]),
-        motion_m=Spread.of(parts["motion_m"]),
-        diagonal_m=Spread.of(objects.values()),
-        distance_m=Spread.of(parts["distance_m"]),
-        image_px=_counted(f"{h.cameras[0].width} x {h.cameras[0].height}" for h in headers if h.cameras),
-        depth_missing_share=_ratio(missing, every),
-        depth_missing_share_on_object=_ratio(missing_on_object, on_object),
-    )
+        yield "distance_m", np.linalg.norm(moved_points(pose[[0, -1]], point[[0, -1]]), axis=-1)
 
 
 def _counted(values: Iterable[str]) -> dict[str, int]:

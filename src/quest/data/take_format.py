@@ -11,7 +11,6 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Any
 
 import numpy as np
 
@@ -45,15 +44,11 @@ class TakeHeader:
     """Everything about a stored take but its arrays."""
 
     info: TakeInfo
-    """Description of the take."""
     frames: int
-    """Number of frames."""
     cameras: tuple[Camera, ...]
-    """One per view."""
+    """One per view, as are names and whether there is depth."""
     clip_names: tuple[str, ...]
-    """One per view."""
     has_depth: tuple[bool, ...]
-    """Whether each view carries depth."""
     data_hash: str
     """Digest of arrays and description, see :func:`hash_take`."""
     files: Mapping[str, int]
@@ -63,16 +58,14 @@ class TakeHeader:
 
     def to_json(self) -> bytes:
         """The file :data:`HEADER_FILE` of the group."""
+        views = zip(self.clip_names, self.cameras, self.has_depth, strict=True)
         attributes = {
             "format": FORMAT,
             "version": 2 if self.arrays_at else 1,
             "depth_scale_m": DEPTH_SCALE_M,
             "info": asdict(self.info),
             "frames": self.frames,
-            "views": [
-                {"name": name, "camera": asdict(camera), "has_depth": depth}
-                for name, camera, depth in zip(self.clip_names, self.cameras, self.has_depth, strict=True)
-            ],
+            "views": [asdict(_View(*view)) for view in views],
             "data_hash": self.data_hash,
             "files": dict(self.files),
             **({"arrays_at": self.arrays_at} if self.arrays_at else {}),
@@ -87,34 +80,11 @@ class _View:
     has_depth: bool
 
 
-def _header(attributes: Mapping[str, Any]) -> TakeHeader:
-    """Header from the attributes of a group; KeyError, TypeError or ValueError if they are damaged."""
-    views = build(list[_View], attributes["views"], "views")
-    header = TakeHeader(
-        info=build(TakeInfo, attributes["info"], "info"),
-        frames=build(int, attributes["frames"], "frames"),
-        cameras=tuple(view.camera for view in views),
-        clip_names=tuple(view.name for view in views),
-        has_depth=tuple(view.has_depth for view in views),
-        data_hash=build(str, attributes["data_hash"], "data_hash"),
-        files=build(dict[str, int], attributes["files"], "files"),
-        arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
-    )
-    if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
-        raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
-    return header
-
-
 def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
-    """Header of a take from its file.
-
-    Args:
-        name: name of the take.
-        where: the take's folder or URL, for messages.
-        data: content of :data:`HEADER_FILE`; None if there is no such file.
+    """Header of a take from the content of its :data:`HEADER_FILE`; None if there is no such file.
 
     Raises:
-        TakeError: the file is missing or damaged, or is that of another group or format version.
+        TakeError: the file is missing or damaged, or is that of another group or format version; it names ``where``.
     """
     if data is None:
         raise TakeError(f"take {name!r}: {where} holds no {HEADER_FILE}, so it is torn or not a take; {REMEDY}")
@@ -131,7 +101,19 @@ def parse_header(name: str, where: str, data: bytes | None) -> TakeHeader:
             f"{' or '.join(map(str, VERSIONS))}; generate it again, or use the version of quest that wrote it"
         )
     with reading(file, TakeError, REMEDY):
-        header = _header(attributes)
+        views = build(list[_View], attributes["views"], "views")
+        header = TakeHeader(
+            info=build(TakeInfo, attributes["info"], "info"),
+            frames=build(int, attributes["frames"], "frames"),
+            cameras=tuple(view.camera for view in views),
+            clip_names=tuple(view.name for view in views),
+            has_depth=tuple(view.has_depth for view in views),
+            data_hash=build(str, attributes["data_hash"], "data_hash"),
+            files=build(dict[str, int], attributes["files"], "files"),
+            arrays_at=build(str, attributes.get("arrays_at", ""), "arrays_at"),
+        )
+        if min(header.frames, header.info.frames_per_s, header.info.half_diagonal_m) <= 0:
+            raise ValueError("frames, frames_per_s and half_diagonal_m are to be positive")
     if header.info.name != name or not is_name(name):
         raise TakeError(f"{file} is of a take of another name, {header.info.name!r}; give its folder that name")
     if outside := [path for path in header.files if not is_inside(path)]:
@@ -202,14 +184,11 @@ def check_take(take: Take) -> None:
     """Raise InputError if the arrays of a take contradict each other or its description."""
     frames, entities, joints = len(take), len(take.info.entities), len(take.info.joints)
     links = take.link_pose.shape[1] if take.link_pose.ndim == 4 else -1
-    checked: list[tuple[str, np.ndarray, tuple[int, ...]]] = [
-        ("point_world", take.point_world, (frames, entities, 3)),
-        ("flow_world", take.flow_world, (frames, entities, 3)),
-        ("link_pose", take.link_pose, (frames, links, 4, 4)),
-        ("joint_position", take.joint_position, (frames, joints)),
-        ("joint_velocity", take.joint_velocity, (frames, joints)),
-        ("joint_axis", take.joint_axis, (frames, joints, 6)),
-    ]
+    shapes = dict.fromkeys(("point_world", "flow_world"), (frames, entities, 3)) | {"link_pose": (frames, links, 4, 4)}
+    shapes |= dict.fromkeys(("joint_position", "joint_velocity"), (frames, joints)) | {
+        "joint_axis": (frames, joints, 6)
+    }
+    checked = [(name, getattr(take, name), shape) for name, shape in shapes.items()]
     for v, view in enumerate(take.views):
         size = view.clip.rgb.shape[1:3]
         shapes = {"uv_px": (frames, entities, 2), "visible": (frames, entities)}

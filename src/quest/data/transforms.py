@@ -64,8 +64,8 @@ class Edge:
     def forget(self, before_ns: int) -> None:
         """Drop samples that are not needed from a time on."""
         old = bisect_left(self.samples, before_ns, key=_stamp_ns) - 1
-        if old > 0 and not self.static:
-            del self.samples[:old]
+        if not self.static:
+            del self.samples[: max(old, 0)]
 
 
 class Transforms:
@@ -77,10 +77,7 @@ class Transforms:
     def add(self, message: Any, *, static: bool, log_ns: int = 0) -> None:
         """Take the transforms of one TFMessage; those that are no transforms (a quaternion of zeros) are left out.
 
-        Args:
-            message: the message.
-            static: whether they hold throughout.
-            log_ns: when it was recorded, for transforms without a time of their own.
+        Static ones hold throughout; those without a time of their own are of the time of logging.
         """
         for stamped in message.transforms:
             moved, turned = stamped.transform.translation, stamped.transform.rotation

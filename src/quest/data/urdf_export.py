@@ -10,6 +10,7 @@ import re
 import unicodedata
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -42,14 +43,7 @@ def write_urdf(tracks: Tracks, path: str | Path) -> UrdfNames:
     is ``NAME_joint``, from ``world``, with the axis and the range that were seen. A turning joint's frame must lie on
     its axis, so that it moves the link ``NAME_hinge``, to which the entity's link is fixed. Efforts and velocities are
     not known: 1000 stands for no limit. A comment above each joint holds, as JSON, the name that the track had, and
-    how uncertain axis and origin are.
-
-    Args:
-        tracks: with joints.
-        path: the file.
-
-    Returns:
-        Which links there are, and which tracks were left out because nothing is known of their joint.
+    how uncertain axis and origin are. Returned is which links there are, and which tracks were left out.
 
     Raises:
         InputError: the tracks have no joints.
@@ -128,16 +122,10 @@ def _valid(name: str) -> str:
 def _unique(names: list[str]) -> list[str]:
     """Valid names for links, so that neither they nor the names made of them clash."""
     taken, unique = {WORLD}, []
-    for name in names:
-        valid, number = _valid(name), 1
-        made = _made_of(valid)
-        while taken & made:
-            number += 1
-            made = _made_of(f"{valid}_{number}")
-        taken |= made
-        unique.append(valid if number == 1 else f"{valid}_{number}")
+    for valid in map(_valid, names):
+        tried = (valid if number == 1 else f"{valid}_{number}" for number in count(1))
+        made = ([name, f"{name}_joint", f"{name}_hinge", f"{name}_fixed"] for name in tried)
+        free = next(clashing for clashing in made if not taken & {*clashing})
+        taken |= {*free}
+        unique.append(free[0])
     return unique
-
-
-def _made_of(name: str) -> set[str]:
-    return {name, f"{name}_joint", f"{name}_hinge", f"{name}_fixed"}

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from quest.data.store import TakeStore
@@ -73,25 +73,43 @@ def check_truth(take: Take) -> Iterator[Check]:
     if bad or sum(broken.values()) or len(backwards):
         return  # the others cannot be computed
     yield _check_rotations("link poses", take.link_pose.reshape(-1, 4, 4), len(take))
-    yield _check_rigid(take)
-    yield _check_joints(take)
-    yield _check_flow(take)
+    in_links = _in_links(take)
+    moved_m = np.linalg.norm(in_links - in_links[:1], axis=-1)
+    limit = RIGID * take.info.half_diagonal_m + _FLOAT_M
+    yield _check("rigid in link", moved_m.max(initial=0), limit, "m", _place(take, moved_m))
+    yield _check_joints(take, in_links[0])
+    flow = np.zeros_like(take.point_world, dtype=np.float64)
+    flow[:-1] = np.diff(take.point_world.astype(np.float64), axis=0)
+    error_m = np.linalg.norm(flow - take.flow_world, axis=-1)
+    yield _check("flow", error_m.max(initial=0), FLOW_M, "m", _place(take, error_m))
     yield _check_velocity(take)
 
 
 def check_view(take: Take, view: View, number: int) -> Iterator[Check]:
-    """Checks of one view against what is true of the take.
-
-    Args:
-        take: the truth, which has passed the checks of indices and finite numbers.
-        view: one camera's frames.
-        number: its number, for messages.
-    """
-    yield _check_rotations("camera poses", view.clip.cam_from_world, len(take), f"view {number}, ")
-    uv_px, depth_m = _project(take, view)
-    yield _check_reprojection(take, view, number, uv_px)
-    yield _check_visible(take, view, number, depth_m)
-    yield _check_masks(take, view, number)
+    """Checks of one view, by its number, against a take that has passed the checks of indices and finite numbers."""
+    where, pose, camera = f"view {number}", view.clip.cam_from_world, view.clip.camera
+    yield _check_rotations("camera poses", pose, len(take), f"{where}, ")
+    point = moved_points(pose, take.point_world.astype(np.float64))
+    z = np.where(point[..., 2] > 1e-6, point[..., 2], np.nan)
+    uv_px = np.stack((camera.fx * point[..., 0] / z + camera.cx, camera.fy * point[..., 1] / z + camera.cy), axis=-1)
+    error_px = np.linalg.norm(uv_px - view.uv_px, axis=-1)
+    # Far outside the image a pixel is an angle: the plane of the image reaches to infinity there.
+    away_px = np.linalg.norm(uv_px - [camera.width / 2, camera.height / 2], axis=-1)
+    error_px = error_px / np.fmax(1, away_px / (camera.width + camera.height))
+    behind = np.isnan(uv_px).any(axis=-1)
+    error_px = np.where(behind & np.isnan(view.uv_px).any(axis=-1), 0, np.nan_to_num(error_px, nan=np.inf))
+    place = f"{where}, {_place(take, error_px)}"
+    yield _check("reprojection", error_px.max(initial=0), REPROJECTION_PX, "px", place)
+    wrong = _contradictions(take, view, point[..., 2])
+    place = where + (f", first {_place(take, wrong)}" if wrong.any() else "")
+    yield _check("visibility", 100 * wrong.mean() if wrong.size else 0, 100 * INCONSISTENT_SHARE, "%", place)
+    # Pixels of an entity that are not of its link; and pixels of links or entities that there are not.
+    links = np.full(256, -1, np.int16)
+    links[: 1 + len(take.info.entities)] = [0, *(1 + e.link for e in take.info.entities)]
+    marked = view.entity_id > 0
+    strays = int((links[view.entity_id[marked]] != view.link_id[marked]).sum())
+    strays += int((view.link_id > take.link_pose.shape[1]).sum())
+    yield _check("masks", strays, where=where + ", pixels that belong to another link" * (strays > 0))
 
 
 def has_sensed_depth(info: TakeInfo) -> bool:
@@ -111,6 +129,11 @@ def _check(name: str, worst: float, limit: float = 0.0, unit: str = "", where: s
     return Check(name, bool(worst <= limit), float(worst), limit, unit, where)
 
 
+def moved_points(pose: Float[np.ndarray, "T 4 4"], point: Float[np.ndarray, "T N 3"]) -> Float[np.ndarray, "T N 3"]:
+    """Points of every frame in other axes, by its pose."""
+    return np.einsum("tij,tnj->tni", pose[:, :3, :3], point) + pose[:, None, :3, 3]
+
+
 def _check_rotations(name: str, pose: Float[np.ndarray, "N 4 4"], frames: int, place: str = "") -> Check:
     """Whether poses are rigid: orthonormal, not mirrored, last row 0 0 0 1."""
     rotation = pose[:, :3, :3].astype(np.float64)
@@ -128,24 +151,17 @@ def _in_links(take: Take) -> Float[np.ndarray, "T E 3"]:
     return np.einsum("teji,tej->tei", pose[..., :3, :3], take.point_world - pose[..., :3, 3])
 
 
-def _check_rigid(take: Take) -> Check:
-    local = _in_links(take)
-    moved_m = np.linalg.norm(local - local[:1], axis=-1)
-    limit = RIGID * take.info.half_diagonal_m + _FLOAT_M
-    return _check("rigid in link", moved_m.max(initial=0), limit, "m", _place(take, moved_m))
-
-
-def _check_joints(take: Take) -> Check:
+def _check_joints(take: Take, in_links: Float[np.ndarray, "E 3"]) -> Check:
     """Every link moves about or along its joint's axis by what the joint's position changes.
 
     Which link a joint carries is known from its entities; joints without any are skipped.
     """
     limit = ON_JOINT * take.info.half_diagonal_m + _FLOAT_M
-    local, worst, where = _in_links(take)[:1], 0.0, "no entity on a joint"
+    worst, where = 0.0, "no entity on a joint"
     for link, j in sorted({(e.link, e.joint) for e in take.info.entities if e.joint >= 0}):
         on_link = [i for i, e in enumerate(take.info.entities) if e.link == link]
         steps = np.concatenate([np.zeros((1, 3)), take.info.half_diagonal_m * np.eye(3)])
-        probes = (local[0, on_link][:, None] + steps).reshape(-1, 3)
+        probes = (in_links[on_link][:, None] + steps).reshape(-1, 3)
         # The parent is not stored: it is one in which the axis stays where it is, most often one that never moves.
         parents = [None, *(p for p in range(take.link_pose.shape[1]) if p != link)]
         errors = []
@@ -183,13 +199,6 @@ def _joint_error(
     return np.maximum(np.linalg.norm(expected - found, axis=-1).max(axis=-1), strays)
 
 
-def _check_flow(take: Take) -> Check:
-    flow = np.zeros_like(take.point_world, dtype=np.float64)
-    flow[:-1] = np.diff(take.point_world.astype(np.float64), axis=0)
-    error_m = np.linalg.norm(flow - take.flow_world, axis=-1)
-    return _check("flow", error_m.max(initial=0), FLOW_M, "m", _place(take, error_m))
-
-
 def _check_velocity(take: Take) -> Check:
     """Every velocity lies between those to the frame before and after, with some room.
 
@@ -209,29 +218,8 @@ def _check_velocity(take: Take) -> Check:
     return _check("velocity", share.max(), VELOCITY, "of the highest", where)
 
 
-def _project(take: Take, view: View) -> tuple[Float[np.ndarray, "T E 2"], Float[np.ndarray, "T E"]]:
-    """Pixels, NaN behind the camera, and depths of the entities."""
-    pose, camera = view.clip.cam_from_world, view.clip.camera
-    point = np.einsum("tij,tej->tei", pose[:, :3, :3], take.point_world.astype(np.float64)) + pose[:, None, :3, 3]
-    z = np.where(point[..., 2] > 1e-6, point[..., 2], np.nan)
-    uv = np.stack((camera.fx * point[..., 0] / z + camera.cx, camera.fy * point[..., 1] / z + camera.cy), axis=-1)
-    return uv, point[..., 2]
-
-
-def _check_reprojection(take: Take, view: View, number: int, uv_px: Float[np.ndarray, "T E 2"]) -> Check:
-    camera = view.clip.camera
-    error_px = np.linalg.norm(uv_px - view.uv_px, axis=-1)
-    # Far outside the image a pixel is an angle: the plane of the image reaches to infinity there.
-    away_px = np.linalg.norm(uv_px - [camera.width / 2, camera.height / 2], axis=-1)
-    error_px = error_px / np.fmax(1, away_px / (camera.width + camera.height))
-    behind = np.isnan(uv_px).any(axis=-1)
-    error_px = np.where(behind & np.isnan(view.uv_px).any(axis=-1), 0, np.nan_to_num(error_px, nan=np.inf))
-    where = f"view {number}, {_place(take, error_px)}"
-    return _check("reprojection", error_px.max(initial=0), REPROJECTION_PX, "px", where)
-
-
-def _check_visible(take: Take, view: View, number: int, depth_m: Float[np.ndarray, "T E"]) -> Check:
-    """Share of (frame, entity) whose visibility contradicts the images, either way.
+def _contradictions(take: Take, view: View, depth_m: Float[np.ndarray, "T E"]) -> Bool[np.ndarray, "T E"]:
+    """Whether an entity's visibility contradicts the images, either way.
 
     Seen means: inside the image, and within 3 x 3 pixels one of its link at its own depth. Stored depth is rounded, and
     missing beyond its range, so what hangs on that is accepted either way. In takes with a sensor model depth is noisy,
@@ -258,9 +246,7 @@ def _check_visible(take: Take, view: View, number: int, depth_m: Float[np.ndarra
         if sensor:
             wide = _around(view.clip.depth_m, t, view.uv_px[t, e], _SENSOR_REACH_PX, fill=np.nan)
             may[t, e] = same.any(axis=1) & ((np.abs(wide - z) <= within + room) | (wide == 0)).any(axis=1)
-    wrong = (view.visible & ~may) | (must & ~view.visible)
-    where = f"view {number}" + (f", first {_place(take, wrong)}" if wrong.any() else "")
-    return _check("visibility", 100 * wrong.mean() if wrong.size else 0, 100 * INCONSISTENT_SHARE, "%", where)
+    return (view.visible & ~may) | (must & ~view.visible)
 
 
 def _around(
@@ -273,18 +259,6 @@ def _around(
     inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
     values = image[t[:, None], np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     return np.where(inside, values, fill)
-
-
-def _check_masks(take: Take, view: View, number: int) -> Check:
-    """Pixels of an entity that are not of its link; and pixels of links or entities that there are not."""
-    links = np.zeros(256, np.int16)
-    count = len(take.info.entities)
-    links[1 : 1 + count] = [1 + e.link for e in take.info.entities]
-    links[1 + count :] = -1  # no such entity
-    marked = view.entity_id > 0
-    wrong = int((links[view.entity_id[marked]] != view.link_id[marked]).sum())
-    wrong += int((view.link_id > take.link_pose.shape[1]).sum())
-    return _check("masks", wrong, where=f"view {number}" + ", pixels that belong to another link" * (wrong > 0))
 
 
 def _place(take: Take, values: np.ndarray) -> str:
@@ -300,11 +274,9 @@ class TakeReport:
     """What verifying one take found."""
 
     name: str
-    """The take."""
     frames: int
-    """Its frames; 0 if it cannot be read."""
+    """0 if it cannot be read, as of views."""
     views: int
-    """Its views."""
     checks: tuple[Check, ...]
     """Every check, those of views once per view."""
     problem: str = ""
@@ -367,13 +339,7 @@ def verify_take(store: TakeStore, name: str) -> TakeReport:
 def verify_store(
     store: TakeStore, names: Sequence[str] | None = None, *, report: Callable[[TakeReport], None] = lambda _: None
 ) -> StoreReport:
-    """Check takes of a store.
-
-    Args:
-        store: the store.
-        names: the takes; by default all, those that cannot be read included.
-        report: told about each take as soon as it is done.
-    """
+    """Check takes of a store, by default all, also those that cannot be read; reports each as soon as it is done."""
     done = []
     for name in names if names is not None else sorted({*store.names(), *store.problems()}):
         done.append(verify_take(store, name))

@@ -59,15 +59,14 @@ def probe_video(path: Path) -> VideoInfo:
 
 
 def play_video(
-    path: Path, *, pixel_format: str = "rgb24", start_s: float = 0.0, end_s: float | None = None
+    path: Path, *, pixel_format: str = "rgb24", start_s: float = 0.0
 ) -> Iterator[tuple[Shaped[np.ndarray, "H W *C"], float]]:
     """Frames of a video one by one, upright, with their time in seconds from the first frame of the file.
 
     Args:
         path: the file.
         pixel_format: what FFmpeg calls the format to convert to: ``rgb24``, or ``gray12le`` for 12 bits in 16.
-        start_s: frames before are omitted.
-        end_s: frames from there on are omitted; None plays to the end, which must be where the file says.
+        start_s: frames before are omitted; without any the end must be where the file says.
 
     Raises:
         RecordingError: there is no such file, it cannot be decoded, has no frames, changes its size, or ends early.
@@ -86,12 +85,11 @@ def play_video(
                 time_s = frame.time - origin if frame.time is not None else before + 1 / rate
                 if time_s < before or time_s == -np.inf:
                     time_s = 0.0 if before == -np.inf else before + 1 / rate
-                longest_s = max(longest_s, _shown_s(frame), 0.0 if before == -np.inf else time_s - before)
+                shown_s = float(frame.duration * frame.time_base) if frame.duration and frame.time_base else 0.0
+                longest_s = max(longest_s, shown_s, 0.0 if before == -np.inf else time_s - before)
                 before = time_s
                 if time_s < start_s:
                     continue
-                if end_s is not None and time_s >= end_s:
-                    return
                 image = np.ascontiguousarray(np.rot90(frame.to_ndarray(format=pixel_format), _turns(frame)))
                 if shape is not None and image.shape != shape:
                     raise RecordingError(
@@ -103,7 +101,7 @@ def play_video(
             raise _undecodable(path, number, error) from error
         if number == 0:
             raise RecordingError(f"video {path}: expected at least one frame, got none; record it again")
-        if start_s == 0 and end_s is None:
+        if start_s == 0:
             _check_whole(path, container, number, last_s=origin + before, frame_s=max(longest_s, 1 / rate))
 
 
@@ -111,10 +109,6 @@ def _turns(frame: av.VideoFrame) -> int:
     """Quarter turns, against the clock, that make a frame upright; other angles are left alone, as in OpenCV."""
     turns, rest = divmod(frame.rotation % 360, 90)
     return 0 if rest else turns
-
-
-def _shown_s(frame: av.VideoFrame) -> float:
-    return float(frame.duration * frame.time_base) if frame.duration and frame.time_base else 0.0
 
 
 def _check_whole(path: Path, container: InputContainer, number: int, *, last_s: float, frame_s: float) -> None:
@@ -211,21 +205,9 @@ def write_video(
     return _encode(path, frames, frames_per_s, "libx264", options, ("rgb24", "yuv420p", "yuv444p"))
 
 
-def write_depth_video(
-    path: Path, codes: Iterable[UInt16[np.ndarray, "H W"]], *, frames_per_s: float | int, preset: str = "ultrafast"
-) -> int:
-    """Write pictures of twelve bits as HEVC without loss, all or nothing; returns their number.
-
-    Args:
-        path: file to write; replaced if it exists.
-        codes: pictures of one size, 0 to 4095.
-        frames_per_s: frame rate.
-        preset: x265's speed preset.
-
-    Raises:
-        InputError: no pictures came, or pictures of different sizes.
-    """
-    options = {"x265-params": "lossless=1:log-level=error", "preset": preset}
+def write_depth_video(path: Path, codes: Iterable[UInt16[np.ndarray, "H W"]], *, frames_per_s: float | int) -> int:
+    """Write pictures of twelve bits (0 to 4095) as HEVC without loss, otherwise as :func:`write_video`."""
+    options = {"x265-params": "lossless=1:log-level=error", "preset": "ultrafast"}
     return _encode(path, codes, frames_per_s, "libx265", options, ("gray12le", "gray12le", "gray12le"))
 
 
