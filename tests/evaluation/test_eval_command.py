@@ -20,7 +20,7 @@ from quest.errors import ConfigError, InputError, ObjectError, TakeError
 from quest.evaluation import evaluate, read_records, read_results
 from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.results import records_path
-from quest.evaluation.selection import Shard, select_in, select_takes
+from quest.evaluation.selection import Shard, select_takes
 from quest.types import Clip, Query, Take, Tracks
 from tests.evaluation.fakes import Oracle
 from tests.synthetic import make_take
@@ -91,9 +91,6 @@ def test_selection(store: TakeStore) -> None:
     ):
         with pytest.raises(ConfigError, match=match):
             select_takes(of, split=("validation",), objects=objects)
-    assert select_in([store], split=("train",)) == [(store, {"panels-7-1": "train"})]
-    with pytest.raises(ConfigError, match="twice"):
-        select_in([store, store], split=("train",))
 
 
 def test_what_an_evaluation_is_asked_for(store: TakeStore) -> None:

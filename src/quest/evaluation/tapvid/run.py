@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 
 from quest.baselines import ClipTracker, Inputs
 from quest.baselines.point_queries import lift_pixels
-from quest.evaluation.bootstrap import draw_objects, mean_value
+from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums
 from quest.evaluation.real.run import KeptAnswers, RealRow, asked, kept_or_asked, shown
 from quest.evaluation.tables import Column
@@ -78,14 +78,7 @@ def evaluate_videos(
 ) -> tuple[list[RealRow], list[RealRow]]:
     """Score trackers on videos.
 
-    Args:
-        files: of TAP-Vid or TAPVid-3D, by the name of the video.
-        trackers: with names of the registry.
-        setting: how they are asked and judged.
-        resamples: of the bootstrap over videos.
-        seed: of the bootstrap.
-        kept: where answers are kept as they come; nowhere by default.
-        progress: called after each video with how many are done.
+    Answers are kept as they come in ``kept``; ``progress`` is told after each video how many are done.
 
     Returns:
         Rows of the table, and rows of each video.
@@ -184,11 +177,8 @@ def _row(
     of: str, tracker: str, inputs: Inputs, scored: Sequence[_Scored], *, resamples: int = 1, seed: int = 0
 ) -> RealRow:
     """Means over videos; those in which nothing is counted are left out."""
-    draws = draw_objects(len(scored), resamples=resamples, generator=np.random.default_rng(seed))
-    measures = {}
-    for name in scored[0].scores:
-        value = np.array([s.scores[name] for s in scored])
-        sums = Sums(np.nan_to_num(value), (~np.isnan(value)).astype(float))
-        measures[name] = mean_value(sums, np.arange(len(scored)), draws)
-    tracks, queries = (sum(getattr(s, name) for s in scored) for name in ("tracks", "queries"))
+    pool = Pool(scored, resamples=resamples, seed=seed)
+    values = {name: np.array([s.scores[name] for s in scored]) for name in scored[0].scores}
+    measures = {name: pool.ratio(Sums(np.nan_to_num(v), (~np.isnan(v)).astype(float))) for name, v in values.items()}
+    tracks, queries = sum(s.tracks for s in scored), sum(s.queries for s in scored)
     return RealRow(of, tracker, inputs, len(scored), tracks, queries, measures)
