@@ -103,10 +103,18 @@ def evaluate_set(
             counts = sum(map(len, tracks)), sum(len(c.error_px) for c in scored)
         return RealRow(of, tracker, inputs, len(scored), *counts, measures)
 
+    rows, single = rows_of(found, row, resamples)
+    return sorted(rows, key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of)), single
+
+
+def rows_of(
+    found: Mapping[tuple[str, str, Inputs], Mapping[str, Any]],
+    row: Callable[[str, str, Inputs, Sequence[Any], int], RealRow],
+    resamples: int,
+) -> tuple[list[RealRow], list[RealRow]]:
+    """A row of each table, tracker and input, of all that was scored there, and a row of each by its name."""
     rows = [row(*key, list(by_name.values()), resamples) for key, by_name in found.items()]
-    single = [row(name, *key[1:], [one], 1) for key, by_name in found.items() for name, one in by_name.items()]
-    rows.sort(key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of))
-    return rows, single
+    return rows, [row(name, *key[1:], [one], 1) for key, by_name in found.items() for name, one in by_name.items()]
 
 
 def shown(clip: Clip) -> dict[Inputs, Clip]:
