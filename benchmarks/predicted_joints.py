@@ -1,6 +1,6 @@
 """Measure how well joints are told from predicted tracks, against the simulator's.
 
-    python benchmarks/predicted_joints.py --takes STORE --split validation \
+    python -m benchmarks.predicted_joints --takes STORE --split validation \
         --out benchmarks/results/predicted_joints.json
 
 Every scored entity is asked for as in the protocol point, alarms are off. Moved entities are judged at the first frame
@@ -21,11 +21,11 @@ import tyro
 from jaxtyping import Float, Float32
 
 import quest
+from benchmarks.study import Study
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.protocols import first_visible, true_queries
-from quest.evaluation.study import Study
 from quest.filter.joints import Joint, JointKind
 from quest.track import StreamState, Tracker
 from quest.types import Take

@@ -1,6 +1,6 @@
 """Measure the flow head of the published network: EPE3D beside zero flow and differences of lifted points.
 
-    python benchmarks/scene_flow.py --takes STORE --weights FILE --out benchmarks/results/scene_flow/validation.json
+    python -m benchmarks.scene_flow --takes STORE --weights FILE --out benchmarks/results/scene_flow/validation.json
 
 A stride of 1 asks for the next frame, as a stream would; a larger one for the frame as far on as the frames of the
 window are apart, which is what training on thinned takes looks like. Features are prepared in a cache that can be
@@ -36,13 +36,13 @@ import tyro
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from benchmarks.study import Study
 from quest.data.provenance import file_hash
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, WeightsError
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.protocols import START_FRAMES
-from quest.evaluation.study import Study
 from quest.model.frames import FrameBatch
 from quest.model.weights import find_weights
 from quest.paper.network import PaperNetwork, read_paper

@@ -1,6 +1,6 @@
 """Faults of a camera: are they flagged, is what is blind still tracked, and is everything found again afterwards?
 
-    python benchmarks/sensor_faults.py --real VIDEO POSED --takes TAKES --out benchmarks/results/sensor_faults.json
+    python -m benchmarks.sensor_faults --real VIDEO POSED --takes TAKES --out benchmarks/results/sensor_faults.json
 
 Every fault lasts a second, from frame 15 on, and the clip is followed for half a second more. Flagged means a new flag
 within three frames. Found again are queries within 12 pixels (of a diagonal of 800) of where the same clip has them
@@ -21,11 +21,12 @@ import tyro
 from rich.console import Console
 
 import quest
+from benchmarks.study import rows_table
 from quest.data.store import TakeStore
 from quest.evaluation.drift import clopper_pearson
 from quest.evaluation.real.run import shown
 from quest.evaluation.real.sets import open_set
-from quest.evaluation.report import provenance, rows_table, write_report
+from quest.evaluation.report import provenance, write_report
 from quest.track.state import StreamState
 from quest.track.tracker import Tracker
 from quest.types import Clip, Frame, Query

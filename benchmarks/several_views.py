@@ -1,6 +1,6 @@
 """Measure what several cameras give over one: takes of several views, each view alone, their mean, and fused.
 
-    python benchmarks/several_views.py --takes STORE --out benchmarks/results/several_views.json
+    python -m benchmarks.several_views --takes STORE --out benchmarks/results/several_views.json
 
 Each view alone is asked as in the protocol point, for what it sees in the first frames. The fused tracks are asked for
 each entity once, in the first view that sees it; or in each view that does, as the single views and their mean are. The
@@ -21,12 +21,12 @@ from jaxtyping import Bool, Float
 from scipy.stats import chi2
 
 import quest
+from benchmarks.study import Study
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import distance, identity
 from quest.evaluation.protocols import first_visible, true_queries
-from quest.evaluation.study import Study
 from quest.filter.view import View
 from quest.track import Tracker
 from quest.track.fusion import place_covariance

@@ -448,7 +448,6 @@ def notes(report: Mapping[str, Any]) -> list[str]:
     """What made a table."""
     run = report.get("run", report)
     found = [f"`{run['command']}`, commit {run['commit'][:9]}."]
-    found += [f"Answers: `{r['command']}`, commit {r['commit'][:9]}." for r in origins(report)]
     if report.get("complete") is False:
         found.insert(0, "**Unfinished**: these are the takes so far.")
     if "machine" in report and "n_takes" in report:
@@ -462,11 +461,6 @@ def notes(report: Mapping[str, Any]) -> list[str]:
     if "calibration" in report:
         found.append(f"Calibration: {report['calibration']}.")
     return found
-
-
-def origins(report: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The runs whose records a report was made from."""
-    return [origin["run"] for origin in report.get("origins", ())]
 
 
 def read_report(path: Path) -> dict[str, Any]:

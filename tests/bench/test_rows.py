@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from quest.bench.encoded import serve_cached
 from quest.bench.rows import Answers, rows_of
+from quest.bench.workbench import serve_cached
 from quest.errors import InputError
 from quest.evaluation.records import EntityRecord
 from tests.evaluation.answers import make_answer

@@ -189,10 +189,10 @@ def test_variants_differ_from_what_they_vary_in_one_thing(base):
 def test_chained_flow_is_off_by_the_noise_of_its_steps():
     take = make_take(frames=200, views=1, entities=2)
     subject = Subject("flow", "point", "train", "procedural", 1, "panels-0")
-    exact = evaluate_point(ChainedFlow(0.0), take, 0, subject).records
+    exact = evaluate_point(ChainedFlow(0.0), take, 0, subject)
     assert max(r.distance.max() for r in exact) < 1e-5
-    noisy = evaluate_point(ChainedFlow(0.01, seed=3), take, 0, subject).records
-    again = evaluate_point(ChainedFlow(0.01, seed=3), take, 0, subject).records
+    noisy = evaluate_point(ChainedFlow(0.01, seed=3), take, 0, subject)
+    again = evaluate_point(ChainedFlow(0.01, seed=3), take, 0, subject)
     assert all(np.array_equal(a.distance, b.distance) for a, b in zip(noisy, again, strict=True))
     assert 0.5 < np.mean([r.distance[-1] for r in noisy]) / (0.01 * np.sqrt(200 * 3)) < 1.5
     with pytest.raises(ConfigError, match="only be judged on takes"):
@@ -218,7 +218,7 @@ def test_noise_of_colours_is_what_was_asked_for():
 def test_drift_is_read_at_shares_of_a_take():
     take = make_take(frames=11, views=1, entities=2)
     subject = Subject("flow", "point", "train", "procedural", 1, "panels-0")
-    records = evaluate_point(HoldStill(), take, 0, subject).records
+    records = evaluate_point(HoldStill(), take, 0, subject)
     rows = drift_rows([workbench.Answers("hold", seed, records) for seed in (0, 1)], resamples=10)
     assert {row["tracks"] for row in rows if row["reading"] == "all"} == {2}
     own = {row["share"]: row["metrics"]["distance"].mean for row in rows if row["reading"] == "all"}

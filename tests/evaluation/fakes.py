@@ -1,4 +1,4 @@
-"""Trackers that know the truth, so that the right score is known."""
+"""Trackers that know the truth, so that the right score is known, and one that is stopped."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from quest.baselines.hold_still import HoldStill
 from quest.types import Clip, Query, State, Take, Tracks, View
 
 
@@ -62,3 +63,18 @@ class Oracle:
     def _entity(self, view: View, query: Query) -> int:
         gap = np.linalg.norm(view.uv_px[query.frame] - np.array(query.uv_px), axis=-1)
         return int(np.nanargmin(gap))
+
+
+class Stopped(HoldStill):
+    """Notes the clips that it is asked about, and is stopped after so many."""
+
+    def __init__(self, after: int | None = None) -> None:
+        super().__init__()
+        self.clips: list[str] = []
+        self._after = after
+
+    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        if len(self.clips) == self._after:
+            raise KeyboardInterrupt
+        self.clips.append(clip.name)
+        return super().track(clip, queries)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -20,9 +20,9 @@ from quest.errors import ConfigError, InputError, ObjectError, TakeError
 from quest.evaluation import evaluate, read_records, read_results
 from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.results import records_path
-from quest.evaluation.selection import Shard, select_in, select_takes
-from quest.types import Clip, Query, Take, Tracks
-from tests.evaluation.fakes import Oracle
+from quest.evaluation.selection import Shard, select_takes
+from quest.types import Take
+from tests.evaluation.fakes import Oracle, Stopped
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
@@ -91,9 +91,6 @@ def test_selection(store: TakeStore) -> None:
     ):
         with pytest.raises(ConfigError, match=match):
             select_takes(of, split=("validation",), objects=objects)
-    assert select_in([store], split=("train",)) == [(store, {"panels-7-1": "train"})]
-    with pytest.raises(ConfigError, match="twice"):
-        select_in([store, store], split=("train",))
 
 
 def test_what_an_evaluation_is_asked_for(store: TakeStore) -> None:
@@ -182,20 +179,6 @@ def test_command_errors(store: TakeStore, changes: dict, error: type[Exception],
         command.run()
 
 
-class _Counting(HoldStill):
-    """Counts what it is asked, and is stopped before the clip of a name."""
-
-    def __init__(self, stop_at: str | None = None) -> None:
-        self.clips: list[str] = []
-        self._stop_at = stop_at
-
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        if self._stop_at is not None and clip.name.startswith(self._stop_at):
-            raise KeyboardInterrupt
-        self.clips.append(clip.name)
-        return super().track(clip, queries)
-
-
 VALIDATION: Mapping[str, SplitPart] = dict.fromkeys(
     ("panels-100000-1", "panels-100000-2", "panels-100001-1"), "validation"
 )
@@ -205,9 +188,9 @@ def test_what_was_stopped_goes_on(store: TakeStore, tmp_path: Path) -> None:
     whole = evaluate(store, VALIDATION, [HoldStill()])
     folder = tmp_path / "parts"
     with pytest.raises(KeyboardInterrupt):
-        evaluate(store, VALIDATION, [_Counting("panels-100001")], finished=FinishedTakes(folder, made_by="a"))
+        evaluate(store, VALIDATION, [Stopped(4)], finished=FinishedTakes(folder, made_by="a"))
     assert len(list(folder.iterdir())) == 2
-    second, frames = _Counting(), list[int]()
+    second, frames = Stopped(), list[int]()
     found = evaluate(
         store,
         VALIDATION,

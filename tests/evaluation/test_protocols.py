@@ -28,7 +28,7 @@ def take() -> Take:
 
 def _metrics(take: Take, change: Change = lambda uv, xyz: (uv, xyz)) -> Metrics:
     """Of a tracker that knows the truth but for a change."""
-    return _row(evaluate_point(Oracle(take, change=change), take, 0, SUBJECT).records)
+    return _row(evaluate_point(Oracle(take, change=change), take, 0, SUBJECT))
 
 
 def _row(records: tuple[EntityRecord, ...], discoveries: tuple[Discovery, ...] = ()) -> Metrics:
@@ -69,7 +69,7 @@ def test_point_asks_by_pixel_only_and_from_the_first_visible_frame(take: Take) -
     visible[:8, 2] = False  # too late
     hidden = _with_visible(take, visible)
     oracle = Oracle(hidden)
-    records = evaluate_point(oracle, hidden, 0, SUBJECT).records
+    records = evaluate_point(oracle, hidden, 0, SUBJECT)
     assert [(q.frame, q.label) for q in oracle.asked] == [(0, None), (3, None)]
     assert all(label not in q.name for q in oracle.asked for label in ("handle", "knob", "rim", "front"))
     assert [(r.entity, r.first_frame) for r in records] == [(0, 0), (1, 3)]
@@ -80,19 +80,18 @@ def test_point_asks_by_pixel_only_and_from_the_first_visible_frame(take: Take) -
 def test_no_visible_entity_gives_no_records(take: Take) -> None:
     blind = _with_visible(take, np.zeros_like(take.views[0].visible))
     oracle = Oracle(blind, slots=(0, 1))
-    assert evaluate_point(oracle, blind, 0, SUBJECT).records == ()
-    outcome = evaluate_semantic(oracle, blind, 0, SUBJECT)
-    assert outcome.records == ()
-    assert outcome.discovery is not None
-    assert (outcome.discovery.slots, outcome.discovery.matched) == (2, 0)
-    assert summarise((), (outcome.discovery,), resamples=5, seed=0) == ()
+    assert evaluate_point(oracle, blind, 0, SUBJECT) == ()
+    records, discovery = evaluate_semantic(oracle, blind, 0, SUBJECT)
+    assert records == ()
+    assert (discovery.slots, discovery.matched) == (2, 0)
+    assert summarise((), (discovery,), resamples=5, seed=0) == ()
 
 
 def test_hinges_are_neither_scored_nor_confusable(take: Take) -> None:
-    assert {r.entity for r in evaluate_point(Oracle(take), take, 0, SUBJECT).records} == {0, 1, 2}
+    assert {r.entity for r in evaluate_point(Oracle(take), take, 0, SUBJECT)} == {0, 1, 2}
 
     hinges = take.point_world[:, 3:6].copy()
-    records = evaluate_point(Oracle(take, change=lambda uv, xyz: (uv, hinges)), take, 0, SUBJECT).records
+    records = evaluate_point(Oracle(take, change=lambda uv, xyz: (uv, hinges)), take, 0, SUBJECT)
     assert all((r.follows < 3).all() for r in records)
 
 
@@ -106,11 +105,10 @@ def test_a_tracker_must_answer_every_query(take: Take) -> None:
 
 
 def test_semantic_truth_scores_perfectly(take: Take) -> None:
-    outcome = evaluate_semantic(Oracle(take, slots=(2, 0, 1)), take, 0, SUBJECT)
-    assert [r.found for r in outcome.records] == [True] * 3
-    assert mean(_row(outcome.records).ape) == 0.0
-    assert outcome.discovery is not None
-    assert (outcome.discovery.slots, outcome.discovery.matched) == (3, 3)
+    records, discovery = evaluate_semantic(Oracle(take, slots=(2, 0, 1)), take, 0, SUBJECT)
+    assert [r.found for r in records] == [True] * 3
+    assert mean(_row(records).ape) == 0.0
+    assert (discovery.slots, discovery.matched) == (3, 3)
 
 
 def test_semantic_undiscovered_and_unsure_and_mislabelled_are_missing(take: Take) -> None:
@@ -118,12 +116,11 @@ def test_semantic_undiscovered_and_unsure_and_mislabelled_are_missing(take: Take
     oracle = Oracle(
         take, slots=(0, 1, 2, 0), labels=("handle", "rim", "rim", "handle"), confidence=(0.9, 0.9, 0.4, 0.6)
     )
-    outcome = evaluate_semantic(oracle, take, 0, semantic)
-    assert [r.found for r in outcome.records] == [True, False, False]  # 1 has the wrong label, 2 is unsure
-    assert [float(r.distance.mean()) for r in outcome.records] == [0.0, 1.0, 1.0]
-    assert all((r.follows == -1).all() for r in outcome.records[1:])
-    assert outcome.discovery is not None
-    metrics = _row(outcome.records, (outcome.discovery,))
+    records, discovery = evaluate_semantic(oracle, take, 0, semantic)
+    assert [r.found for r in records] == [True, False, False]  # 1 has the wrong label, 2 is unsure
+    assert [float(r.distance.mean()) for r in records] == [0.0, 1.0, 1.0]
+    assert all((r.follows == -1).all() for r in records[1:])
+    metrics = _row(records, (discovery,))
     found = [mean(each) for each in (metrics.recall, metrics.place_recall, metrics.precision)]
     assert found == pytest.approx([1 / 3, 2 / 3, 1 / 3])  # a second slot on entity 0 is no second discovery
 
@@ -135,16 +132,18 @@ def test_semantic_never_re_assigns(take: Take) -> None:
 
     entities = (replace(e, label="handle" if i < 3 else "hinge") for i, e in enumerate(take.info.entities))
     same_label = replace(take, info=replace(take.info, entities=tuple(entities)))
-    outcome = evaluate_semantic(Oracle(same_label, slots=(0, 1), change=swapped_later), same_label, 0, SUBJECT)
-    for record in outcome.records[:2]:
+    records, _ = evaluate_semantic(Oracle(same_label, slots=(0, 1), change=swapped_later), same_label, 0, SUBJECT)
+    for record in records[:2]:
         assert (record.follows[:8] == record.entity).all()
         assert (record.follows[8:] == 1 - record.entity).all()
 
 
 def test_semantic_gate(take: Take) -> None:
     off = np.array([0, 0, 0.11 * take.info.half_diagonal_m])
-    outcome = evaluate_semantic(Oracle(take, slots=(0, 1, 2), change=lambda uv, xyz: (uv, xyz + off)), take, 0, SUBJECT)
-    assert not any(r.found for r in outcome.records)
+    records, _ = evaluate_semantic(
+        Oracle(take, slots=(0, 1, 2), change=lambda uv, xyz: (uv, xyz + off)), take, 0, SUBJECT
+    )
+    assert not any(r.found for r in records)
 
 
 def test_assign_prefers_more_pairs_then_less_distance() -> None:

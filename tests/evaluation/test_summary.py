@@ -7,6 +7,7 @@ import io
 import json
 from collections.abc import Iterable
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 
 import numpy as np
@@ -27,10 +28,10 @@ from quest.evaluation import (
     summarise,
     write_results,
 )
-from quest.evaluation.bootstrap import Value, draw_objects, interval_over, mean_value, median_value
-from quest.evaluation.metrics import Sums
-from quest.evaluation.report import gather, provenance, rows_table, shown, write_report
+from quest.evaluation.bootstrap import Pool, Value, interval_over
+from quest.evaluation.report import provenance, write_report
 from quest.evaluation.results import records_path
+from quest.evaluation.tables import shown
 from tests.evaluation.answers import RUN, known, make_answer, mean
 
 
@@ -116,16 +117,13 @@ def test_what_there_is_nothing_of_has_no_rows_and_values(records: tuple[EntityRe
 
 def test_bootstrap_equals_resampling_the_objects_by_hand() -> None:
     rng = np.random.default_rng(0)
-    owner = rng.integers(0, 5, size=60)
-    value = rng.exponential(size=60) + owner
-    draws = draw_objects(5, resamples=200, generator=np.random.default_rng(3))
-    assert (draws.sum(axis=1) == 5).all()
-    pooled = [np.concatenate([np.tile(value[owner == o], n) for o, n in enumerate(drawn)]) for drawn in draws]
-    for got, statistic in (
-        (mean_value(Sums(value, np.ones(60)), owner, draws), np.mean),
-        (median_value(value, owner, draws), np.median),
-    ):
-        assert mean(got) == pytest.approx(statistic(value))
+    terms = [(int(o), float(x + o)) for o, x in zip(rng.integers(0, 5, size=60), rng.exponential(size=60), strict=True)]
+    pool = Pool(terms, itemgetter(0), resamples=200, seed=3)
+    assert (pool.draws.sum(axis=1) == 5).all()
+    own = [[x for o, x in terms if o == k] for k in range(5)]
+    pooled = [np.concatenate([own[k] * n for k, n in enumerate(drawn)]) for drawn in pool.draws]
+    for got, statistic in ((pool.mean(itemgetter(1)), np.mean), (pool.median(itemgetter(1)), np.median)):
+        assert mean(got) == pytest.approx(statistic([x for _, x in terms]))
         expected = np.quantile([statistic(each) for each in pooled], [0.025, 0.975])
         np.testing.assert_allclose(np.array([known(got).low, known(got).high], dtype=float), expected)
 
@@ -139,16 +137,17 @@ def test_interval_over_turns_is_that_of_the_percentile_bootstrap() -> None:
 
 
 def test_intervals_need_terms_of_two_objects() -> None:
-    draws, owner = draw_objects(6, resamples=50, generator=np.random.default_rng(0)), np.arange(6)
+    pool = Pool(range(6), lambda record: record, resamples=50, seed=0)
     for counted in (0, 1, 2):
-        count = (owner < counted).astype(float)
-        average = mean_value(Sums(0.3 * count, count), owner, draws)
-        median = median_value(np.where(count > 0, 0.3, np.nan), owner, draws)
+        average = pool.mean(lambda i, n=counted: 0.3 * (i < n), lambda i, n=counted: i < n)
+        median = pool.median(lambda i, n=counted: 0.3 if i < n else np.nan)
         if counted:
             assert (known(average).mean, known(average).count) == (pytest.approx(0.3), counted)
             assert (known(average).low is None) == (known(median).low is None) == (counted == 1)
         else:
             assert average is median is None
+    alone = Pool([[1.0], [2.0]], resamples=50, seed=0)  # each record is an object of its own
+    assert (alone.objects, known(alone.mean(sum)).low) == (2, 1.0)
 
 
 def test_results_and_records_come_back_equal(tmp_path: Path, records: tuple[EntityRecord, ...]) -> None:
@@ -216,26 +215,18 @@ def test_a_narrow_table_cuts_no_number(records: tuple[EntityRecord, ...], width:
     assert all(len(line) <= width for line in text.splitlines())
 
 
-def test_reports_carry_where_their_records_come_from(tmp_path: Path) -> None:
-    for name, take in (("a", "t0"), ("b", "t1")):
-        write_results(Results(RUN, ()), tmp_path / f"{name}.json", records=(make_answer(np.zeros(5), take=take),))
-    (tmp_path / "b.json").unlink()
-    paths = [tmp_path / f"{name}.records.parquet" for name in "ab"]
-    records, origins = gather(paths)
-    assert [r.take for r in records] == ["t0", "t1"]
-    assert [(o.records, o.run) for o in origins] == [("a.records.parquet", RUN), ("b.records.parquet", None)]
+def test_reports_carry_how_they_are_made_again(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "report.json"
-    write_report(provenance() | {"origins": origins}, path)
+    write_report(provenance() | {"run": RUN}, path)
     read = json.loads(path.read_text())
-    assert read["origins"][0]["run"]["commit"] == "abc"
+    assert read["run"]["commit"] == "abc"
     assert {"command", "commit", "machine", "versions", "stamp"} <= set(read)
-    with pytest.raises(InputError, match="twice"):
-        gather([*paths, paths[0]])
-    paths[1].replace(paths[0])
-    with pytest.raises(InputError, match="not those of"):
-        gather(paths[:1])
+
+
+def test_records_of_an_earlier_run_do_not_stay(tmp_path: Path) -> None:
+    write_results(Results(RUN, ()), tmp_path / "a.json", records=(make_answer(np.zeros(5)),))
     write_results(Results(RUN, ()), tmp_path / "a.json")
-    assert not paths[0].exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
 
 
 def test_values_in_the_terminal() -> None:
@@ -244,8 +235,3 @@ def test_values_in_the_terminal() -> None:
     assert shown(Value(-0.5, -1.0, None, 3), decimals=1) == "-0.5 (-1.0 to ∞)"
     plain = [shown(each) for each in (Value(0.5, None, None, 3), None, 0.25, 3, "far")]
     assert plain == ["0.500", "-", "0.250", "3", "far"]
-    console = Console(width=80, record=True, file=io.StringIO())
-    console.print(rows_table("joints", [{"part": "test", "kind": kind, "epe": {"head": value}} for kind in ("a", "b")]))
-    text = console.export_text()
-    assert "joints: part test, epe head 0.500 (0.250–0.750)" in text
-    assert "kind" in text

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -88,23 +89,15 @@ class Entry:
         return make(*(() if self.plain else (name, tracker if self.of_weights else rivals)), **self.settings)
 
 
-def _of_weights(about: str, maker: str, *, inputs: tuple[Inputs, ...] = EVERYTHING, **settings: Any) -> Entry:
-    return Entry(about, maker, settings, of_weights=True, inputs=inputs)
-
-
-def _official(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",), **settings: Any) -> Entry:
-    return Entry(about, maker, settings, official=True, inputs=inputs)
-
-
-def _retrained(about: str, maker: str, *, inputs: tuple[Inputs, ...] = ("colours",)) -> Entry:
-    return Entry(about, f"retrained.trackers:{maker}", retrained=True, inputs=inputs)
-
+_of_weights = partial(Entry, of_weights=True, inputs=EVERYTHING)
+_official = partial(Entry, official=True)
+_retrained = partial(Entry, retrained=True)
 
 TRACKERS: dict[str, Entry] = {
     "quest": _of_weights("this tracker", ""),
     "quest-pixels": _of_weights("quest without depth", "pixels_only:PixelsOnly.without_depth", inputs=("colours",)),
-    "redetect": _of_weights("its finder without queries, every 4th frame", "redetect:Redetect", every=4),
-    "redetect-1": _of_weights("the same in every frame", "redetect:Redetect", every=1),
+    "redetect": _of_weights("its finder without queries, every 4th frame", "redetect:Redetect", {"every": 4}),
+    "redetect-1": _of_weights("the same in every frame", "redetect:Redetect", {"every": 1}),
     "hold-still": Entry("the first position for ever", "hold_still:HoldStill"),
     "lk": Entry("Lucas-Kanade, one point", "chained:LucasKanade"),
     "lk-grid": Entry("Lucas-Kanade, 5 x 5 points checked backwards", "chained:LucasKanadeGrid"),
@@ -118,18 +111,24 @@ TRACKERS: dict[str, Entry] = {
     "world-given": Entry(
         "still in the world, given poses", "hold_still:HoldStill", {"name": "world-given"}, inputs=("depth and poses",)
     ),
-    "cotracker3-official": _official("CoTracker3, whole clip", "cotracker:CoTracker", online=False),
-    "cotracker3-online-official": _official("CoTracker3, windows of 16 frames", "cotracker:CoTracker", online=True),
-    "tapir-official": _official("TAPIR, whole clip", "tapnet:Tapir", causal=False, boots=False),
-    "bootstapir-official": _official("BootsTAPIR, whole clip", "tapnet:Tapir", causal=False, boots=True),
-    "bootstapir-online-official": _official("BootsTAPIR, frame by frame", "tapnet:Tapir", causal=True, boots=True),
+    "cotracker3-official": _official("CoTracker3, whole clip", "cotracker:CoTracker", {"online": False}),
+    "cotracker3-online-official": _official(
+        "CoTracker3, windows of 16 frames", "cotracker:CoTracker", {"online": True}
+    ),
+    "tapir-official": _official("TAPIR, whole clip", "tapnet:Tapir", {"causal": False, "boots": False}),
+    "bootstapir-official": _official("BootsTAPIR, whole clip", "tapnet:Tapir", {"causal": False, "boots": True}),
+    "bootstapir-online-official": _official(
+        "BootsTAPIR, frame by frame", "tapnet:Tapir", {"causal": True, "boots": True}
+    ),
     "tapnext-official": _official("TAPNext, frame by frame", "tapnet:TapNext"),
     "tapnextpp-official": _official("TAPNext++, frame by frame", "tapnet:TapNext"),
     "raft-official": _official("RAFT, chained", "raft:Raft"),
     "raft-3d-official": _official("RAFT-3D, chained; CUDA", "raft:Raft3D", inputs=("depth",)),
-    "raft-3d-retrained": _retrained("rigid flow of its kind, chained", "FlowTracker", inputs=("depth", "colours")),
-    "tapnet-retrained": _retrained("volume of costs of its kind, frame by frame", "MatchTracker"),
-    "cotracker-retrained": _retrained("refined windows of its kind, 8 frames", "RefineTracker"),
+    "raft-3d-retrained": _retrained(
+        "rigid flow of its kind, chained", "retrained.trackers:FlowTracker", inputs=("depth", "colours")
+    ),
+    "tapnet-retrained": _retrained("volume of costs of its kind, frame by frame", "retrained.trackers:MatchTracker"),
+    "cotracker-retrained": _retrained("refined windows of its kind, 8 frames", "retrained.trackers:RefineTracker"),
 }
 """Every tracker by the name that commands and tables call it."""
 

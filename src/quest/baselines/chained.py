@@ -59,11 +59,7 @@ class Chained(PointTracker, Generic[Picture]):
     ) -> tuple[Point, bool]:
         """Where a point is that was not found in the previous frame; where the step says, if no tracker knows better.
 
-        Args:
-            picture: of this frame.
-            origin: picture of the query's own frame, and its pixel there.
-            uv_px: where the point is held.
-            stepped: where the step has it now, and whether it found it.
+        ``origin`` is the picture of the query's own frame, and its pixel there; ``uv_px`` is where the point is held.
         """
         return stepped
 

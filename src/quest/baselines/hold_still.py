@@ -15,16 +15,16 @@ from jaxtyping import Float
 
 from quest.baselines.chained import checked_flow
 from quest.baselines.point_queries import (
+    answers,
     check_point_queries,
     depth_flags,
     lift_pixels,
     project_points,
-    query_names,
     unoccluded,
 )
 from quest.data.cut import cut_clip
 from quest.track.preprocess import grey_of
-from quest.types import Clip, Query, State, Tracks
+from quest.types import Clip, Query, Tracks
 
 _CORNERS, _LEAST_CORNERS = 500, 12
 _INLIER_PX = 2.0
@@ -35,9 +35,6 @@ class HoldStill:
 
     The pixel is lifted once, at the query's frame; the world point then stays, and a moving camera sees it elsewhere.
     It is seen unless it is out of view or something is in front of it. Without depth the pixel stays, and is seen.
-
-    Args:
-        name: what tables call it; the name of the class by default.
     """
 
     name = "hold-still"
@@ -58,16 +55,15 @@ class HoldStill:
         seen = project_points(clip, point_world)
         uv_px = np.where(np.isfinite(seen), seen, uv_px)
         visible = asked & (unoccluded(clip, point_world) | np.isnan(point_world).any(axis=-1))
-        return Tracks(
-            names=query_names(queries),
-            labels=tuple(q.label for q in queries),
-            uv_px=np.where(asked[..., None], uv_px, np.nan).astype(np.float32),
+        return answers(
+            clip,
+            queries,
+            uv_px=np.where(asked[..., None], uv_px, np.nan),
             point_world=point_world,
-            confidence=asked.astype(np.float32),
             visible=visible,
-            state=np.where(visible, State.TRACKING.value, np.where(asked, State.HELD.value, State.LOST.value)),
-            stamp_s=clip.stamp_s,
-            frame_flags=depth_flags(clip, queries, point_world),
+            held=asked,
+            confidence=asked.astype(np.float32),
+            flags=depth_flags(clip, queries, point_world),
         )
 
 

@@ -81,11 +81,6 @@ def load_weights(network: nn.Module, path: Path) -> str:
 class Official:
     """A network of other people's, ready to answer.
 
-    Args:
-        name: what tables call the tracker.
-        rivals: the folder of code and weights.
-        network: of the official code.
-
     Raises:
         ConfigError: the code is not there or cannot be imported.
         WeightsError: the checkpoint is not there, is torn, or is of another network.

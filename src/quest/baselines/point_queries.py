@@ -48,8 +48,36 @@ def check_point_queries(
     return frame, uv_px
 
 
-def query_names(queries: Sequence[Query]) -> tuple[str, ...]:
-    """Name of each answer; made up where the query has none."""
+def answers(
+    clip: Clip,
+    queries: Sequence[Query],
+    *,
+    uv_px: Float[np.ndarray, "T K 2"],
+    point_world: Float[np.ndarray, "T K 3"],
+    visible: Bool[np.ndarray, "T K"],
+    held: Bool[np.ndarray, "T K"] | bool = False,
+    confidence: Float32[np.ndarray, "T K"],
+    flags: tuple[str, ...] = (),
+) -> Tracks:
+    """Tracks of queries, whose names are made up where they have none.
+
+    What is visible is being tracked; what is not is held where ``held`` says so, and lost elsewhere.
+    """
+    hidden = np.where(held, State.HELD.value, State.LOST.value)
+    return Tracks(
+        names=_names(queries),
+        labels=tuple(q.label for q in queries),
+        uv_px=uv_px.astype(np.float32),
+        point_world=point_world.astype(np.float32),
+        confidence=confidence,
+        visible=visible,
+        state=np.where(visible, State.TRACKING.value, hidden),
+        stamp_s=clip.stamp_s,
+        frame_flags=flags,
+    )
+
+
+def _names(queries: Sequence[Query]) -> tuple[str, ...]:
     return tuple(q.name or f"point-{i}" for i, q in enumerate(queries))
 
 
@@ -108,10 +136,9 @@ def depth_flags(clip: Clip, queries: Sequence[Query], point_world: Float32[np.nd
     """In words, what missing depth does to the answers."""
     if clip.depth_m is None:
         return (NO_DEPTH,)
-    names = query_names(queries)
     return tuple(
-        NO_FIRST_DEPTH.format(name=names[k], frame=q.frame)
-        for k, q in enumerate(queries)
+        NO_FIRST_DEPTH.format(name=name, frame=q.frame)
+        for k, (q, name) in enumerate(zip(queries, _names(queries), strict=True))
         if not np.isfinite(point_world[q.frame, k]).all()
     )
 
@@ -169,14 +196,8 @@ class PointTracker(ABC):
         uv_px[early], visible[early], confidence[early] = np.nan, False, 0
         uv_px[first, each], visible[first, each], confidence[first, each] = uv_first, True, 1
         point_world = lift_pixels(clip, uv_px)
-        return Tracks(
-            names=query_names(queries),
-            labels=tuple(q.label for q in queries),
-            uv_px=uv_px,
-            point_world=hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first),
-            confidence=confidence,
-            visible=visible,
-            state=np.where(visible, State.TRACKING.value, State.LOST.value),
-            stamp_s=clip.stamp_s,
-            frame_flags=depth_flags(clip, queries, point_world),
+        held = hold_last(np.where(visible[..., None], point_world, np.float32(np.nan)), first=first)
+        flags = depth_flags(clip, queries, point_world)
+        return answers(
+            clip, queries, uv_px=uv_px, point_world=held, visible=visible, confidence=confidence, flags=flags
         )

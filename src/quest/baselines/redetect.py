@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float, Float32
 from scipy.optimize import linear_sum_assignment
 
-from quest.baselines.point_queries import NO_DEPTH, check_point_queries, lift_pixels, project_points, query_names
+from quest.baselines.point_queries import NO_DEPTH, answers, check_point_queries, lift_pixels, project_points
 from quest.data.cut import cut_clip
 from quest.track import Tracker
-from quest.types import LABELS, Clip, Query, State, Tracks
+from quest.types import LABELS, Clip, Query, Tracks
 
 REACH = 0.25
 """Farthest that a detection is linked, in half widths of the view at the depth of what is linked, and at which a point
@@ -35,9 +35,7 @@ class Detections:
     point_world: Float32[np.ndarray, "N 3"]
     """Lifted points, metres; NaN without depth."""
     label: tuple[str, ...]
-    """One of :data:`quest.types.LABELS` each."""
     confidence: Float32[np.ndarray, " N"]
-    """Probability of being right."""
 
 
 class Redetect:
@@ -81,7 +79,7 @@ class Redetect:
                 if t % self.every == 0:
                     self._link(rows, alive, seen, clip, t)
                 self._bind(rows, born, uv_first[born], seen, clip, t)
-        return rows.tracks(clip, query_names(queries), tuple(q.label for q in queries), flags)
+        return rows.tracks(clip, queries, flags)
 
     def detect(self, clip: Clip, t: int) -> Detections:
         """What is found in frame ``t``."""
@@ -154,24 +152,18 @@ class _Rows:
         self.confidence[t, tracks] = seen.confidence[detections]
         self.visible[t, tracks] = True
 
-    def tracks(
-        self, clip: Clip, names: tuple[str, ...], labels: tuple[str | None, ...], flags: tuple[str, ...]
-    ) -> Tracks:
+    def tracks(self, clip: Clip, queries: Sequence[Query], flags: tuple[str, ...]) -> Tracks:
         """The answers; a held world point is seen where the camera is by now."""
         held = np.zeros(self.visible.shape, bool)
         held[1:] = (self.point_world[1:] == self.point_world[:-1]).all(axis=-1)
         projected = project_points(clip, self.point_world)
-        uv_px = np.where((held & np.isfinite(projected).all(axis=-1))[..., None], projected, self.uv_px)
-        begun = np.isfinite(self.uv_px).all(axis=-1)
-        state = np.where(self.visible, State.TRACKING.value, np.where(begun, State.HELD.value, State.LOST.value))
-        return Tracks(
-            names=names,
-            labels=labels,
-            uv_px=uv_px.astype(np.float32),
+        return answers(
+            clip,
+            queries,
+            uv_px=np.where((held & np.isfinite(projected).all(axis=-1))[..., None], projected, self.uv_px),
             point_world=self.point_world,
-            confidence=self.confidence,
             visible=self.visible,
-            state=state,
-            stamp_s=clip.stamp_s,
-            frame_flags=flags,
+            held=np.asarray(np.isfinite(self.uv_px).all(axis=-1)),
+            confidence=self.confidence,
+            flags=flags,
         )

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
+from quest.baselines import ClipTracker
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import GATE, distance, identity
-from quest.evaluation.protocols import ClipTracker, first_visible
+from quest.evaluation.protocols import first_visible
 from quest.geometry import invert, transform
 from quest.types import INTENTS, Query, Take
 
@@ -36,22 +37,18 @@ class IntentAnswer:
     label: str
     """That both entities have."""
     open_ape: float
-    """Mean 3D distance to the entity to open by, normalised units; a frame without an answer counts 1."""
     lift_ape: float
-    """The same to the entity to lift by."""
+    """Mean 3D distance to the entity, normalised units; a frame without an answer counts 1."""
     open_acc: float
-    """Share of frames in which the answer is nearest to its own entity and within 0.1."""
     lift_acc: float
-    """The same to lift by."""
+    """Share of frames in which the answer is nearest to its own entity and within 0.1."""
     open_bound: float
-    """3D distance of the first answer to the entity to open by; 1 if there is none."""
     lift_bound: float
-    """The same to lift by."""
+    """3D distance of the first answer to the entity; 1 if there is none."""
     open_kept: float
+    lift_kept: float
     """Share of frames in which the answer is within 0.1 of the spot of the entity's own link on which the first answer
     was. It says whether the right link is followed, wherever on it the track began."""
-    lift_kept: float
-    """The same to lift by."""
 
     @property
     def both(self) -> bool:
@@ -88,12 +85,13 @@ def intent_pairs(take: Take, view: int) -> list[tuple[str, int, int]]:
 def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> list[IntentAnswer]:
     """Ask for what opens and for what lifts in one stream, and judge both tracks from its first frame."""
     answers = []
-    info, clip = take.info, take.views[view].clip
+    info, clip, half, true = take.info, take.views[view].clip, take.info.half_diagonal_m, take.point_world
     for label, opens, lifts in intent_pairs(take, view):
         pair = np.array([opens, lifts])
         queries = [Query.semantic(label, intent=intent, name=intent) for intent in INTENTS]
-        point = tracker.track(clip, queries).point_world
-        gap, right = _score(take, point, pair)
+        point, rank = tracker.track(clip, queries).point_world, np.searchsorted(take.tracked, pair)
+        gap = distance(point, true[:, pair], half_diagonal_m=half)
+        right = identity(point, true[:, take.tracked], rank, half_diagonal_m=half) == rank
         measured: dict[str, float] = {}
         for i, intent in enumerate(INTENTS):
             first, kept = _kept(take, point[:, i], int(pair[i]))
@@ -101,16 +99,6 @@ def judge_intents(tracker: ClipTracker, take: Take, view: int, *, part: str) -> 
             measured |= {f"{intent}_{what}": float(value) for what, value in values.items()}
         answers.append(IntentAnswer(info.name, view, info.object_id, part, info.source, label, **measured))
     return answers
-
-
-def _score(
-    take: Take, point_world: Float[np.ndarray, "T 2 3"], entities: Int[np.ndarray, " 2"]
-) -> tuple[np.ndarray, np.ndarray]:
-    half, true = take.info.half_diagonal_m, take.point_world
-    gap = distance(point_world, true[:, entities], half_diagonal_m=half)
-    rank = np.searchsorted(take.tracked, entities)
-    nearest = identity(point_world, true[:, take.tracked], rank, half_diagonal_m=half)
-    return gap, nearest == rank
 
 
 def _kept(take: Take, point_world: Float[np.ndarray, "T 3"], entity: int) -> tuple[int, float]:

@@ -21,7 +21,7 @@ from quest.evaluation.bootstrap import Pool, Value
 from quest.evaluation.drift import clopper_pearson
 from quest.evaluation.records import EntityRecord
 from quest.evaluation.stream_record import runs
-from quest.evaluation.take_suite import TakeSuite
+from quest.evaluation.summary import TakeSuite
 
 STILL = "hold-still"
 """The tracker whose distance tells how far an entity has moved."""
@@ -41,7 +41,6 @@ class Episode:
     """One tracker's answers to one entity that is hidden and maybe seen again."""
 
     record: EntityRecord
-    """All its answers."""
     start: int
     """First hidden frame."""
     end: int
@@ -85,22 +84,17 @@ def reappearances(records: Sequence[EntityRecord], *, resamples: int, seed: int)
     ``beside``: whether a look-alike stays in view (``alike``), none does (``alone``), or ``both`` together. Shares and
     distances after an entity is seen again are over the ``judged``; None where there are none.
 
-    Args:
-        records: of any trackers, :data:`STILL` among them; other suites and protocols are left out.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap; every row draws from a generator of its own.
-
     Raises:
         InputError: an entity has no answer of :data:`STILL`.
     """
     groups: dict[tuple, list[Episode]] = defaultdict(list)
-    order: dict[str, int] = {}
-    for episode in episodes(records):
+    found = episodes(records)
+    trackers = list(dict.fromkeys(e.record.subject.tracker for e in found))
+    for episode in found:
         s = episode.record.subject
         beside = "alike" if TakeSuite.of(episode.record.take).look_alike else "alone"
-        rank = order.setdefault(s.tracker, len(order))
         for kind in (beside, "both"):
-            groups[(s.part, s.source, kind, rank, s.tracker)].append(episode)
+            groups[s.part, s.source, kind, trackers.index(s.tracker), s.tracker].append(episode)
     return [_row(key, groups[key], resamples=resamples, seed=seed) for key in sorted(groups)]
 
 

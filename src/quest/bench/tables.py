@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -23,24 +24,12 @@ from quest.errors import ConfigError
 from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums, distance_at
 from quest.evaluation.records import EntityRecord
-from quest.evaluation.summary import READINGS
+from quest.evaluation.summary import object_of, readings_of
 
 Rows = list[dict[str, Any]]
 Report = Mapping[str, Rows]
 """Rows by the key that they have in the file."""
-
-SETS: Mapping[str, SetName] = {"new motions": "motions", "new views": "views", "new objects": "objects"}
-"""What a network that learned from some objects is judged by; only the first is what the publication seems to do."""
-
-_WHO = "takes = takes_of | objects = source | level = level | of = reading | "
-_COUNTS = "objects/takes/tracks = objects/takes/tracks | "
-_SHOWN = {
-    "ape": "APE = metrics.ape | published = published.ape | ",
-    "ape_2d": "APE_2d = metrics.ape_2d | published = published.ape_2d | ",
-}
-_MORE = "D@50 = metrics.d50 | D@100 = metrics.d100 | published D@100 = published.d100 | "
-_ACC = "Acc % = %metrics.acc | published Acc % = %published.acc | switches = metrics.switches"
-_DIFFERENCE = " | Δ APE = difference.ape | Δ Acc % = %difference.acc"
+Make = Callable[[Workbench], Report]
 
 
 @dataclass(frozen=True)
@@ -49,19 +38,51 @@ class Recipe:
 
     about: str
     """What it says, in one line."""
-    make: Callable[[Workbench], Report]
+    make: Make
     """Makes its rows, and all that they rest on."""
     pages: tuple[Table, ...]
-    """How its rows are shown."""
     figure: Figure | None = None
-    """A picture of them."""
 
 
-def _table(name: str, title: str, columns: str, *, about: str = "", rows: str = "rows", **only: Any) -> Table:
+TABLES: dict[str, Recipe] = {}
+"""Every table by its name on the command line."""
+
+
+def _shown(*pages: Table, figure: Figure | None = None) -> Callable[[Make], Make]:
+    """What the function below makes is a table of its name, shown on these pages; its docstring says what it is of."""
+
+    def add(make: Make) -> Make:
+        TABLES[make.__name__] = Recipe(str(make.__doc__), make, pages, figure)
+        return make
+
+    return add
+
+
+def _page(name: str, title: str, columns: str, *, about: str = "", rows: str = "rows", **only: Any) -> Table:
     return Table(f"bench/{name}.json", title, columns, rows=rows, only=only, about=about)
 
 
-# Rows of distances
+SETS: Mapping[str, SetName] = {"new motions": "motions", "new views": "views", "new objects": "objects"}
+"""What a network that learned from some objects is judged by; only the first is what the publication seems to do."""
+SHARES = tuple(round(0.1 * i, 1) for i in range(11))
+"""Of a take, where the drift curve is read."""
+
+_WHO = "takes = takes_of | objects = source | level = level | of = reading | "
+_COUNTS = "objects/takes/tracks = objects/takes/tracks | "
+_APE = "APE = metrics.ape | published = published.ape | "
+_APE_2D = "APE_2d = metrics.ape_2d | published = published.ape_2d | "
+_MORE = (
+    "D@50 = metrics.d50 | D@100 = metrics.d100 | published D@100 = published.d100 | "
+    "Acc % = %metrics.acc | published Acc % = %published.acc | switches = metrics.switches"
+)
+_LEVELS = Figure("level", "joints that move", (("metrics.ape", "APE"), ("metrics.acc", "Acc")))
+
+
+def _network(name: str, title: str, ape: str = _APE) -> Table:
+    """A page of networks, and how each differs from one of them."""
+    difference = " | Δ APE = difference.ape | Δ Acc % = %difference.acc"
+    return _page(name, title, f"{_WHO}line = line | {_COUNTS}{ape}{_MORE}{difference}", reading="moved")
+
 
 _PUBLISHED_LEVELS: Mapping[str, tuple[Sequence[float], Sequence[float]]] = {
     "full": ((0.065, 0.070, 0.075, 0.081), (0.920, 0.902, 0.883, 0.865)),
@@ -133,14 +154,27 @@ def _compared(bench: Workbench, *, noise: float = 0.0) -> list[Asked]:
     return [*named, Asked("published network", variant=BASES[making.base], noise=noise, reference=first)]
 
 
+@_shown(
+    _page(
+        "comparison",
+        "Comparison",
+        f"{_WHO}tracker = line | {_COUNTS}{_APE}{_MORE}",
+        about="The published network and rivals named -retrained learned from other motions of the objects of "
+        "the first two sets; the others learned from no object how to follow points, but for the noises of our "
+        "filter. Published figures are of other objects.",
+        reading="moved",
+    ),
+    figure=_LEVELS,
+)
 def comparison(bench: Workbench) -> Report:
     """Every tracker at every level."""
     sets: dict[str, TakesName] = {called: takes for called, takes in SETS.items() if takes in bench.making.sets}
     return {"rows": _rows(bench, _compared(bench), sets)}
 
 
+@_shown(_network("levels", "Levels and parts"), figure=_LEVELS)
 def levels(bench: Workbench) -> Report:
-    """What the published network loses without its parts."""
+    """The published network without its queries, 3D or smoothness, and chained flow with noise."""
     base = BASES[bench.making.base]
     lines = [
         Asked("full", variant=base),
@@ -159,87 +193,114 @@ def _variants(bench: Workbench, lines: Mapping[str, Variant], reference: str) ->
     return {"rows": _rows(bench, asked, {"new motions": "motions"}, levels=[max(bench.making.levels)])}
 
 
+@_shown(_network("window", "Windows of T frames", _APE_2D))
 def window(bench: Workbench) -> Report:
-    """Windows of some frames."""
+    """Windows of 2, 4 and 8 frames."""
     return _variants(bench, {f"T = {n}": BASES[bench.making.base].sized("window", n) for n in (2, 4, 8)}, "T = 4")
 
 
+@_shown(_network("slots", "K learned queries", _APE_2D))
 def slots(bench: Workbench) -> Report:
-    """Some learned queries."""
+    """4, 8 and 16 learned queries."""
     return _variants(bench, {f"K = {n}": BASES[bench.making.base].sized("slots", n) for n in (4, 8, 16)}, "K = 8")
 
 
+@_shown(_network("losses", "Each loss left out"))
 def losses(bench: Workbench) -> Report:
-    """The published network without each of its losses."""
+    """Each loss left out."""
     base = BASES[bench.making.base]
     lines = {"all losses": base} | {f"no {loss}": base.without(loss, loss) for loss in trained_losses(base)}
     return _variants(bench, lines, "all losses")
 
 
+@_shown(_network("remedies", "What helps the published network to learn"))
 def remedies(bench: Workbench) -> Report:
-    """The published network with what is said to help the prediction of sets, one by one and together."""
+    """What helps the published network to learn."""
     return _variants(bench, REMEDIES, "as published")
 
 
+@_shown(
+    _page(
+        "noise",
+        "Noise of the colours",
+        f"objects = source | level = level | of = reading | noise % = %noise | tracker = line | {_COUNTS}"
+        "APE = metrics.ape | Acc % = %metrics.acc",
+        about="Published, at 5 % noise: more than 96 % for the network, less than 40 % for its rivals.",
+        reading="moved",
+    ),
+    figure=Figure("noise", "noise", (("metrics.ape", "APE"), ("metrics.acc", "Acc"))),
+)
 def noise(bench: Workbench) -> Report:
-    """Every tracker on noisy colours, at the highest level."""
+    """Every tracker on noisy colours."""
     found: Rows = []
     for share in bench.making.noise:
-        rows = _rows(
-            bench, _compared(bench, noise=share), {"new motions": "motions"}, levels=[max(bench.making.levels)]
-        )
+        asked, highest = _compared(bench, noise=share), [max(bench.making.levels)]
+        rows = _rows(bench, asked, {"new motions": "motions"}, levels=highest)
         found += [row | {"noise": share, "published": None} for row in rows]
     return {"rows": found}
 
 
+@_shown(
+    _page(
+        "drift",
+        "Drift",
+        "objects = source | level = level | of = reading | tracker = line | share of the take % = %share | "
+        "objects/tracks = objects/tracks | D = metrics.distance",
+        share=1.0,
+        reading="moved",
+    ),
+    figure=Figure("share", "share of the take", (("metrics.distance", "D"),), ("source",)),
+)
 def drift(bench: Workbench) -> Report:
-    """Distance over the course of a take, at the highest level."""
+    """Distance over the course of a take."""
     answers = bench.answers(_compared(bench), "motions", [max(bench.making.levels)])
     return {"rows": drift_rows(answers, resamples=bench.making.resamples)}
 
 
-SHARES = tuple(round(0.1 * i, 1) for i in range(11))
-"""Of a take, where the drift curve is read."""
-
-
 def drift_rows(answers: Sequence[Answers], *, resamples: int) -> Rows:
     """D@p of every line for p in :data:`SHARES`, per source and reading."""
-
-    def keys(record: EntityRecord) -> Iterator[tuple[str, str, int]]:
-        for reading in READINGS:
-            if reading == "all" or record.moved:
-                yield record.subject.source, reading, record.subject.level
-
-    groups: dict[tuple[str, str, int], dict[str, list[EntityRecord]]] = {}
+    groups: dict[tuple[str, str, int], dict[str, list[EntityRecord]]] = defaultdict(lambda: defaultdict(list))
     for one in answers:
         for record in one.records:
-            for key in keys(record):
-                groups.setdefault(key, {}).setdefault(one.line, []).append(record)
+            for reading in readings_of(record):
+                groups[record.subject.source, reading, record.subject.level][one.line].append(record)
     rows: Rows = []
     for (source, reading, level), lines in sorted(groups.items()):
         for line, records in lines.items():
-            pool = Pool(records, lambda r: r.subject.object_id, resamples=resamples, seed=0)
-            tracks = len({(r.take, r.view, r.entity) for r in records})
+            pool = Pool(records, object_of, resamples=resamples, seed=0)
+            about = {"line": line, "source": source, "reading": reading, "level": level}
+            counts = {"objects": pool.objects, "tracks": len({(r.take, r.view, r.entity) for r in records})}
             for share in SHARES:
                 value = pool.ratio(_at(records, share))
                 if value is not None:
-                    rows.append(
-                        {"line": line, "source": source, "reading": reading, "level": level, "share": share}
-                        | {"objects": pool.objects, "tracks": tracks, "metrics": {"distance": value}}
-                    )
+                    rows.append(about | {"share": share} | counts | {"metrics": {"distance": value}})
     return rows
 
 
 def _at(records: Sequence[EntityRecord], share: float) -> Sums:
     """Sums of D@p, of takes of any length."""
-    counted = [np.arange(len(r.distance))[None] >= r.first_frame for r in records]
-    each = [distance_at(r.distance[None].astype(float), share, c) for r, c in zip(records, counted, strict=True)]
+    each = [distance_at(r.distance[None].astype(float), share, r.counted[None]) for r in records]
     return Sums(np.concatenate([s.total for s in each]), np.concatenate([s.count for s in each]))
 
 
-# Cases
-
-
+@_shown(
+    _page(
+        "failures",
+        "Occluded for 60 frames",
+        "objects = source | beside = beside | tracker = tracker | occlusions/judged = episodes/judged | "
+        "right before % = %held_before | APE while occluded = ape_hidden | right 5 frames after % = "
+        "%held_again | of those right before % = %held_again_if_before",
+        rows="occlusion",
+        about="The joint moves on while the entity is occluded, and stops.",
+    ),
+    _page(
+        "failures",
+        "Sixteen identical doors",
+        "of = reading | tracker = line | objects/tracks = objects/tracks | switches per 1,000 frames = "
+        "metrics.switches | Acc % = %metrics.acc",
+        rows="lockers",
+    ),
+)
 def failures(bench: Workbench) -> Report:
     """Entities that are occluded for 60 frames, and banks of like doors."""
     # Without the tracker that holds still nobody knows how far an entity moved.
@@ -252,8 +313,16 @@ def failures(bench: Workbench) -> Report:
     }
 
 
+@_shown(
+    _page(
+        "intents",
+        "Open and lift: both rims of a closed laptop",
+        "objects = source | objects/takes/views = objects/takes/views | both stable % = %both | both on their "
+        "link % = %kept | APE open = open_ape | APE lift = lift_ape",
+    )
+)
 def intents(bench: Workbench) -> Report:
-    """What opens a laptop and what lifts it, both asked for by the same label."""
+    """What opens a laptop and what lifts it."""
     store, asked = bench.takes("laptops"), Asked("quest", tracker="quest")
     kept, tracker = bench.kept(asked, "laptops", 0), cache(lambda: build(bench.making, asked, 0))
 
@@ -271,141 +340,15 @@ def intents(bench: Workbench) -> Report:
     return {"rows": intent_rows(answers, resamples=bench.making.resamples, seed=0), "answers": list(map(vars, answers))}
 
 
+@_shown(
+    _page(
+        "speed",
+        "Speed and memory of every tracker",
+        "tracker = line | queries = queries | frames = frames | ms a frame = ms | frames/s = frames_per_s | "
+        "memory, MiB = memory_mib",
+        about="Eight queries, the same clip, one thread, float32; memory is the peak of a process.",
+    )
+)
 def speed(bench: Workbench) -> Report:
-    """Time and memory of every tracker, one after the other in processes of their own."""
+    """Time and memory of every tracker."""
     return {"rows": speed_rows(bench.making, _compared(bench))}
-
-
-_NETWORK = f"{_WHO}line = line | {_COUNTS}"
-_LEVELS = Figure("level", "joints that move", (("metrics.ape", "APE"), ("metrics.acc", "Acc")))
-_MOVED = {"reading": "moved"}
-
-TABLES: Mapping[str, Recipe] = {
-    "comparison": Recipe(
-        "Every tracker at every level.",
-        comparison,
-        (
-            _table(
-                "comparison",
-                "Comparison",
-                f"{_WHO}tracker = line | {_COUNTS}{_SHOWN['ape']}{_MORE}{_ACC}",
-                about="The published network and rivals named -retrained learned from other motions of the objects of "
-                "the first two sets; the others learned from no object how to follow points, but for the noises of our "
-                "filter. Published figures are of other objects.",
-                **_MOVED,
-            ),
-        ),
-        _LEVELS,
-    ),
-    "levels": Recipe(
-        "The published network without its queries, 3D or smoothness, and chained flow with noise.",
-        levels,
-        (_table("levels", "Levels and parts", f"{_NETWORK}{_SHOWN['ape']}{_MORE}{_ACC}{_DIFFERENCE}", **_MOVED),),
-        _LEVELS,
-    ),
-    "window": Recipe(
-        "Windows of 2, 4 and 8 frames.",
-        window,
-        (_table("window", "Windows of T frames", f"{_NETWORK}{_SHOWN['ape_2d']}{_MORE}{_ACC}{_DIFFERENCE}", **_MOVED),),
-    ),
-    "slots": Recipe(
-        "4, 8 and 16 learned queries.",
-        slots,
-        (_table("slots", "K learned queries", f"{_NETWORK}{_SHOWN['ape_2d']}{_MORE}{_ACC}{_DIFFERENCE}", **_MOVED),),
-    ),
-    "losses": Recipe(
-        "Each loss left out.",
-        losses,
-        (_table("losses", "Each loss left out", f"{_NETWORK}{_SHOWN['ape']}{_MORE}{_ACC}{_DIFFERENCE}", **_MOVED),),
-    ),
-    "remedies": Recipe(
-        "What helps the published network to learn.",
-        remedies,
-        (
-            _table(
-                "remedies",
-                "What helps the published network to learn",
-                f"{_NETWORK}{_SHOWN['ape']}{_MORE}{_ACC}{_DIFFERENCE}",
-                **_MOVED,
-            ),
-        ),
-    ),
-    "noise": Recipe(
-        "Every tracker on noisy colours.",
-        noise,
-        (
-            _table(
-                "noise",
-                "Noise of the colours",
-                f"objects = source | level = level | of = reading | noise % = %noise | tracker = line | {_COUNTS}"
-                "APE = metrics.ape | Acc % = %metrics.acc",
-                about="Published, at 5 % noise: more than 96 % for the network, less than 40 % for its rivals.",
-                **_MOVED,
-            ),
-        ),
-        Figure("noise", "noise", (("metrics.ape", "APE"), ("metrics.acc", "Acc"))),
-    ),
-    "drift": Recipe(
-        "Distance over the course of a take.",
-        drift,
-        (
-            _table(
-                "drift",
-                "Drift",
-                "objects = source | level = level | of = reading | tracker = line | share of the take % = %share | "
-                "objects/tracks = objects/tracks | D = metrics.distance",
-                share=1.0,
-                **_MOVED,
-            ),
-        ),
-        Figure("share", "share of the take", (("metrics.distance", "D"),), ("source",)),
-    ),
-    "failures": Recipe(
-        "Entities that are occluded for 60 frames, and banks of like doors.",
-        failures,
-        (
-            _table(
-                "failures",
-                "Occluded for 60 frames",
-                "objects = source | beside = beside | tracker = tracker | occlusions/judged = episodes/judged | "
-                "right before % = %held_before | APE while occluded = ape_hidden | right 5 frames after % = "
-                "%held_again | of those right before % = %held_again_if_before",
-                rows="occlusion",
-                about="The joint moves on while the entity is occluded, and stops.",
-            ),
-            _table(
-                "failures",
-                "Sixteen identical doors",
-                "of = reading | tracker = line | objects/tracks = objects/tracks | switches per 1,000 frames = "
-                "metrics.switches | Acc % = %metrics.acc",
-                rows="lockers",
-            ),
-        ),
-    ),
-    "intents": Recipe(
-        "What opens a laptop and what lifts it.",
-        intents,
-        (
-            _table(
-                "intents",
-                "Open and lift: both rims of a closed laptop",
-                "objects = source | objects/takes/views = objects/takes/views | both stable % = %both | both on their "
-                "link % = %kept | APE open = open_ape | APE lift = lift_ape",
-            ),
-        ),
-    ),
-    "speed": Recipe(
-        "Time and memory of every tracker.",
-        speed,
-        (
-            _table(
-                "speed",
-                "Speed and memory of every tracker",
-                "tracker = line | queries = queries | frames = frames | ms a frame = ms | frames/s = frames_per_s | "
-                "memory, MiB = memory_mib",
-                about="Eight queries, the same clip, one thread, float32; memory is the peak of a process.",
-            ),
-        ),
-    ),
-}
-"""Every table by its name on the command line."""

@@ -9,9 +9,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from quest.baselines import ClipTracker
-from quest.baselines.point_queries import check_point_queries, project_points, query_names
+from quest.baselines.point_queries import answers, check_point_queries, project_points
 from quest.errors import ConfigError
-from quest.types import Clip, Query, State, Take, Tracks
+from quest.types import Clip, Query, Take, Tracks
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,9 @@ class NoisyColours:
     """A tracker that is shown colours with Gaussian noise; of a clip and seed the noise is always the same."""
 
     tracker: ClipTracker
-    """Who answers."""
     noise: float
     """Standard deviation, as a share of the range of the colours."""
     seed: int = 0
-    """Of the noise."""
 
     @property
     def name(self) -> str:
@@ -55,49 +53,31 @@ class ChainedFlow:
     noise: float
     """Standard deviation of each coordinate of a step, in half diagonals of the object."""
     seed: int = 0
-    """Of the noise."""
     name: str = "flow"
     protocols: tuple[str, ...] = ("point",)
 
+    truth: tuple[Take, int] | None = None
+    """A take, and the view of it."""
+
     def told(self, take: Take, view: int) -> ClipTracker:
         """The same, knowing the truth of a take."""
-        return _ToldFlow(self, take, view)
+        return replace(self, truth=(take, view))
 
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
-        """Never asked: it knows nothing before it is :meth:`told`."""
-        raise ConfigError("tracker 'flow': it chains the true flow and can only be judged on takes")
-
-
-@dataclass(frozen=True)
-class _ToldFlow:
-    flow: ChainedFlow
-    take: Take
-    view: int
-
-    @property
-    def name(self) -> str:
-        return self.flow.name
-
-    def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
+        """What the entities nearest to the queries do, and noise that adds up; only when it is :meth:`told`."""
+        if self.truth is None:
+            raise ConfigError("tracker 'flow': it chains the true flow and can only be judged on takes")
         first, uv_first = check_point_queries(clip, queries, tracker=self.name)
         assert queries is not None
-        truth, unit = self.take.point_world, self.take.info.half_diagonal_m
-        asked = [_nearest(self.take, self.view, int(t), uv) for t, uv in zip(first, uv_first, strict=True)]
-        rng = _generator(self.flow.seed, self.take.info.name, str(self.view))
-        step = rng.normal(0.0, self.flow.noise * unit, (len(clip), len(asked), 3))
+        take, view = self.truth
+        asked = [_nearest(take, view, int(t), uv) for t, uv in zip(first, uv_first, strict=True)]
+        rng = _generator(self.seed, take.info.name, str(view))
+        step = rng.normal(0.0, self.noise * take.info.half_diagonal_m, (len(clip), len(asked), 3))
         step[np.arange(len(clip))[:, None] <= first] = 0.0
-        point = (truth[:, asked] + step.cumsum(axis=0)).astype(np.float32)
-        visible = np.ones(point.shape[:2], bool)
-        return Tracks(
-            names=query_names(queries),
-            labels=tuple(q.label for q in queries),
-            uv_px=project_points(clip, point),
-            point_world=point,
-            confidence=visible.astype(np.float32),
-            visible=visible,
-            state=np.full(point.shape[:2], State.TRACKING.value),
-            stamp_s=clip.stamp_s,
-        )
+        point = (take.point_world[:, asked] + step.cumsum(axis=0)).astype(np.float32)
+        visible, uv_px = np.ones(point.shape[:2], bool), project_points(clip, point)
+        sure = visible.astype(np.float32)
+        return answers(clip, queries, uv_px=uv_px, point_world=point, visible=visible, confidence=sure)
 
 
 def _nearest(take: Take, view: int, frame: int, uv_px: np.ndarray) -> int:

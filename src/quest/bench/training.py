@@ -16,7 +16,7 @@ from quest.bench.variants import Variant
 from quest.data.provenance import code_commit, combined_hash
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.results import write_report
+from quest.evaluation.report import write_report
 from quest.model.weights import find_weights
 from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.objective import PaperStageOne

@@ -21,13 +21,10 @@ class Variant:
     name: str
     """Of its folder."""
     network: PaperConfig = field(default_factory=PaperConfig)
-    """What it is."""
     losses: Mapping[str, float] = field(default_factory=dict)
     """Weights of losses that differ from the published ones."""
     windows: WindowConfig = field(default_factory=WindowConfig)
-    """How windows are drawn."""
     order: Order = "match"
-    """How entities get their slots."""
 
     def without(self, name: str, *losses: str) -> Variant:
         """The same trained without some losses."""

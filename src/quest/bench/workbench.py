@@ -13,13 +13,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+import torch
 from rich.console import Console
+from torch import Tensor
 
 from quest.baselines import TRACKERS, ClipTracker, line_up
-from quest.bench.encoded import serve_cached
 from quest.bench.rows import Answers
 from quest.bench.settings import Making
 from quest.bench.trackers import ChainedFlow, NoisyColours
@@ -33,8 +36,8 @@ from quest.evaluation.finished import FinishedTakes, KeptAnswers
 from quest.evaluation.runner import evaluate
 from quest.evaluation.selection import Shard, select_takes
 from quest.extras import require
-from quest.model.weights import find_weights
-from quest.paper.network import read_paper
+from quest.model.weights import find_weights, weights_digest
+from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.tracker import PaperTracker
 from quest.sim.cluster import ClusterSettings, connected, produce_on_cluster
 from quest.sim.plan import TakeSpec, parse_object, plan_takes, procedural_objects
@@ -42,6 +45,7 @@ from quest.sim.production import Notice, StudioSettings, TakeSkipped, missing_ta
 from quest.sim.settings import TakeSettings
 from quest.sim.suites import Suite, find_suites
 from quest.track.tracker import pick_device
+from quest.whole_file import whole_file
 
 TakesName = Literal["teach", "choose", "motions", "views", "objects", "hidden", "lockers", "laptops"]
 
@@ -57,7 +61,6 @@ class Asked:
     """Who answers, as one row of a table calls it."""
 
     label: str
-    """In the table."""
     tracker: str = ""
     """One of :data:`quest.baselines.TRACKERS`; empty for a published network, or for the chained true flow."""
     variant: Variant | None = None
@@ -93,9 +96,7 @@ class Workbench:
     """Makes what is missing."""
 
     making: Making
-    """How."""
     console: Console
-    """Says what goes on."""
 
     def answers(self, asked: Sequence[Asked], takes: TakesName, levels: Sequence[int] = ()) -> list[Answers]:
         """The answers of everybody to takes, of every seed where something was trained."""
@@ -243,29 +244,29 @@ def _place(making: Making, asked: Asked, takes: TakesName, seed: int) -> dict[st
     return {"folder": making.work / "answers" / takes / asked.key / f"seed-{seed}", "made_by": digest}
 
 
+@dataclass(frozen=True)
 class _Late:
     """A tracker that is made when it is first asked: where all answers are kept, none is."""
 
+    making: Making
+    asked: Asked
+    seed: int
     protocols = ("point",)
 
-    def __init__(self, making: Making, asked: Asked, seed: int) -> None:
-        self.name = asked.key
-        self._making, self._asked, self._seed = making, asked, seed
-        self._made: ClipTracker | None = None
+    @property
+    def name(self) -> str:
+        return self.asked.key
+
+    @cached_property
+    def tracker(self) -> ClipTracker:
+        return build(self.making, self.asked, self.seed)
 
     def track(self, clip: Any, queries: Any = None) -> Any:
-        """As of the tracker."""
-        return self._tracker().track(clip, queries)
+        return self.tracker.track(clip, queries)
 
     def told(self, take: Any, view: int) -> ClipTracker:
         """The tracker, which knows the truth if it is there to."""
-        tracker = self._tracker()
-        return tracker.told(take, view) if isinstance(tracker, ChainedFlow) else tracker
-
-    def _tracker(self) -> ClipTracker:
-        if self._made is None:
-            self._made = build(self._making, self._asked, self._seed)
-        return self._made
+        return self.tracker.told(take, view) if isinstance(self.tracker, ChainedFlow) else self.tracker
 
 
 def build(making: Making, asked: Asked, seed: int, *, cached: bool = True) -> ClipTracker:
@@ -282,3 +283,25 @@ def build(making: Making, asked: Asked, seed: int, *, cached: bool = True) -> Cl
             serve_cached(network, making.work / "encoded")
         tracker = PaperTracker(network, device=pick_device("auto"), persistent=asked.persistent)
     return NoisyColours(tracker, asked.noise, seed) if asked.noise else tracker
+
+
+def serve_cached(network: PaperNetwork, root: Path) -> None:
+    """Make a network read tokens instead of computing them, as far as they are there.
+
+    Many networks share one frozen encoder. Frames are looked up by their letterboxed colours, and encoded once.
+    """
+    encode, folder = network.encode, root / weights_digest(network.encoder)[:12]
+    folder.mkdir(parents=True, exist_ok=True)
+
+    def read(rgb: Tensor) -> Tensor:
+        return torch.stack([one(image) for image in rgb])
+
+    def one(image: Tensor) -> Tensor:
+        colours = np.ascontiguousarray(image.cpu().numpy())
+        file = folder / f"{hashlib.blake2b(colours.data, digest_size=16).hexdigest()}.npy"
+        if not file.exists():
+            with whole_file(file) as partial, partial.open("wb") as out:
+                np.save(out, encode(image[None])[0].detach().half().cpu().numpy())
+        return torch.from_numpy(np.load(file)).to(image.device).float()
+
+    network.encode = read  # type: ignore[method-assign]

@@ -27,7 +27,6 @@ class Value:
     low: float | None
     """Lower end of the 95 % interval; None with terms of fewer than two objects."""
     high: float | None
-    """Upper end of the interval."""
     count: int
     """How many terms (frames, records or slots) it is over."""
 
@@ -40,7 +39,7 @@ class Pool(Generic[R]):
 
     Args:
         records: what is pooled.
-        object_of: the object of a record.
+        object_of: the object of a record; by default each record is one of its own.
         resamples: of the bootstrap.
         seed: of the bootstrap; pools over the same objects are resampled alike.
         objects: objects that count though they may have no record.
@@ -49,17 +48,20 @@ class Pool(Generic[R]):
     def __init__(
         self,
         records: Iterable[R],
-        object_of: Callable[[Any], str],
+        object_of: Callable[[Any], Any] | None = None,
         *,
         resamples: int,
         seed: int,
-        objects: Iterable[str] = (),
+        objects: Iterable[Any] = (),
     ) -> None:
         self.records: Sequence[R] = list(records)
-        self._object_of = object_of
-        names = sorted({*map(object_of, self.records), *objects})
+        numbers = {id(record): i for i, record in enumerate(self.records)}
+        self._object_of = object_of or (lambda record: numbers[id(record)])
+        names = sorted({*map(self._object_of, self.records), *objects})
         self._index = {name: i for i, name in enumerate(names)}
-        self._draws = draw_objects(len(names), resamples=resamples, generator=np.random.default_rng(seed))
+        share, rng = np.full(len(names), 1.0 / len(names)), np.random.default_rng(seed)
+        self.draws: Int[np.ndarray, "B O"] = rng.multinomial(len(names), share, size=resamples)
+        """How often each object is drawn in each resample of as many objects."""
 
     @property
     def objects(self) -> int:
@@ -81,82 +83,47 @@ class Pool(Generic[R]):
         """Those of the records for which something is true."""
         return self.of(filter(chosen, self.records))
 
-    def ratio(self, sums: Sums) -> Value | None:
-        """The pooled mean of sums per record; None where nothing was counted."""
-        return mean_value(sums, self.owner, self._draws)
-
     def mean(self, total: Callable[[R], float], count: Callable[[R], float] = lambda record: 1.0) -> Value | None:
         """The mean of a value of each record, or of the sum and number of several; None where nothing was counted."""
         terms = np.array([(total(record), count(record)) for record in self.records], np.float64).reshape(-1, 2)
         return self.ratio(Sums(terms[:, 0], terms[:, 1]))
 
+    def ratio(self, sums: Sums) -> Value | None:
+        """The pooled mean of sums per record; None where nothing was counted."""
+        if sums.count.sum() == 0:
+            return None
+        owner, size = self.owner, self.draws.shape[1]
+        total = self.draws @ np.bincount(owner, weights=sums.total, minlength=size)
+        count = self.draws @ np.bincount(owner, weights=sums.count, minlength=size)
+        with_terms = count > 0  # a resample may hold only objects to which the metric does not apply
+        samples = total[with_terms] / count[with_terms]
+        return _value(sums.mean(), samples, int(sums.count.sum()), objects=len(np.unique(owner[sums.count > 0])))
+
     def median(self, values: Callable[[R], Any]) -> Value | None:
         """The median of a value or an array of values of each record, NaN left out; None without any."""
         parts = [np.atleast_1d(np.asarray(values(record), dtype=np.float64)) for record in self.records]
-        owner = np.repeat(self.owner, [len(part) for part in parts])
-        return median_value(np.concatenate([np.zeros(0), *parts]), owner, self._draws)
+        value, owner = np.concatenate([np.zeros(0), *parts]), np.repeat(self.owner, [len(part) for part in parts])
+        value, owner = value[~np.isnan(value)], owner[~np.isnan(value)]
+        if not len(value):
+            return None
+        order = np.argsort(value, kind="stable")
+        ordered, owner = value[order], owner[order]
+        medians = []
+        for drawn in self.draws:
+            below = np.cumsum(drawn[owner])
+            if half := 0.5 * below[-1]:
+                middle = [np.searchsorted(below, half), np.searchsorted(below, half, side="right")]
+                medians.append(ordered[middle].mean())
+        return _value(float(np.median(value)), np.array(medians), len(value), objects=len(np.unique(owner)))
 
-
-def draw_objects(objects: int, *, resamples: int, generator: np.random.Generator) -> Int[np.ndarray, "B O"]:
-    """How often each object is drawn in each resample of as many objects."""
-    return generator.multinomial(objects, np.full(objects, 1.0 / objects), size=resamples)
-
-
-def mean_value(sums: Sums, object_of: Int[np.ndarray, " N"], draws: Int[np.ndarray, "B O"]) -> Value | None:
-    """The pooled mean and its interval; None where nothing was counted.
-
-    Args:
-        sums: per record.
-        object_of: object index per record, below O.
-        draws: from :func:`draw_objects`.
-    """
-    if sums.count.sum() == 0:
-        return None
-    size = draws.shape[1]
-    total = draws @ np.bincount(object_of, weights=sums.total, minlength=size)
-    count = draws @ np.bincount(object_of, weights=sums.count, minlength=size)
-    with_terms = count > 0  # a resample may hold only objects to which the metric does not apply
-    low, high = _percentiles(total[with_terms] / count[with_terms], objects=objects_with_terms(sums, object_of))
-    return Value(sums.mean(), low, high, int(sums.count.sum()))
-
-
-def median_value(
-    value: Float[np.ndarray, " M"], object_of: Int[np.ndarray, " M"], draws: Int[np.ndarray, "B O"]
-) -> Value | None:
-    """The median of pooled terms and its interval; None without terms. NaN terms are left out."""
-    known = ~np.isnan(value)
-    value, object_of = value[known], object_of[known]
-    if not len(value):
-        return None
-    order = np.argsort(value, kind="stable")
-    ordered, owner = value[order], object_of[order]
-    medians = []
-    for drawn in draws:
-        below = np.cumsum(drawn[owner])
-        if half := 0.5 * below[-1]:
-            middle = [np.searchsorted(below, half), np.searchsorted(below, half, side="right")]
-            medians.append(ordered[middle].mean())
-    low, high = _percentiles(np.array(medians), objects=len(np.unique(owner)))
-    return Value(float(np.median(value)), low, high, len(value))
-
-
-def statistic_value(
-    statistic: Callable[[Int[np.ndarray, " O"]], float], draws: Int[np.ndarray, "B O"], *, count: int
-) -> Value | None:
-    """A statistic that is no mean or median, and its interval; None where it is NaN.
-
-    Args:
-        statistic: of how often each object is drawn; NaN where it does not apply.
-        draws: from :func:`draw_objects`.
-        count: how many terms it is over.
-    """
-    objects = draws.shape[1]
-    whole = statistic(np.ones(objects, dtype=draws.dtype))
-    if np.isnan(whole):
-        return None
-    drawn = np.array([statistic(times) for times in draws])
-    low, high = _percentiles(drawn[~np.isnan(drawn)], objects=objects)
-    return Value(float(whole), low, high, count)
+    def statistic(self, statistic: Callable[[Int[np.ndarray, " O"]], float], *, count: int) -> Value | None:
+        """Another statistic, of how often each object is drawn, over so many terms; None where it is NaN."""
+        objects = self.draws.shape[1]
+        whole = statistic(np.ones(objects, dtype=self.draws.dtype))
+        if np.isnan(whole):
+            return None
+        samples = np.array([statistic(times) for times in self.draws])
+        return _value(float(whole), samples[~np.isnan(samples)], count, objects=objects)
 
 
 def interval_over(
@@ -175,17 +142,12 @@ def interval_over(
         seed: of the draws.
     """
     draws = np.random.default_rng(seed).integers(len(units), size=(resamples, len(units)))
-    low, high = np.quantile(statistic(units[draws]), _ENDS)
-    return Value(float(statistic(units)), float(low), float(high), len(units))
+    return _value(float(statistic(units)), statistic(units[draws]), len(units), objects=2)
 
 
-def objects_with_terms(sums: Sums, object_of: Int[np.ndarray, " N"]) -> int:
-    """How many objects have anything that a metric counts."""
-    return len(np.unique(object_of[sums.count > 0]))
-
-
-def _percentiles(samples: np.ndarray, *, objects: int) -> tuple[float | None, float | None]:
+def _value(mean: float, samples: np.ndarray, count: int, *, objects: int) -> Value:
+    """A number with the interval of its samples, which says nothing where terms are of fewer than two objects."""
     if objects < 2 or not len(samples):
-        return None, None
+        return Value(mean, None, None, count)
     low, high = np.quantile(samples, _ENDS)
-    return float(low), float(high)
+    return Value(mean, float(low), float(high), count)

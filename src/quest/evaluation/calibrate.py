@@ -43,13 +43,10 @@ class Fitted:
     calibration: Calibration
     """To be written into the file of calibrations."""
     objects: int
-    """That it was fitted on."""
     streams: int
-    """Of these."""
     frames: int
     """(frame, query) pairs of these that are right or lost."""
     lost_frames: int
-    """Of these."""
     auroc: float
     """Per frame."""
     ece: float

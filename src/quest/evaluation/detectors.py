@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -33,14 +33,13 @@ def replay_statistic(
 ) -> list[Float64[np.ndarray, "_ _"]]:
     """The statistic in every frame and query; minus infinity before a query was asked.
 
-    Args:
-        statistic: collects the evidence; it starts from nothing at the beginning of every block.
-        evidence: per stream; where it is NaN, the statistic stays as it is.
-        records: the streams.
-        block_frames: length of a block.
+    It starts from nothing at the beginning of every block, and stays as it is where the evidence is NaN.
     """
+    by_length: dict[int, list[int]] = defaultdict(list)
+    for i, record in enumerate(records):
+        by_length[len(record)].append(i)
     found: list[np.ndarray] = [np.empty(0)] * len(records)
-    for batch in _batches(records):
+    for batch in by_length.values():
         joined = np.concatenate([evidence[i] for i in batch], axis=1)
         watched = np.concatenate([records[i].watched for i in batch], axis=1)
         cuts = np.cumsum([records[i].band.shape[1] for i in batch])[:-1]
@@ -55,14 +54,6 @@ def replay_statistic(
         for i, own in zip(batch, np.split(path, cuts, axis=1), strict=True):
             found[i] = own
     return found
-
-
-def _batches(records: Sequence[StreamRecord]) -> Iterator[list[int]]:
-    """Indices of streams of one length."""
-    by_length: dict[int, list[int]] = defaultdict(list)
-    for i, record in enumerate(records):
-        by_length[len(record)].append(i)
-    yield from by_length.values()
 
 
 AnyStatistic = TypeVar("AnyStatistic", bound=Statistic)
@@ -81,9 +72,7 @@ class Detector:
     """Something that raises alarms."""
 
     name: str
-    """What tables call it."""
     statistic: Statistic
-    """Collects evidence."""
     maxima: Float64[np.ndarray, " n"]
     """Of the statistic in loss-free calibration streams; ascending."""
     block_frames: int
@@ -94,12 +83,7 @@ class Detector:
     """Whether the score of a frame is meant as a probability."""
 
     def limits(self, frames: int, budget: Budget) -> list[Threshold]:
-        """The threshold in each frame of a stream.
-
-        Args:
-            frames: length of the stream.
-            budget: of false alarms.
-        """
+        """The threshold in each frame of a stream."""
         parts = [
             budget.part(block=b + 1, restart=0, block_frames=self.block_frames)
             for b in range(-(-frames // self.block_frames))
@@ -150,10 +134,6 @@ def rivals(records: Sequence[StreamRecord], *, block_frames: int) -> tuple[Detec
     """CUSUM, Page-Hinkley and a threshold on the tracker's own probability, at their best settings.
 
     Settings are chosen, as the monitor's are, on the streams that it is fitted on; thresholds come from the others.
-
-    Args:
-        records: all calibration streams.
-        block_frames: length of the calibration streams.
 
     Raises:
         ConfigError: the streams do not suffice.

@@ -27,11 +27,9 @@ class Loss:
     """The first lasting loss of a query in a stream, or its first where none lasts."""
 
     query: int
-    """Index of the query."""
     first: int
     """The first frame in which the query is lost at all."""
     start: int
-    """The loss's first frame."""
     deadline: int
     """The frame after the last one in which an alarm still counts."""
     lasts: bool
@@ -51,12 +49,7 @@ def losses(record: StreamRecord) -> list[Loss]:
 
 
 def delay_of(loss: Loss, above: Bool[np.ndarray, " T"]) -> float:
-    """Frames from the start of a loss to the first frame, at or after it, that alarms; infinite if it is missed.
-
-    Args:
-        loss: when it was.
-        above: frames in which the statistic is above its threshold.
-    """
+    """Frames from the start of a loss to the first frame, at or after it, that alarms; infinite if it is missed."""
     frames = np.flatnonzero(above[loss.start : loss.deadline])
     return float(frames[0]) if len(frames) else math.inf
 
@@ -75,13 +68,7 @@ def auroc(score: Float[np.ndarray, " M"], lost: Bool[np.ndarray, " M"]) -> float
 
 
 def ranked_auroc(rank: Int[np.ndarray, " M"], lost: Bool[np.ndarray, " M"], weight: Float[np.ndarray, " M"]) -> float:
-    """:func:`auroc` of weighted frames whose scores have been ranked before, which resampling needs again and again.
-
-    Args:
-        rank: of each score among the different scores.
-        lost: truth.
-        weight: of each.
-    """
+    """:func:`auroc` of weighted frames whose scores have been ranked before, which resampling needs again and again."""
     bad = np.bincount(rank, weights=weight * lost)
     good = np.bincount(rank, weights=weight * ~lost)
     pairs = bad.sum() * good.sum()
@@ -92,13 +79,10 @@ def augrc(area: float, share: float) -> float:
     """Area under the generalised risk-coverage curve: mean share of all frames that are accepted and lost.
 
     Frames are accepted in the order of their scores, the least suspicious first.
+    ``area`` is the AUROC, ``share`` that of lost frames.
 
     Reference: Traub et al., Overcoming common flaws in the evaluation of selective classification systems, NeurIPS
     2024, equation 6.
-
-    Args:
-        area: AUROC.
-        share: of lost frames.
     """
     return (1.0 - area) * share * (1.0 - share) + 0.5 * share**2
 
@@ -109,11 +93,6 @@ def calibration_error(
     """Expected calibration error: mean over frames of | mean P(lost) - share lost | in the frame's bin of P(lost).
 
     Reference: Guo et al., On calibration of modern neural networks, ICML 2017, equation 3.
-
-    Args:
-        p: probability of a loss.
-        lost: truth.
-        weight: of each; all alike by default.
     """
     weight = np.ones(len(p)) if weight is None else weight
     index = np.minimum((p * BINS).astype(int), BINS - 1)
@@ -126,10 +105,6 @@ def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
     """Exact 95 % interval of a share.
 
     Reference: Clopper and Pearson, Biometrika 26, 1934.
-
-    Args:
-        hits: how often it happened.
-        trials: how often it could have; at least 1.
     """
     tail = (1.0 - LEVEL) / 2.0
     low = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from rich import box
 from rich.console import Group, RenderableType
 from rich.table import Table
 
-from quest.evaluation.bootstrap import LEVEL, Value, draw_objects
+from quest.evaluation.bootstrap import LEVEL, Pool, Value
 from quest.evaluation.detectors import Detector, Played, one_part, one_per_object, play
 from quest.evaluation.drift import (
     augrc,
@@ -24,9 +25,10 @@ from quest.evaluation.drift import (
     quantile,
     ranked_auroc,
 )
-from quest.evaluation.report import shown, write_report
+from quest.evaluation.report import write_report
 from quest.evaluation.results import Run
 from quest.evaluation.stream_record import StreamRecord
+from quest.evaluation.tables import shown
 from quest.monitor import Budget
 
 FORMAT = 2
@@ -56,15 +58,12 @@ class AlarmRow:
     low: float | None
     """Lower end of the exact 95 % interval of their share; None without streams."""
     high: float | None
-    """Upper end."""
     all_trials: int
     """All loss-free streams or parts, those of one object dependent on each other."""
     all_false_alarms: int
-    """How many of them raised an alarm."""
     unclear_trials: int
     """How many of :attr:`trials` are not always right, though never lost."""
     unclear_false_alarms: int
-    """How many of these raised an alarm."""
     missed: Value | None
     """Share of judged losses that are missed."""
     early: Value | None
@@ -81,19 +80,13 @@ class DriftRow:
     """One detector on one kind of streams."""
 
     detector: str
-    """Its name."""
     part: str
-    """Part of the object split."""
     source: str
-    """As of :class:`quest.types.TakeInfo`."""
     objects: int
-    """How many."""
     streams: int
-    """How many."""
     frames: int
     """(frame, query) pairs that are right or lost."""
     lost_frames: int
-    """Of these."""
     unclear_frames: int
     """Pairs beside these, which are neither."""
     losses: int
@@ -101,13 +94,11 @@ class DriftRow:
     brief: int
     """Queries that are lost, but never long enough to be judged."""
     auroc: Value | None
-    """Per frame."""
+    """Per frame, like the next two."""
     augrc: Value | None
-    """Per frame."""
     ece: Value | None
-    """Per frame; None where the score is no probability."""
+    """None where the score is no probability."""
     alarms: tuple[AlarmRow, ...]
-    """At every alpha."""
 
 
 def drift_rows(
@@ -120,32 +111,22 @@ def drift_rows(
 ) -> tuple[DriftRow, ...]:
     """Rows per part of the split, source and detector.
 
-    Args:
-        detectors: all calibrated.
-        records: streams to judge on; none of them took part in any calibration.
-        budgets: of false alarms.
-        resamples: of the bootstrap over objects.
-        seed: of the bootstrap.
+    None of the records took part in any calibration of the detectors.
     """
     rows = []
-    kinds = sorted({(r.part, r.source) for r in records})
-    for part, source in kinds:
+    for part, source in sorted({(r.part, r.source) for r in records}):
         group = [r for r in records if (r.part, r.source) == (part, source)]
-        objects = sorted({r.object_id for r in group})
-        draws = draw_objects(len(objects), resamples=resamples, generator=np.random.default_rng(seed))
-        owner = np.array([objects.index(r.object_id) for r in group])
-        rows += [_row(detector, group, owner, draws.astype(np.float64), budgets) for detector in detectors]
+        pool = Pool(group, attrgetter("object_id"), resamples=resamples, seed=seed)
+        rows += [_row(detector, pool, budgets) for detector in detectors]
     return tuple(rows)
 
 
-def _row(
-    detector: Detector, records: list[StreamRecord], owner: np.ndarray, draws: np.ndarray, budgets: Sequence[Budget]
-) -> DriftRow:
-    played = play(detector, records)
-    judged_frames = [r.judged for r in records]
-    score = np.concatenate([s[j] for s, j in zip(played.score, judged_frames, strict=True)])
-    lost = np.concatenate([r.lost[j] for r, j in zip(records, judged_frames, strict=True)])
-    weights = _Weights(np.repeat(owner, [int(j.sum()) for j in judged_frames]), draws)
+def _row(detector: Detector, pool: Pool[StreamRecord], budgets: Sequence[Budget]) -> DriftRow:
+    records, played = pool.records, play(detector, pool.records)
+    judged = [r.judged for r in records]
+    score = np.concatenate([s[j] for s, j in zip(played.score, judged, strict=True)])
+    lost = np.concatenate([r.lost[j] for r, j in zip(records, judged, strict=True)])
+    owner = np.repeat(pool.owner, [int(j.sum()) for j in judged])
     rank = np.unique(score, return_inverse=True)[1]
 
     def area(weight: np.ndarray) -> float:
@@ -154,56 +135,50 @@ def _row(
     def risk(weight: np.ndarray) -> float:
         return augrc(area(weight), float((weight * lost).sum() / weight.sum()))
 
+    def error(weight: np.ndarray) -> float:
+        return calibration_error(score, lost, weight)
+
     every = [loss for r in records for loss in losses(r)]
     return DriftRow(
         detector=detector.name,
         part=records[0].part,
         source=records[0].source,
-        objects=draws.shape[1],
+        objects=pool.objects,
         streams=len(records),
         frames=len(lost),
         lost_frames=int(lost.sum()),
         unclear_frames=sum(int((r.watched & ~r.right & ~r.lost).sum()) for r in records),
         losses=sum(loss.lasts for loss in every),
         brief=sum(not loss.lasts for loss in every),
-        auroc=weights.value(area, len(lost)),
-        augrc=weights.value(risk, len(lost)),
-        ece=weights.value(lambda w: calibration_error(score, lost, w), len(lost)) if detector.probabilistic else None,
-        alarms=tuple(_alarm_row(detector, played, records, owner, draws, budget) for budget in budgets),
+        auroc=_value(area, owner, pool.draws),
+        augrc=_value(risk, owner, pool.draws),
+        ece=_value(error, owner, pool.draws) if detector.probabilistic else None,
+        alarms=tuple(_alarm_row(detector, played, pool, budget) for budget in budgets),
     )
 
 
-@dataclass(frozen=True)
-class _Weights:
-    """Terms and the objects they belong to, for intervals."""
+def _value(metric: Callable[[np.ndarray], float], owner: np.ndarray, draws: np.ndarray) -> Value | None:
+    """A metric of weighted terms with its percentile interval; None where it is not defined or infinite.
 
-    owner: np.ndarray
-    """Object of each term."""
-    draws: np.ndarray
-    """How often each object is drawn in each resample."""
-
-    def value(self, metric: Callable[[np.ndarray], float], count: int) -> Value | None:
-        """The metric and its percentile interval; None where it is not defined or infinite."""
-        mean = metric(np.ones(len(self.owner))) if count else math.nan
-        if not math.isfinite(mean):
-            return None
-        if len(np.unique(self.owner)) < 2:
-            return Value(mean, None, None, count)
-        drawn = (draw[self.owner] for draw in self.draws)
-        samples = np.array([metric(weight) for weight in drawn if weight.sum() > 0])
-        samples = samples[~np.isnan(samples)]
-        low, high = (quantile(samples, share) for share in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0))
-        return Value(mean, _finite(low), _finite(high), count)
+    Args:
+        metric: of the weight of each term.
+        owner: object of each term.
+        draws: how often each object is drawn in each resample.
+    """
+    mean = metric(np.ones(len(owner))) if len(owner) else math.nan
+    if not math.isfinite(mean):
+        return None
+    if len(np.unique(owner)) < 2:
+        return Value(mean, None, None, len(owner))
+    drawn = (draw[owner] for draw in draws.astype(np.float64))
+    samples = np.array([metric(weight) for weight in drawn if weight.sum() > 0])
+    samples = samples[~np.isnan(samples)]
+    low, high = (_finite(quantile(samples, share)) for share in ((1.0 - LEVEL) / 2.0, (1.0 + LEVEL) / 2.0))
+    return Value(mean, low, high, len(owner))
 
 
-def _alarm_row(
-    detector: Detector,
-    played: Played,
-    records: list[StreamRecord],
-    owner: np.ndarray,
-    draws: np.ndarray,
-    budget: Budget,
-) -> AlarmRow:
+def _alarm_row(detector: Detector, played: Played, pool: Pool[StreamRecord], budget: Budget) -> AlarmRow:
+    records = pool.records
     limits = [detector.limits(len(r), budget) for r in records]
     above = [
         path > np.array([limit.value for limit in own])[:, None] for path, own in zip(played.path, limits, strict=True)
@@ -223,11 +198,13 @@ def _alarm_row(
     judged = [(i, loss) for i, r in enumerate(records) for loss in losses(r) if loss.lasts]
     delay = np.array([delay_of(loss, above[i][:, loss.query]) for i, loss in judged])
     early = np.array([above[i][: loss.first, loss.query].any() for i, loss in judged], dtype=np.float64)
-    weights = _Weights(owner[[i for i, _ in judged]] if judged else np.zeros(0, int), draws)
-    missed = np.isinf(delay).astype(np.float64)
+    owner = pool.owner[[i for i, _ in judged]] if judged else np.zeros(0, int)
 
     def mean(terms: np.ndarray) -> Value | None:
-        return weights.value(lambda w: float((w * terms).sum() / w.sum()), len(judged))
+        return _value(lambda w: float((w * terms).sum() / w.sum()), owner, pool.draws)
+
+    def delay_at(share: float) -> Value | None:
+        return _value(lambda w: quantile(delay, share, w), owner, pool.draws)
 
     first = limits[0][0]
     return AlarmRow(
@@ -243,10 +220,10 @@ def _alarm_row(
         all_false_alarms=sum(alarmed.values()),
         unclear_trials=len(unclear),
         unclear_false_alarms=sum(alarmed[place] for place in unclear),
-        missed=mean(missed),
+        missed=mean(np.isinf(delay).astype(np.float64)),
         early=mean(early),
-        delay_median=weights.value(lambda w: quantile(delay, 0.5, w), len(judged)),
-        delay_p90=weights.value(lambda w: quantile(delay, 0.9, w), len(judged)),
+        delay_median=delay_at(0.5),
+        delay_p90=delay_at(0.9),
     )
 
 

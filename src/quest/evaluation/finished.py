@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
 
 from quest.errors import InputError
-from quest.evaluation.records import PER_FRAME, Discovery, EntityRecord, Subject, Unscored
+from quest.evaluation.records import Discovery, TakeOutcome, Unscored, read_records, write_records
 from quest.whole_file import whole_file
 
 
@@ -62,29 +63,16 @@ class KeptAnswers:
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-@dataclass(frozen=True)
-class TakeOutcome:
-    """How all trackers answered in all views of one take."""
-
-    records: tuple[EntityRecord, ...]
-    """Per tracker, protocol, view and scored entity."""
-    discoveries: tuple[Discovery, ...]
-    """Per tracker and view of the semantic protocol."""
-    unscored: tuple[Unscored, ...]
-    """Entities not scored, per view."""
-    moving: bool
-    """Whether the take already moves in frames 0 to 7, against the protocol."""
-
-
 class FinishedTakes(KeptAnswers):
     """A folder with one file for each take that was evaluated."""
 
     def write(self, take: str, data_hash: str, outcome: TakeOutcome) -> None:
         """Keep a take; its file is written whole or not at all."""
-        flat = [{f.name: getattr(r, f.name) for f in fields(r) if f.name not in PER_FRAME} for r in outcome.records]
-        plain = vars(outcome) | {"records": flat}
-        stacked = {n: np.array([getattr(r, n) for r in outcome.records], t) for n, t in PER_FRAME.items()}
-        self.keep(take, {"plain": np.array(json.dumps(plain, default=asdict)), **stacked}, of=data_hash)
+        table = io.BytesIO()
+        write_records(outcome.records, table)
+        plain = json.dumps(vars(outcome) | {"records": ()}, default=asdict)
+        records = np.frombuffer(table.getvalue(), np.uint8)
+        self.keep(take, {"plain": np.array(plain), "records": records}, of=data_hash)
 
     def read(self, take: str, data_hash: str) -> TakeOutcome | None:
         """What was kept of a take; None where nothing was, or of other code, weights or data.
@@ -96,11 +84,9 @@ class FinishedTakes(KeptAnswers):
         if known is None:
             return None
         plain = json.loads(str(known["plain"]))
-        records = (
-            EntityRecord(**flat | {"subject": Subject(**flat["subject"])}, **{n: known[n][i] for n in PER_FRAME})
-            for i, flat in enumerate(plain["records"])
-        )
-        discoveries = map(Discovery.from_json, plain["discoveries"])
         return TakeOutcome(
-            tuple(records), tuple(discoveries), tuple(Unscored(**u) for u in plain["unscored"]), plain["moving"]
+            read_records(io.BytesIO(known["records"].tobytes())),
+            tuple(map(Discovery.from_json, plain["discoveries"])),
+            tuple(Unscored(**u) for u in plain["unscored"]),
+            plain["moving"],
         )

@@ -81,12 +81,6 @@ def distance_px(
 
     Letterboxing scales both axes alike and shifts both points alike, so only the scale matters.
 
-    Args:
-        uv_px: predictions in the source image.
-        true_px: truth in the source image.
-        width: width of the source image, pixels.
-        height: height of the source image, pixels.
-
     Returns:
         :data:`MISSING_PX` where the prediction is not finite; NaN where the truth has no pixel (behind the camera).
     """

@@ -11,14 +11,13 @@ Each view of a take is one clip.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import Literal, Protocol, SupportsIndex, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import linear_sum_assignment
 
 from quest.baselines import ClipTracker
+from quest.baselines.redetect import link
 from quest.errors import ConfigError
 from quest.evaluation.metrics import GATE, distance, distance_px, identity
 from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
@@ -42,16 +41,6 @@ class Oracle(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class ViewOutcome:
-    """What one tracker did in one view."""
-
-    records: tuple[EntityRecord, ...]
-    """One per scored entity."""
-    discovery: Discovery | None = None
-    """Slots and matches; None in the point protocol."""
-
-
 def first_visible(visible: Bool[np.ndarray, "T E"], tracked: Int[np.ndarray, " R"]) -> tuple[np.ndarray, np.ndarray]:
     """Scored entities among the tracked ones, and the first frame in which each is visible."""
     start = visible[:START_FRAMES, tracked]
@@ -67,13 +56,11 @@ def true_queries(view: View, entities: Iterable[SupportsIndex], frames: Iterable
 
 def unscored_entities(take: Take) -> tuple[Unscored, ...]:
     """Entities that could be followed but do not show themselves in the first frames, per view."""
-    missing = []
-    for v, view in enumerate(take.views):
-        scored, _ = first_visible(view.visible, take.tracked)
-        for e in np.setdiff1d(take.tracked, scored):
-            entity = take.info.entities[e]
-            missing.append(Unscored(take.info.name, v, entity.name, entity.label))
-    return tuple(missing)
+    return tuple(
+        Unscored(take.info.name, v, take.info.entities[e].name, take.info.entities[e].label)
+        for v, view in enumerate(take.views)
+        for e in np.setdiff1d(take.tracked, first_visible(view.visible, take.tracked)[0])
+    )
 
 
 def starts_at_rest(take: Take) -> bool:
@@ -82,8 +69,8 @@ def starts_at_rest(take: Take) -> bool:
     return bool((np.linalg.norm(start - start[:1], axis=-1) <= 0.01 * take.info.half_diagonal_m).all())
 
 
-def evaluate_point(tracker: ClipTracker, take: Take, view: int, subject: Subject) -> ViewOutcome:
-    """Ask for every scored entity of a view by its true pixel.
+def evaluate_point(tracker: ClipTracker, take: Take, view: int, subject: Subject) -> tuple[EntityRecord, ...]:
+    """Ask for every scored entity of a view by its true pixel: a record each.
 
     Frames before an entity's query are not scored: nothing was asked yet.
 
@@ -93,45 +80,36 @@ def evaluate_point(tracker: ClipTracker, take: Take, view: int, subject: Subject
     truth = take.views[view]
     scored, first = first_visible(truth.visible, take.tracked)
     if not len(scored):
-        return ViewOutcome(())
+        return ()
     if isinstance(tracker, Oracle):
         tracker = tracker.told(take, view)
-    queries = true_queries(truth, scored, first)
-    tracks = tracker.track(truth.clip, queries)
-    _check(tracks, tracker=tracker.name, frames=len(take), queries=len(queries))
-    answers = np.arange(len(scored))
-    return ViewOutcome(_records(tracks, take, view, subject, scored, first, answers))
+    tracks = tracker.track(truth.clip, true_queries(truth, scored, first))
+    _check(tracks, tracker=tracker.name, frames=len(take), queries=len(scored))
+    return _records(tracks, take, view, subject, scored, first, np.arange(len(scored)))
 
 
-def evaluate_semantic(tracker: ClipTracker, take: Take, view: int, subject: Subject) -> ViewOutcome:
+def evaluate_semantic(
+    tracker: ClipTracker, take: Take, view: int, subject: Subject
+) -> tuple[tuple[EntityRecord, ...], Discovery]:
     """Let the tracker discover, assign its answers to entities once, and score all frames.
 
     Raises:
         ConfigError: the tracker's answer has another number of frames than the clip.
     """
-    truth = take.views[view]
+    truth, info = take.views[view], take.info
     scored, first = first_visible(truth.visible, take.tracked)
     tracks = tracker.track(truth.clip, None)
     _check(tracks, tracker=tracker.name, frames=len(take), queries=None)
-    judged = min(START_FRAMES, len(take)) - 1
-    slots = np.flatnonzero(tracks.confidence[judged] > MIN_CONFIDENCE)
+    slots = np.flatnonzero(tracks.confidence[min(START_FRAMES, len(take)) - 1] > MIN_CONFIDENCE)
     answers = np.full(len(scored), -1)
-    gap = _start_distance(tracks.point_world[:, slots], take.point_world[:, scored], take.info.half_diagonal_m)
+    gap = _start_distance(tracks.point_world[:, slots], take.point_world[:, scored], info.half_diagonal_m)
     slot_labels = np.array([tracks.labels[s] or "" for s in slots], dtype=object)
-    entity_labels = np.array([take.info.entities[e].label for e in scored], dtype=object)
+    entity_labels = np.array([info.entities[e].label for e in scored], dtype=object)
     for k, e in assign(gap, slot_labels[:, None] == entity_labels[None]):
         answers[e] = slots[k]
-    placed = assign(gap, np.ones_like(gap, bool))
-    discovery = Discovery(
-        subject,
-        take.info.name,
-        view,
-        slots=len(slots),
-        matched=int((answers >= 0).sum()),
-        placed=len(placed),
-        entities=len(scored),
-    )
-    return ViewOutcome(_records(tracks, take, view, subject, scored, np.zeros_like(first), answers), discovery)
+    placed, matched = len(assign(gap, np.ones_like(gap, bool))), int((answers >= 0).sum())
+    discovery = Discovery(subject, info.name, view, len(slots), matched, placed, entities=len(scored))
+    return _records(tracks, take, view, subject, scored, np.zeros_like(first), answers), discovery
 
 
 def assign(gap: Float[np.ndarray, "S E"], allowed: Bool[np.ndarray, "S E"]) -> list[tuple[int, int]]:
@@ -141,11 +119,7 @@ def assign(gap: Float[np.ndarray, "S E"], allowed: Bool[np.ndarray, "S E"]) -> l
         gap: mean distance of slot and entity, normalised units; NaN where unknown.
         allowed: pairs of the same label.
     """
-    allowed = allowed & (gap <= GATE)
-    # One forbidden pair costs more than all allowed ones together, so it is only taken where nothing else is left.
-    cost = np.where(allowed, gap, 1.0 + GATE * max(gap.shape, default=0))
-    rows, columns = linear_sum_assignment(cost)
-    return [(int(s), int(e)) for s, e in zip(rows, columns, strict=True) if allowed[s, e]]
+    return [(int(s), int(e)) for s, e in zip(*link(np.where(allowed, gap, np.inf), GATE), strict=True)]
 
 
 def _start_distance(
@@ -177,21 +151,17 @@ def _records(
 ) -> tuple[EntityRecord, ...]:
     """One record per scored entity; ``answers`` is its query's index, -1 if no slot was assigned to it."""
     truth, info = take.views[view], take.info
-    found = answers >= 0
     # A NaN track stands in for the missing answer, so that one rule scores all missing predictions.
-    padded_world = np.concatenate(
-        [tracks.point_world, np.full_like(tracks.point_world[:, :0], np.nan, shape=(len(take), 1, 3))], axis=1
+    point_world, uv_px = (
+        np.concatenate([places, np.full((len(take), 1, places.shape[2]), np.nan, places.dtype)], axis=1)[:, answers]
+        for places in (tracks.point_world, tracks.uv_px)
     )
-    padded_px = np.concatenate([tracks.uv_px, np.full((len(take), 1, 2), np.nan, dtype=tracks.uv_px.dtype)], axis=1)
-    point_world, uv_px = padded_world[:, answers], padded_px[:, answers]
-    unit = info.half_diagonal_m
+    unit, camera, tracked, moved = info.half_diagonal_m, truth.clip.camera, take.tracked, take.moved
     gap = distance(point_world, take.point_world[:, scored], half_diagonal_m=unit)
-    camera = truth.clip.camera
     gap_px = distance_px(uv_px, truth.uv_px[:, scored], width=camera.width, height=camera.height)
-    rank = np.searchsorted(take.tracked, scored)
-    nearest = identity(point_world, take.point_world[:, take.tracked], rank, half_diagonal_m=unit)
-    follows = np.where(nearest >= 0, take.tracked[nearest], nearest)
-    moved = take.moved
+    rank = np.searchsorted(tracked, scored)
+    nearest = identity(point_world, take.point_world[:, tracked], rank, half_diagonal_m=unit)
+    follows = np.where(nearest >= 0, tracked[nearest], nearest)
     return tuple(
         EntityRecord(
             subject=subject,
@@ -201,7 +171,7 @@ def _records(
             name=info.entities[e].name,
             label=info.entities[e].label,
             moved=bool(moved[e]),
-            found=bool(found[k]),
+            found=bool(answers[k] >= 0),
             first_frame=int(first[k]),
             distance=gap[:, k].astype(np.float32),
             distance_px=gap_px[:, k].astype(np.float32),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ import pyarrow.parquet as pq
 from jaxtyping import Bool, Float32, Int16
 
 from quest.errors import InputError
-from quest.whole_file import whole_file
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,6 @@ class Subject:
     """What a table row is about: records with equal subjects but for the object belong to one row."""
 
     tracker: str
-    """Its name."""
     protocol: str
     """``point`` or ``semantic``."""
     part: str
@@ -34,7 +33,6 @@ class Subject:
     level: int
     """How many joints move one after the other."""
     object_id: str
-    """The object."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +40,12 @@ class EntityRecord:
     """How one tracker answered for one entity in one view of one take."""
 
     subject: Subject
-    """Tracker, protocol and object."""
     take: str
-    """Name of the take."""
     view: int
-    """Index of the view."""
     entity: int
     """Index of the entity in the take."""
     name: str
-    """The entity's name."""
     label: str
-    """The entity's label."""
     moved: bool
     """Whether it is at some time more than 0.1 from rest."""
     found: bool
@@ -68,17 +61,19 @@ class EntityRecord:
     visible: Bool[np.ndarray, " T"]
     """Whether the entity is seen."""
 
+    @property
+    def counted(self) -> Bool[np.ndarray, " T"]:
+        """Which frames are scored."""
+        return np.arange(len(self.distance)) >= self.first_frame
+
 
 @dataclass(frozen=True)
 class Discovery:
     """How many answers a tracker gave unasked in one view, and how many of them were entities."""
 
     subject: Subject
-    """Tracker, protocol and object."""
     take: str
-    """Name of the take."""
     view: int
-    """Index of the view."""
     slots: int
     """Answers."""
     matched: int
@@ -99,33 +94,40 @@ class Unscored:
     """An entity that is not scored in a view, because it is not visible in frames 0 to 7."""
 
     take: str
-    """Name of the take."""
     view: int
-    """Index of the view."""
     name: str
-    """The entity's name."""
     label: str
-    """The entity's label."""
+
+
+@dataclass(frozen=True)
+class TakeOutcome:
+    """How all trackers answered in all views of one take."""
+
+    records: tuple[EntityRecord, ...]
+    """Per tracker, protocol, view and scored entity."""
+    discoveries: tuple[Discovery, ...]
+    """Per tracker and view of the semantic protocol."""
+    unscored: tuple[Unscored, ...]
+    moving: bool
+    """Whether the take already moves in frames 0 to 7, against the protocol."""
 
 
 PER_FRAME = {"distance": np.float32, "distance_px": np.float32, "follows": np.int16, "visible": np.bool_}
 """Fields of a record that have a value in every frame, and their types."""
+_OF_SUBJECT = tuple(f.name for f in fields(Subject))
 
 
-def write_records(records: Sequence[EntityRecord], path: Path) -> None:
-    """Write records as Parquet, one row each with lists over frames; atomic."""
-    flat = [f.name for f in fields(EntityRecord) if f.name != "subject" and f.name not in PER_FRAME]
-    columns: dict[str, list] = {f.name: [getattr(r.subject, f.name) for r in records] for f in fields(Subject)}
-    columns |= {name: [getattr(r, name) for r in records] for name in flat}
-    arrays = {name: pa.array(values) for name, values in columns.items()}
-    for name, dtype in PER_FRAME.items():
-        item = pa.from_numpy_dtype(dtype)
-        arrays[name] = pa.array([getattr(r, name) for r in records], type=pa.list_(item))
-    with whole_file(path) as partial:
-        pq.write_table(pa.table(arrays), partial, compression="zstd")
+def write_records(records: Sequence[EntityRecord], file: Path | BytesIO) -> None:
+    """Write records as Parquet, one row each with lists over frames."""
+    own = [f.name for f in fields(EntityRecord)[1:]]
+    columns = {name: pa.array([getattr(r.subject, name) for r in records]) for name in _OF_SUBJECT}
+    for name in own:
+        kind = pa.list_(pa.from_numpy_dtype(PER_FRAME[name])) if name in PER_FRAME else None
+        columns[name] = pa.array([getattr(r, name) for r in records], type=kind)
+    pq.write_table(pa.table(columns), file, compression="zstd")
 
 
-def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
+def read_records(path: str | Path | BytesIO) -> tuple[EntityRecord, ...]:
     """Read what :func:`write_records` wrote.
 
     Raises:
@@ -134,10 +136,8 @@ def read_records(path: str | Path) -> tuple[EntityRecord, ...]:
     records = []
     try:
         for row in pq.read_table(path).to_pylist():
-            subject = Subject(**{f.name: row.pop(f.name) for f in fields(Subject)})
-            per_frame: dict[str, Any] = {
-                name: np.array(row.pop(name), dtype=dtype) for name, dtype in PER_FRAME.items()
-            }
+            subject = Subject(**{name: row.pop(name) for name in _OF_SUBJECT})
+            per_frame: dict[str, Any] = {name: np.array(row.pop(name), kind) for name, kind in PER_FRAME.items()}
             records.append(EntityRecord(subject=subject, **row, **per_frame))
     except (OSError, pa.ArrowInvalid, KeyError, TypeError) as error:
         raise InputError(f"records {path}: expected a Parquet file written by `quest eval --out` ({error})") from error

@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-import json
-import os
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from quest.data.provenance import code_commit, command_line, file_hash, machine, package_versions
+from quest.data.provenance import command_line, file_hash
 from quest.errors import InputError
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.records import Discovery, EntityRecord, Unscored, write_records
+from quest.evaluation.report import provenance, write_report
 from quest.evaluation.summary import Metrics, Row
 from quest.untrusted import read_json, reading
 from quest.whole_file import whole_file
 
 FORMAT = 1
 """Version of the result file."""
-_OF_RECORDS = ("records", "records_hash")
 
 
 @dataclass(frozen=True)
@@ -29,7 +25,6 @@ class Run:
     """What made the numbers."""
 
     command: str
-    """The command line."""
     commit: str
     """Commit of the checkout, with ``+dirty`` where files differ from it; the version where there is none."""
     data_hash: str
@@ -39,36 +34,22 @@ class Run:
     weights_hash: str | None
     """SHA-256 of the weights file, where it is known."""
     resamples: int
-    """Of the bootstrap over objects."""
     seed: int
-    """Of the bootstrap."""
     machine: str
     """Operating system, processor and cores."""
     versions: dict[str, str]
-    """Of Python and the packages that compute."""
     stamp: str
     """Date and time of the end, UTC."""
     seconds: float
-    """Duration."""
 
     @classmethod
-    def ended(
-        cls, start_s: float, *, data_hash: str, weights: str | None, weights_hash: str | None, resamples: int, seed: int
-    ) -> Run:
-        """The run of this process, which began at a reading of the monotonic clock and ends now."""
-        return cls(
-            command=command_line(),
-            commit=code_commit(),
-            data_hash=data_hash,
-            weights=weights,
-            weights_hash=weights_hash,
-            resamples=resamples,
-            seed=seed,
-            machine=machine(),
-            versions=package_versions(),
-            stamp=datetime.now(UTC).isoformat(timespec="seconds"),
-            seconds=round(time.monotonic() - start_s, 1),
-        )
+    def ended(cls, start_s: float, **about: Any) -> Run:
+        """The run of this process, which began at a reading of the monotonic clock and ends now.
+
+        ``about`` has the hash of the data, weights and their hash, and resamples and seed of the bootstrap.
+        """
+        seconds = round(time.monotonic() - start_s, 1)
+        return cls(**provenance() | about | {"command": command_line(), "seconds": seconds})
 
 
 @dataclass(frozen=True)
@@ -76,13 +57,10 @@ class Results:
     """Rows and what they rest on."""
 
     run: Run
-    """What made them."""
     rows: tuple[Row, ...]
-    """The table."""
     discoveries: tuple[Discovery, ...] = ()
     """Answers and matches per view, in the semantic protocol."""
     unscored: tuple[Unscored, ...] = ()
-    """Entities that were not scored."""
     notes: tuple[str, ...] = ()
     """What a reader must know, in words."""
 
@@ -93,27 +71,10 @@ def records_path(path: str | Path) -> Path:
     return path.with_name(f"{path.stem}.records.parquet")
 
 
-def write_report(report: Mapping[str, Any], path: Path) -> None:
-    """Write a report as JSON, whole or not at all.
-
-    Args:
-        report: plain values and dataclasses of such.
-        path: the file; its folder is made.
-    """
-    text = json.dumps(report, indent=1, allow_nan=False, default=asdict)
-    with whole_file(path) as partial, partial.open("w", encoding="utf-8") as file:
-        file.write(text + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
 def write_results(results: Results, path: str | Path, *, records: tuple[EntityRecord, ...] = ()) -> None:
     """Write the result file, and the records beside it; each is written whole or not at all.
 
-    Args:
-        results: what to write.
-        path: a file ending in ``.json``.
-        records: what the rows were computed from; nothing is written beside where empty.
+    The name ends in ``.json``; nothing is written beside without records.
 
     Raises:
         InputError: the name does not end in ``.json``.
@@ -121,13 +82,13 @@ def write_results(results: Results, path: str | Path, *, records: tuple[EntityRe
     path = Path(path)
     if path.suffix != ".json":
         raise InputError(f"results {path}: expected a file name that ends in .json; the records go beside it")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = records_path(path)
+    beside, about = records_path(path), {"records": None, "records_hash": None}
     if records:
-        write_records(records, beside)
+        with whole_file(beside) as partial:
+            write_records(records, partial)
+        about = {"records": beside.name, "records_hash": file_hash(beside)}
     else:
         beside.unlink(missing_ok=True)  # of an earlier run
-    about = {"records": beside.name, "records_hash": file_hash(beside)} if records else dict.fromkeys(_OF_RECORDS)
     write_report({"format": FORMAT} | about | vars(results), path)
 
 
@@ -144,14 +105,12 @@ def read_results(path: str | Path) -> Results:
             raise InputError(f"results {path}: expected format {FORMAT}, got {raw['format']}; run `quest eval` again")
         return Results(
             run=Run(**raw["run"]),
-            rows=tuple(_row(row) for row in raw["rows"]),
+            rows=tuple(Row(**row | {"metrics": _metrics(row["metrics"])}) for row in raw["rows"]),
             discoveries=tuple(map(Discovery.from_json, raw["discoveries"])),
             unscored=tuple(Unscored(**u) for u in raw["unscored"]),
             notes=tuple(raw["notes"]),
         )
 
 
-def _row(raw: dict[str, Any]) -> Row:
-    values = raw["metrics"]
-    metrics = {name: None if value is None else Value(**value) for name, value in values.items()}
-    return Row(**{**raw, "metrics": Metrics(**metrics)})
+def _metrics(raw: dict[str, Any]) -> Metrics:
+    return Metrics(**{name: None if value is None else Value(**value) for name, value in raw.items()})

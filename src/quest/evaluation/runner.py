@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
+from quest.baselines import ClipTracker
 from quest.data.split import SplitPart
 from quest.data.store import TakeStore
 from quest.errors import ConfigError
-from quest.evaluation.finished import FinishedTakes, TakeOutcome
+from quest.evaluation.finished import FinishedTakes
 from quest.evaluation.protocols import (
-    ClipTracker,
     ProtocolName,
-    ViewOutcome,
     evaluate_point,
     evaluate_semantic,
     starts_at_rest,
     unscored_entities,
 )
-from quest.evaluation.records import Discovery, EntityRecord, Subject, Unscored
+from quest.evaluation.records import Discovery, EntityRecord, Subject, TakeOutcome, Unscored
 from quest.evaluation.selection import WHOLE, Shard
 from quest.types import Take
 
@@ -28,11 +28,8 @@ class Evaluated:
     """Everything that an evaluation found out."""
 
     records: tuple[EntityRecord, ...]
-    """Per tracker, take, view and scored entity."""
     discoveries: tuple[Discovery, ...]
-    """Per tracker, take and view of the semantic protocol."""
     unscored: tuple[Unscored, ...]
-    """Entities not scored, per take and view."""
     notes: tuple[str, ...]
     """What a reader must know, in words."""
     missing: int = 0
@@ -106,42 +103,30 @@ def evaluate(
             finished.write(name, hashes[name], done[name])
     tell("done", 0)
     missing = sum(not take_up(name) for name in takes if name not in done)  # only now: other shards went on meanwhile
-    return _joined({name: done[name] for name in takes if name in done}, protocols, missing)
+    outcomes = {name: done[name] for name in takes if name in done}
+    records, discoveries, unscored = (
+        tuple(chain.from_iterable(getattr(outcome, what) for outcome in outcomes.values()))
+        for what in ("records", "discoveries", "unscored")
+    )
+    moving = [name for name, outcome in outcomes.items() if outcome.moving]
+    return Evaluated(records, discoveries, unscored, _notes(unscored, moving, protocols), missing)
 
 
 def _evaluate_take(
     take: Take, runs: Sequence[tuple[ProtocolName, ClipTracker]], part: SplitPart, tell: Callable[[str, int], None]
 ) -> TakeOutcome:
-    records: list[EntityRecord] = []
-    discoveries: list[Discovery] = []
+    info, records, discoveries = take.info, list[EntityRecord](), list[Discovery]()
     for view in range(len(take.views)):
         for protocol, tracker in runs:
-            tell(f"{tracker.name} {protocol} {take.info.name}", len(take))
-            outcome = _evaluate_view(tracker, protocol, take, view, part)
-            records += outcome.records
-            discoveries += () if outcome.discovery is None else (outcome.discovery,)
-    return TakeOutcome(
-        tuple(records), tuple(discoveries), tuple(unscored_entities(take)), moving=not starts_at_rest(take)
-    )
-
-
-def _joined(done: Mapping[str, TakeOutcome], protocols: Sequence[ProtocolName], missing: int) -> Evaluated:
-    unscored = tuple(u for outcome in done.values() for u in outcome.unscored)
-    moving = [name for name, outcome in done.items() if outcome.moving]
-    return Evaluated(
-        tuple(r for outcome in done.values() for r in outcome.records),
-        tuple(d for outcome in done.values() for d in outcome.discoveries),
-        unscored,
-        _notes(unscored, moving, protocols),
-        missing,
-    )
-
-
-def _evaluate_view(tracker: ClipTracker, protocol: ProtocolName, take: Take, view: int, part: SplitPart) -> ViewOutcome:
-    info = take.info
-    subject = Subject(tracker.name, protocol, part, info.source, info.level, info.object_id)
-    run = evaluate_point if protocol == "point" else evaluate_semantic
-    return run(tracker, take, view, subject)
+            tell(f"{tracker.name} {protocol} {info.name}", len(take))
+            subject = Subject(tracker.name, protocol, part, info.source, info.level, info.object_id)
+            if protocol == "point":
+                records += evaluate_point(tracker, take, view, subject)
+            else:
+                found, discovery = evaluate_semantic(tracker, take, view, subject)
+                records += found
+                discoveries.append(discovery)
+    return TakeOutcome(tuple(records), tuple(discoveries), unscored_entities(take), moving=not starts_at_rest(take))
 
 
 def _notes(unscored: Sequence[Unscored], moving: Sequence[str], protocols: Sequence[ProtocolName]) -> tuple[str, ...]:

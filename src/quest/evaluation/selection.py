@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from quest.data.provenance import combined_hash
 from quest.data.split import PARTS, SplitPart, part_of
@@ -20,7 +19,6 @@ class Shard:
     index: int = 0
     """From 0."""
     count: int = 1
-    """How many parts there are."""
 
     @classmethod
     def parse(cls, text: str) -> Shard:
@@ -89,23 +87,6 @@ def select_takes(
             f"the store has {_list(infos)}. Training objects are only evaluated with --split train"
         )
     return kept
-
-
-def select_in(stores: Sequence[TakeStore], **choice: Any) -> Chosen:
-    """:func:`select_takes` of several stores together; stores of which no take is left are omitted.
-
-    Raises:
-        ConfigError: as there, or two stores have a take of one name.
-    """
-    infos = [store.infos() for store in stores]
-    names = [name for own in infos for name in own]
-    if twice := sorted(name for name in set(names) if names.count(name) > 1):
-        raise ConfigError(f"takes: expected different names in all stores, {twice[0]!r} comes twice; omit one of them")
-    parts = select_takes({name: info for own in infos for name, info in own.items()}, **choice)
-    found: list[tuple[TakeStore, dict[str, SplitPart]]] = [
-        (store, {name: parts[name] for name in own if name in parts}) for store, own in zip(stores, infos, strict=True)
-    ]
-    return [each for each in found if each[1]]
 
 
 def hash_of(takes: Chosen) -> str:

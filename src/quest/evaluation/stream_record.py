@@ -48,19 +48,13 @@ class StreamRecord:
     """One stream: a view of a take, watched by a tracker whose monitor was switched off."""
 
     take: str
-    """Name of the take."""
     view: int
-    """Index of the view."""
     object_id: str
-    """The object."""
     source: str
-    """As of :class:`quest.types.TakeInfo`."""
     part: str
-    """Part of the object split."""
     level: int
     """How many joints move one after the other."""
     inputs: Inputs
-    """What the frames brought."""
     stamp_s: Float64[np.ndarray, " T"]
     """Time of each frame, seconds."""
     log_odds: Float32[np.ndarray, "T K"]
@@ -116,14 +110,6 @@ def bands(
     entity; so is one whose entity is seen and whose pixel is within :data:`LIFTING_PX`. It is lost beyond :data:`FAR`,
     and beyond :data:`NEAR` where another entity is less than half as far away. Of colours alone pixels tell the same,
     while the entity is in view. What is lost for less than :data:`LEAST_S` is unclear.
-
-    Args:
-        take: the truth.
-        view: index of the view.
-        uv_px: answers, pixels of the source image.
-        point_world: answers, metres.
-        entities: index in the take of the entity that each query asked for; all of them followable.
-        inputs: what the tracker saw.
     """
     truth, camera = take.views[view], take.views[view].clip.camera
     answer_px, true_px = np.broadcast_arrays(uv_px[:, :, None], truth.uv_px[:, None, take.tracked])
@@ -180,12 +166,7 @@ def runs(flags: Bool[np.ndarray, " T"]) -> list[tuple[int, int]]:
 def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs: Inputs) -> StreamRecord | None:
     """Ask for every entity that is visible in frame 0 by its true pixel, and step through the view.
 
-    Args:
-        tracker: its monitor is switched off.
-        take: with ground truth.
-        view: index of the view.
-        part: part of the object split.
-        inputs: what the tracker sees of the frames.
+    The monitor of the tracker is switched off.
 
     Returns:
         None if no entity is visible in frame 0.
@@ -308,11 +289,6 @@ def write_record(record: StreamRecord | None, path: Path, *, made_by: str, take_
 
 def read_records(folder: str | Path, *, inputs: Inputs, made_by: str) -> tuple[StreamRecord, ...]:
     """All records of a folder that one tracker made of one kind of frames, by file name.
-
-    Args:
-        folder: that :func:`record_streams` filled.
-        inputs: what the frames brought.
-        made_by: from :func:`tracker_id`.
 
     Raises:
         InputError: there are none, or one is damaged.

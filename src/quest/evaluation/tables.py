@@ -1,10 +1,11 @@
-"""Result rows as a table in the terminal."""
+"""Result rows as tables in the terminal."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from typing import Any
 
 from rich import box
 from rich.console import Group, RenderableType
@@ -13,7 +14,7 @@ from rich.text import Text
 
 from quest.evaluation.bootstrap import Value
 from quest.evaluation.results import Results
-from quest.evaluation.take_suite import STANDARD
+from quest.evaluation.summary import STANDARD
 
 
 @dataclass(frozen=True)
@@ -21,11 +22,9 @@ class Column:
     """A metric's column."""
 
     field: str
-    """Of :class:`quest.evaluation.summary.Metrics`."""
+    """Of a row's values, such as :class:`quest.evaluation.summary.Metrics`."""
     heading: str
-    """Above it."""
     decimals: int
-    """Shown."""
     factor: float
     """100 for shares that are shown in percent."""
     rank: int
@@ -52,10 +51,8 @@ COLUMNS = (
 PART_TITLES = {"train": "TRAINING OBJECTS, no measure of generalisation", "unlisted": "objects outside the split"}
 FULL_WIDTH = 170
 """Enough for every column; for output that goes to a file."""
-
 GAP = 3
 """Characters between columns: padding on both sides and the box's divider."""
-
 LEGEND = (
     "cells: mean over frames, entities and views; below it the 95 % bootstrap interval over objects (two objects or "
     "more). n: objects/takes/tracks. Distances in normalised units, pixels of a 224 x 224 input"
@@ -65,9 +62,7 @@ LEGEND = (
 def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableType:
     """All rows as tables, one per protocol, part of the split, source and suite, followed by notes and what made them.
 
-    Args:
-        results: what to show.
-        width: of the terminal in characters; columns that do not fit are left out whole.
+    Columns that do not fit into so many characters are left out whole.
     """
     parts: list[RenderableType] = []
     dropped: set[str] = set()
@@ -80,19 +75,17 @@ def results_table(results: Results, *, width: int = FULL_WIDTH) -> RenderableTyp
         title = f"{protocol} · {source} · {PART_TITLES.get(part, f'{part} objects')}"
         title += "" if suite == STANDARD else f" · suite {suite}"
         style = "bold red" if part == "train" else "bold"
-        shown = columns_table(title, ("L", "of", "tracker", "n"), rows, COLUMNS, width, style=style, once=2)
+        table = columns_table(title, ("L", "of", "tracker", "n"), rows, COLUMNS, width, style=style, once=2)
         known = {c.heading for c in COLUMNS if any(values[c.field] for _, values in rows)}
-        dropped |= known - {str(column.header) for column in shown.columns}
-        parts.append(shown)
+        dropped |= known - {str(column.header) for column in table.columns}
+        parts.append(table)
     run = results.run
     small = [LEGEND, *results.notes]
     if dropped:
         small.append(f"not shown for want of width: {', '.join(sorted(dropped))}")
-    small.append(
-        f"commit {run.commit}, data {run.data_hash[:12]}" + (f", weights {run.weights}" if run.weights else "")
-    )
-    parts += [Text(line, style="dim") for line in small]
-    return Group(*parts)
+    weights = f", weights {run.weights}" if run.weights else ""
+    small.append(f"commit {run.commit}, data {run.data_hash[:12]}{weights}")
+    return Group(*parts, *(Text(line, style="dim") for line in small))
 
 
 def columns_table(
@@ -119,7 +112,7 @@ def columns_table(
     left = width - sum(max(map(len, texts)) + GAP for texts in zip(headings, *(head for head, _ in rows), strict=True))
     kept = []
     for column in sorted((c for c in columns if any(values.get(c.field) for _, values in rows)), key=lambda c: c.rank):
-        lines = [line for _, values in rows for line in cell(values.get(column.field), column).plain.split("\n")]
+        lines = [line for _, values in rows for line in _cell(values.get(column.field), column).plain.split("\n")]
         left -= max(map(len, [column.heading, *lines])) + GAP
         if left < 0:
             break
@@ -137,25 +130,31 @@ def columns_table(
         if once and before is not None and head[:once] != before:
             table.add_section()
         lead = ("",) * once if head[:once] == before else head[:once]
-        table.add_row(*lead, *head[once:], *(cell(values.get(column.field), column) for column in kept))
+        table.add_row(*lead, *head[once:], *(_cell(values.get(column.field), column) for column in kept))
         before = head[:once]
     return table
 
 
-def cell(value: Value | None, column: Column) -> Text:
-    """A number, and below it its interval."""
+def _cell(value: Value | None, column: Column) -> Text:
+    """A number, and below it its interval without the zeros before the points."""
     if value is None:
         return Text("-", style="dim")
-
-    def show(number: float) -> str:
-        return f"{column.factor * number:.{column.decimals}f}"
-
-    text = Text(show(value.mean))
-    if value.low is not None and value.high is not None:
-        text.append(f"\n{_short(show(value.low))}–{_short(show(value.high))}", style="dim")
-    return text
+    texts = [
+        "" if number is None else f"{column.factor * number:.{column.decimals}f}"
+        for number in (value.mean, value.low, value.high)
+    ]
+    low, high = (text.replace("0.", ".", 1) if text.startswith(("0.", "-0.")) else text for text in texts[1:])
+    return Text.assemble(texts[0], (f"\n{low}–{high}" if low and high else "", "dim"))
 
 
-def _short(number: str) -> str:
-    """A number without the zero before its point."""
-    return number.replace("0.", ".", 1) if number.startswith(("0.", "-0.")) else number
+def shown(value: Any, *, decimals: int = 3, factor: float = 1.0, none: str = "-") -> str:
+    """A number, with its interval if it has one, or a word."""
+    if value is None or isinstance(value, bool | int | str):
+        return none if value is None else str(value)
+    if isinstance(value, float):
+        return f"{factor * value:.{decimals}f}"
+    middle, low, high = value.mean, value.low, value.high
+    if low is None and high is None:
+        return f"{factor * middle:.{decimals}f}"
+    ends = ["∞" if end is None else f"{factor * end:.{decimals}f}" for end in (low, high)]
+    return f"{factor * middle:.{decimals}f} ({(' to ' if '-' in ends[0] else '–').join(ends)})"

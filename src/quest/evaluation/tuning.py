@@ -18,7 +18,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from quest.errors import ConfigError
-from quest.evaluation.real.measures import ScoredPicture, score_picture
+from quest.evaluation.real.measures import score_picture
 from quest.evaluation.real.run import discover
 from quest.evaluation.real.sets import Picture
 from quest.evaluation.selection import Chosen
@@ -54,16 +54,12 @@ class Tuned:
     precision: tuple[float, ...]
     """Of discovery in each."""
     recall: tuple[float, ...]
-    """The same."""
 
 
 def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
     """Fit scores and threshold.
 
-    Args:
-        tracker: with the network, and the size at which it looks.
-        pictures: labelled ones that did not teach.
-        takes: stores with takes of validation objects, of which the first frames are used.
+    Pictures did not teach; takes, of which the first frames are used, are of validation objects.
 
     Raises:
         ConfigError: there is nothing to choose by, nothing was found, or a take is not of a validation object.
@@ -75,7 +71,7 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
     config = replace(tracker.config, gain=1.0, bias=0.0, panel_gain=1.0, panel_bias=0.0)
     plain = Tracker(tracker.network, config, device=tracker.device)
     scored = [score_picture(picture, discover(plain, picture.read())) for picture in pictures]
-    grips = {"pictures": _in_pictures(scored)} if scored else {}
+    grips = {"pictures": _joined([Answers(s.score, s.first, len(s.found)) for s in scored])} if scored else {}
     grips |= {"takes": _in_takes(plain, takes, GRIPS)} if parts else {}
     if not any(answers.right.any() for answers in grips.values()):
         raise ConfigError(
@@ -83,9 +79,10 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
         )
     gain, bias = _fit(list(grips.values()))
     config = replace(tracker.config, gain=gain, bias=bias)
-    panels = [_panels_in(scored)] if scored else []
-    if any(answers.right.any() for answers in panels):
-        panel_gain, panel_bias = _fit(panels)
+    boxes = [s.boxes[kind] for s in scored for kind in PANELS if kind in s.boxes]
+    panels = _joined([Answers(b.score, b.first, b.labelled) for b in boxes]) if scored else None
+    if panels is not None and panels.right.any():
+        panel_gain, panel_bias = _fit([panels])
         config = replace(config, panel_gain=panel_gain, panel_bias=panel_bias)
     found = {name: replace(a, logit=gain * a.logit + bias) for name, a in grips.items()}
     if parts:
@@ -96,20 +93,10 @@ def tune(tracker: Tracker, pictures: Sequence[Picture], takes: Chosen) -> Tuned:
     return Tuned(replace(config, threshold=float(expit(threshold))), tuple(found), precision, recall)
 
 
-def _in_pictures(scored: Sequence[ScoredPicture]) -> Answers:
-    """Handles and knobs found in pictures."""
-    return Answers(
-        np.concatenate([s.score for s in scored]),
-        np.concatenate([s.first for s in scored]),
-        sum(len(s.found) for s in scored),
-    )
-
-
-def _panels_in(scored: Sequence[ScoredPicture]) -> Answers:
-    """Doors and drawers found in pictures."""
-    boxes = [s.boxes[kind] for s in scored for kind in PANELS if kind in s.boxes]
-    score, first = ([getattr(b, name) for b in boxes] for name in ("score", "first"))
-    return Answers(np.concatenate(score), np.concatenate(first), sum(b.labelled for b in boxes))
+def _joined(answers: Sequence[Answers]) -> Answers:
+    """Those of several pictures."""
+    logit, right = (np.concatenate([getattr(a, name) for a in answers]) for name in ("logit", "right"))
+    return Answers(logit, right, sum(a.present for a in answers))
 
 
 def _in_takes(tracker: Tracker, takes: Chosen, labels: Sequence[str]) -> Answers:

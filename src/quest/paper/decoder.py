@@ -16,13 +16,10 @@ class Tokens:
     """What a frame looks like: ``project(features) + place + time``, which is never formed for all N tokens."""
 
     features: Float[Tensor, "B T N E"]
-    """Of the encoder."""
     project: nn.Linear
     """From E to D."""
     place: Float[Tensor, "N D"]
-    """Codes of place."""
     time: Float[Tensor, "T D"]
-    """Codes of time."""
 
 
 class Look(nn.Module):

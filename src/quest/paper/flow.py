@@ -40,7 +40,6 @@ class FlowScores:
     zero_moving: float
     """The same where something does."""
     answers: int
-    """How many displacements were judged."""
     moving: int
     """How many of them move."""
 

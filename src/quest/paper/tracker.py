@@ -70,10 +70,6 @@ class PaperTracker:
     def track(self, clip: Clip, queries: Sequence[Query] | None = None) -> Tracks:
         """Track a whole clip; the answer for a frame does not depend on later ones.
 
-        Args:
-            clip: the frames.
-            queries: what to follow; None discovers entities in the first frame.
-
         Raises:
             InputError: a point query lies outside the clip, asks for an intent, or two queries have one name.
         """

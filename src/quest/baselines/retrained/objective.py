@@ -19,6 +19,7 @@ from quest.baselines.retrained.windows import PointNetwork, PointSampler, PointT
 from quest.errors import WeightsError
 from quest.model.encoder import read_into
 from quest.model.tensor_file import read_tensors, save_half
+from quest.train.validation import mean_of
 from quest.untrusted import reading
 
 FORMAT = "quest-retrained-1"
@@ -31,11 +32,8 @@ class Kind:
     """One of the networks."""
 
     config: type[ShownConfig]
-    """Its shapes."""
     network: Callable[[Any], PointNetwork]
-    """Made of them."""
     weights: Mapping[str, float]
-    """Of its losses."""
     batch: int
     """Windows of a step."""
 
@@ -104,12 +102,8 @@ class FollowPoints:
                 right.append(((logit > 0) == truth.visible)[:, 1:].float().flatten().cpu())
         self.network.train()
         gap, way, seen = torch.cat(gaps), torch.cat(ways), torch.cat(right)
-        moved = gap[way > 4]
-        return PointScores(_mean(gap), _mean(moved), _mean(seen), len(gap))
-
-
-def _mean(values: Float[Tensor, " N"]) -> float:
-    return float(values.mean()) if len(values) else 0.0
+        means = (mean_of(values) or 0.0 for values in (gap, gap[way > 4], seen))
+        return PointScores(*means, points=len(gap))
 
 
 def save_retrained(name: str, network: PointNetwork, path: Path, *, about: str) -> None:

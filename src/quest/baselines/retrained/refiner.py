@@ -52,11 +52,10 @@ class Window:
     """Tracks of N points in the frames of one window."""
 
     uv_px: Float[Tensor, "B S N 2"]
-    """Places on the canvas."""
     look: Float[Tensor, "B S N C"]
     """Features that each is known by."""
     logit: Float[Tensor, "B S N"]
-    """Log odds that it is seen."""
+    """Log odds that each is seen."""
 
     def first(self, frames: int) -> Window:
         """Its first frames."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -111,37 +111,20 @@ class MatchTracker(_Windowed):
             yield place_of(where), logit
 
 
-@dataclass
-class _Frames:
-    """Features of the frames of a clip, each made once and forgotten when the windows have passed it."""
-
-    tracker: RefineTracker
-    clip: Clip
-
-    def __post_init__(self) -> None:
-        self._kept: dict[int, Tensor] = {}
-
-    def __getitem__(self, frames: range) -> Float[Tensor, "1 S C h w"]:
-        self._kept = {t: maps for t, maps in self._kept.items() if t in frames}
-        for t in frames:
-            if t not in self._kept:
-                self._kept[t] = self.tracker.network.encode(self.tracker._picture(self.clip, t))
-        return torch.stack([self._kept[t] for t in frames], dim=1)
-
-
 class RefineTracker(_Windowed):
     """Refines windows; an answer looks at most 7 frames ahead."""
 
     def frames(self, clip: Clip, start: int, uv_px: Float[Tensor, "1 N 2"]) -> Any:
         """Window by window, with a grid of points for support."""
-        network, maps = self.network, _Frames(self, clip)
+        network = self.network
         size, span = network.config.image_size, network.config.window
+        encode = lru_cache(span)(lambda t: network.encode(self._picture(clip, t)))  # windows overlap
         side = (torch.arange(_SUPPORT, device=uv_px.device) + 0.5) * size / _SUPPORT
         asked = torch.cat((uv_px, mesh(side, side).flatten(0, 1)[None]), dim=1)
         last: Window | None = None
         for at in range(start, max(start + 1, len(clip) - span // 2), span // 2):
             frames = range(at, min(at + span, len(clip)))
-            shown, new = maps[frames], 0 if last is None else span // 2
+            shown, new = torch.stack([encode(t) for t in frames], dim=1), 0 if last is None else span // 2
             rough = network.begin(shown, asked) if last is None else network.slide(last, new).first(len(frames))
             window: Window = network.refine(shown, rough)[-1]
             for i in range(new, len(frames)):

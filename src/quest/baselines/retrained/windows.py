@@ -53,7 +53,6 @@ class PointConfig:
     batch: int = 4
     """Windows of a step."""
     points: int = 32
-    """Of every window."""
     frames: int = 8
     """Of every window."""
     max_stride: int = 3
@@ -65,7 +64,6 @@ class FilmedView:
     """One view of a take on the canvas; pixels are opened as memory maps."""
 
     folder: Path
-    """Where its arrays are."""
     camera: Camera
     """Of the canvas."""
 
@@ -103,7 +101,6 @@ class PointWindow:
     """What a network is shown: frames, and pixels of points in the first of them."""
 
     rgb: UInt8[Tensor, "B S H W 3"]
-    """Colours."""
     depth_m: Float[Tensor, "B S H W"]
     """0 where missing."""
     intrinsics: Float[Tensor, "B 4"]

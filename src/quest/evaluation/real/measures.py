@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from quest.data.boxed_pictures import in_boxes
-from quest.evaluation.bootstrap import Value, draw_objects, mean_value, median_value, statistic_value
+from quest.evaluation.bootstrap import Pool, Value
 from quest.evaluation.drift import ranked_auroc
 from quest.evaluation.metrics import Sums
 from quest.evaluation.real.sets import Labels, Picture
@@ -47,6 +47,32 @@ class ScoredClip:
     mixed: Bool[np.ndarray, " S"]
     """Whether the answer is not near, and nearer to another labelled entity than to its own."""
 
+    @property
+    def state(self) -> np.ndarray:
+        """As the labels say."""
+        return self.labels.state[self.labels.scored]
+
+    @property
+    def seen(self) -> Bool[np.ndarray, " S"]:
+        """Where the label is visible."""
+        return self.state == "visible"
+
+    @property
+    def near(self) -> Bool[np.ndarray, " S"]:
+        """Where it is, and the answer is near."""
+        return self.error_px <= NEAR_PX
+
+    @property
+    def moves(self) -> Bool[np.ndarray, " S"]:
+        """Where the track is on a part that is moved."""
+        return self.labels.moves[self.labels.track[self.labels.scored]]
+
+    @property
+    def worst_px(self) -> Float[np.ndarray, " K"]:
+        """Largest error of every track with a visible label."""
+        track = self.labels.track[self.labels.scored]
+        return np.array([self.error_px[self.seen & (track == k)].max() for k in np.unique(track[self.seen])])
+
 
 def score_clip(labels: Labels, answers: Answers, *, diagonal_px: float) -> ScoredClip:
     """Compare answers at the scored labels of a clip with these; a missing answer is off by the image's diagonal."""
@@ -63,42 +89,30 @@ def score_clip(labels: Labels, answers: Answers, *, diagonal_px: float) -> Score
 
 def track_measures(clips: Sequence[ScoredClip], *, far_px: float, resamples: int, seed: int) -> Measures:
     """Measures of one tracker over clips, with intervals over these; beyond ``far_px`` an answer is far off."""
-    draws = draw_objects(len(clips), resamples=resamples, generator=np.random.default_rng(seed))
-    clip = np.repeat(np.arange(len(clips)), [len(c.error_px) for c in clips])
-    error_px, mixed = (np.concatenate([getattr(c, name) for c in clips]) for name in ("error_px", "mixed"))
-    called, lost_p = (np.concatenate([getattr(c.answers, name) for c in clips]) for name in ("visible", "lost_p"))
-    track = np.concatenate([c.labels.track[c.labels.scored] for c in clips])
-    state = np.concatenate([c.labels.state[c.labels.scored] for c in clips])
-    moves = np.concatenate([c.labels.moves[c.labels.track[c.labels.scored]] for c in clips])
-    seen = state == "visible"
-    near, far = seen & (error_px <= NEAR_PX), seen & (error_px > far_px)
+    pool = Pool(clips, resamples=resamples, seed=seed)
+    known = [np.isfinite(c.answers.lost_p) & (c.near | (c.error_px > far_px) | ~c.seen) for c in clips]
+    lost_p = np.concatenate([c.answers.lost_p[k] for c, k in zip(clips, known, strict=True)])
+    wrong = np.concatenate([~c.near[k] for c, k in zip(clips, known, strict=True)])
+    rank, owner = np.unique(lost_p, return_inverse=True)[1], np.repeat(pool.owner, [k.sum() for k in known])
 
-    def share(what: np.ndarray, of: np.ndarray) -> Value | None:
-        return mean_value(Sums((what & of).astype(float), of.astype(float)), clip, draws)
+    def share(what: Callable[[ScoredClip], np.ndarray], of: Callable[[ScoredClip], np.ndarray]) -> Value | None:
+        return pool.mean(lambda c: (what(c) & of(c)).sum(), lambda c: of(c).sum())
 
-    def median(values: np.ndarray, of: np.ndarray) -> Value | None:
-        return median_value(values[of], clip[of], draws)
-
-    known = np.isfinite(lost_p) & (near | far | ~seen)
-    rank, wrong, owner = np.unique(lost_p[known], return_inverse=True)[1], ~near[known], clip[known]
-    tracks = np.unique(np.stack([clip, track], axis=1)[seen], axis=0)
-    worst = [error_px[seen & (clip == c) & (track == k)].max() for c, k in tracks]
-    never = Sums((np.array(worst) <= BEYOND_PX).astype(float), np.ones(len(worst)))
     return {
-        "median_px": median(error_px, seen),
-        "within_16": share(near, seen),
-        "moved_median_px": median(error_px, seen & moves),
-        "moved_within_16": share(near, seen & moves),
-        "never_beyond_50": mean_value(never, tracks[:, 0], draws),
-        "identity_errors": share(mixed, seen),
-        "hidden_called_visible": share(called, ~seen),
-        "occluded_called_visible": share(called, state == "occluded"),
-        "out_called_visible": share(called, state == "out"),
-        "lost_p_near": median(lost_p, near),
-        "lost_p_far": median(lost_p, far),
-        "lost_p_hidden": median(lost_p, ~seen),
-        "lost_auroc": statistic_value(
-            lambda times: ranked_auroc(rank, wrong, times[owner].astype(float)), draws, count=int(known.sum())
+        "median_px": pool.median(lambda c: c.error_px[c.seen]),
+        "within_16": share(lambda c: c.near, lambda c: c.seen),
+        "moved_median_px": pool.median(lambda c: c.error_px[c.seen & c.moves]),
+        "moved_within_16": share(lambda c: c.near, lambda c: c.seen & c.moves),
+        "never_beyond_50": pool.mean(lambda c: (c.worst_px <= BEYOND_PX).sum(), lambda c: len(c.worst_px)),
+        "identity_errors": share(lambda c: c.mixed, lambda c: c.seen),
+        "hidden_called_visible": share(lambda c: c.answers.visible, lambda c: ~c.seen),
+        "occluded_called_visible": share(lambda c: c.answers.visible, lambda c: c.state == "occluded"),
+        "out_called_visible": share(lambda c: c.answers.visible, lambda c: c.state == "out"),
+        "lost_p_near": pool.median(lambda c: c.answers.lost_p[c.near]),
+        "lost_p_far": pool.median(lambda c: c.answers.lost_p[c.error_px > far_px]),
+        "lost_p_hidden": pool.median(lambda c: c.answers.lost_p[~c.seen]),
+        "lost_auroc": pool.statistic(
+            lambda times: ranked_auroc(rank, wrong, times[owner].astype(float)), count=len(lost_p)
         ),
     }
 
@@ -138,9 +152,7 @@ class Boxes:
 def score_picture(picture: Picture, found: Mapping[str, np.ndarray]) -> ScoredPicture:
     """Compare what was found with the labels of a picture.
 
-    Args:
-        picture: with its handles.
-        found: see :func:`quest.evaluation.real.run.discover`.
+    ``found`` is as of :func:`quest.evaluation.real.run.discover`.
     """
     uv_px, score = found["uv_px"], found["score"]
     right, again, _ = _assign(picture, uv_px)
@@ -201,59 +213,45 @@ def _assign(picture: Picture, uv_px: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def discovery_measures(pictures: Sequence[ScoredPicture], *, resamples: int, seed: int) -> Measures:
     """Measures of what was found in pictures, with intervals over these."""
-    draws = draw_objects(len(pictures), resamples=resamples, generator=np.random.default_rng(seed))
-
-    def pooled(name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Values of all pictures, and of which picture each is."""
-        values = [getattr(picture, name) for picture in pictures]
-        return np.concatenate(values), np.repeat(np.arange(len(values)), [len(v) for v in values])
-
-    def share(what: np.ndarray, owner: np.ndarray, of: np.ndarray | None = None) -> Value | None:
-        counted = np.ones(len(what), bool) if of is None else of
-        return mean_value(Sums((what & counted).astype(float), counted.astype(float)), owner, draws)
-
-    (right, own), (again, _), (found, home) = pooled("right"), pooled("again"), pooled("found")
-    (score, candidate), (first, _), (size_px, _) = pooled("score"), pooled("first"), pooled("size_px")
+    pool = Pool(pictures, resamples=resamples, seed=seed)
+    handles, answers = np.array([len(p.found) for p in pictures]), np.array([len(p.right) for p in pictures])
+    hits = np.array([int((p.right & ~p.again).sum()) + int(p.found.sum()) for p in pictures])
 
     def f1(times: np.ndarray) -> float:
         """Second answers at a handle are wrong."""
-        both = times[own].sum() + times[home].sum()
-        hits = (times[own] * (right & ~again)).sum() + (times[home] * found).sum()
-        return float(hits / both) if both else np.nan
+        both = times @ answers + times @ handles
+        return float(times @ hits / both) if both else np.nan
 
+    def average_precision(boxes: Sequence[Boxes], count: int) -> Value | None:
+        """Area under the precision-recall curve of all candidates, made to fall."""
+        score, first = (np.concatenate([getattr(b, name) for b in boxes]) for name in ("score", "first"))
+        own, labelled = np.repeat(pool.owner, [len(b.score) for b in boxes]), np.array([b.labelled for b in boxes])
+        order = np.argsort(-score, kind="stable")
+        first, own = first[order], own[order]
+
+        def area(times: np.ndarray) -> float:
+            present, weight = times @ labelled, times[own]
+            if not present:
+                return np.nan
+            hits, answers = np.cumsum(weight * first), np.cumsum(weight)
+            precision = np.maximum.accumulate((hits / np.maximum(answers, 1))[::-1])[::-1]
+            return float(np.sum(np.diff(hits, prepend=0) * precision) / present)
+
+        return pool.statistic(area, count=count)
+
+    candidates = [Boxes(p.score, p.first, len(p.found)) for p in pictures]
     measures: dict[str, Value | None] = {
-        "recall": share(found, home),
-        "precision": share(right, own),
-        "f1": statistic_value(f1, draws, count=len(found)),
-        "ap": statistic_value(_average_precision(score, first, candidate, home), draws, count=len(score)),
+        "recall": pool.mean(lambda p: p.found.sum(), lambda p: len(p.found)),
+        "precision": pool.mean(lambda p: p.right.sum(), lambda p: len(p.right)),
+        "f1": pool.statistic(f1, count=int(handles.sum())),
+        "ap": average_precision(candidates, sum(len(p.score) for p in pictures)),
     }
     for low, high in pairwise(SIZES_PX):
         name = f"recall_{low}_to_{high}_px" if np.isfinite(high) else f"recall_above_{low}_px"
-        measures[name] = share(found, home, (size_px >= low) & (size_px < high))
+        sized = [(p.size_px >= low) & (p.size_px < high) for p in pictures]
+        found = np.array([(p.found & own).sum() for p, own in zip(pictures, sized, strict=True)], float)
+        measures[name] = pool.ratio(Sums(found, np.array([own.sum() for own in sized], float)))
     for kind in dict.fromkeys(kind for picture in pictures for kind in picture.boxes):
         boxes = [picture.boxes[kind] for picture in pictures]
-        home = np.repeat(np.arange(len(boxes)), [b.labelled for b in boxes])
-        own = np.repeat(np.arange(len(boxes)), [len(b.score) for b in boxes])
-        area = _average_precision(
-            np.concatenate([b.score for b in boxes]), np.concatenate([b.first for b in boxes]), own, home
-        )
-        measures[f"ap50_{kind}"] = statistic_value(area, draws, count=len(home))
+        measures[f"ap50_{kind}"] = average_precision(boxes, sum(b.labelled for b in boxes))
     return measures
-
-
-def _average_precision(
-    score: np.ndarray, first: np.ndarray, own: np.ndarray, home: np.ndarray
-) -> Callable[[np.ndarray], float]:
-    """Area under the precision-recall curve of all candidates, made to fall, by how often pictures are drawn."""
-    order = np.argsort(-score, kind="stable")
-    first, own = first[order], own[order]
-
-    def area(times: np.ndarray) -> float:
-        handles, weight = times[home].sum(), times[own]
-        if not handles:
-            return np.nan
-        hits, answers = np.cumsum(weight * first), np.cumsum(weight)
-        precision = np.maximum.accumulate((hits / np.maximum(answers, 1))[::-1])[::-1]
-        return float(np.sum(np.diff(hits, prepend=0) * precision) / handles)
-
-    return area

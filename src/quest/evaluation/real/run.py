@@ -28,7 +28,6 @@ from quest.evaluation.real.measures import (
 )
 from quest.evaluation.real.sets import LabelledClip, Labels, Picture, RealSet
 from quest.evaluation.results import Run
-from quest.model.found import Found
 from quest.track import Tracker
 from quest.types import Clip
 from quest.whole_file import whole_file
@@ -50,9 +49,7 @@ class RealRow:
     of: str
     """``tracks``, ``tracks, wide steps``, ``pictures``, or the name of the clip or picture."""
     tracker: str
-    """Its name."""
     inputs: Inputs
-    """What it was shown."""
     units: int
     """Clips or pictures."""
     targets: int
@@ -60,7 +57,6 @@ class RealRow:
     terms: int
     """Scored labels, or answers given."""
     measures: Measures
-    """The numbers."""
 
 
 def evaluate_set(
@@ -88,36 +84,37 @@ def evaluate_set(
     Raises:
         InputError: a recording is damaged or does not fit its labels.
     """
-    rows, single = [], []
-    tracked: dict[tuple[str, str, Inputs], dict[str, ScoredClip]] = {}
+    found: dict[tuple[str, str, Inputs], dict[str, Any]] = {}
     for clip in real.clips:
         of = "tracks, wide steps" if clip.labels.step_px > WIDE_STEP_PX else "tracks"
         for tracker, inputs, scored in _ask_clip(clip, trackers, kept, progress):
-            tracked.setdefault((of, tracker, inputs), {})[clip.name] = scored
-
-    def track_row(of: str, tracker: str, inputs: Inputs, clips: Sequence[ScoredClip], resamples: int) -> RealRow:
-        measures = track_measures(clips, far_px=real.far_px, resamples=resamples, seed=seed)
-        tracks = sum(len(np.unique(c.labels.track[c.labels.scored])) for c in clips)
-        return RealRow(of, tracker, inputs, len(clips), tracks, sum(len(c.error_px) for c in clips), measures)
-
-    for (of, tracker, inputs), clips in tracked.items():
-        rows.append(track_row(of, tracker, inputs, list(clips.values()), resamples))
-        single += [track_row(name, tracker, inputs, [clip], 1) for name, clip in clips.items()]
-    found: dict[str, dict[str, ScoredPicture]] = {}
+            found.setdefault((of, tracker, inputs), {})[clip.name] = scored
     for picture in real.pictures:
-        for tracker, one in _ask_picture(picture, trackers, kept, progress):
-            found.setdefault(tracker, {})[picture.name] = one
+        for tracker, scored in _ask_picture(picture, trackers, kept, progress):
+            found.setdefault(("pictures", tracker, "colours"), {})[picture.name] = scored
 
-    def found_row(of: str, tracker: str, pictures: Sequence[ScoredPicture], resamples: int) -> RealRow:
-        measures = discovery_measures(pictures, resamples=resamples, seed=seed)
-        handles, answers = (sum(len(getattr(p, name)) for p in pictures) for name in ("found", "right"))
-        return RealRow(of, tracker, "colours", len(pictures), handles, answers, measures)
+    def row(of: str, tracker: str, inputs: Inputs, scored: Sequence[Any], resamples: int) -> RealRow:
+        if isinstance(scored[0], ScoredPicture):
+            measures = discovery_measures(scored, resamples=resamples, seed=seed)
+            counts = sum(len(p.found) for p in scored), sum(len(p.right) for p in scored)
+        else:
+            measures = track_measures(scored, far_px=real.far_px, resamples=resamples, seed=seed)
+            tracks = (np.unique(c.labels.track[c.labels.scored]) for c in scored)
+            counts = sum(map(len, tracks)), sum(len(c.error_px) for c in scored)
+        return RealRow(of, tracker, inputs, len(scored), *counts, measures)
 
-    for tracker, pictures in found.items():
-        rows.append(found_row("pictures", tracker, list(pictures.values()), resamples))
-        single += [found_row(name, tracker, [p], 1) for name, p in pictures.items()]
-    rows.sort(key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of))
-    return rows, single
+    rows, single = rows_of(found, row, resamples)
+    return sorted(rows, key=lambda row: ("tracks", "tracks, wide steps", "pictures").index(row.of)), single
+
+
+def rows_of(
+    found: Mapping[tuple[str, str, Inputs], Mapping[str, Any]],
+    row: Callable[[str, str, Inputs, Sequence[Any], int], RealRow],
+    resamples: int,
+) -> tuple[list[RealRow], list[RealRow]]:
+    """A row of each table, tracker and input, of all that was scored there, and a row of each by its name."""
+    rows = [row(*key, list(by_name.values()), resamples) for key, by_name in found.items()]
+    return rows, [row(name, *key[1:], [one], 1) for key, by_name in found.items() for name, one in by_name.items()]
 
 
 def shown(clip: Clip) -> dict[Inputs, Clip]:
@@ -179,11 +176,6 @@ def _follow(tracker: ClipTracker, clip: Clip, labels: Labels) -> dict[str, np.nd
     return {"uv_px": tracks.uv_px[at], "visible": tracks.visible[at], "lost_p": lost_p}
 
 
-def grips_of(found: Found) -> Found:
-    """Handles and knobs of what was found."""
-    return found.select(~np.isnan(found.box_px[:, 0]))
-
-
 def discover(tracker: Tracker, rgb: UInt8[np.ndarray, "H W 3"]) -> dict[str, np.ndarray]:
     """Handles, knobs, doors and drawers that a tracker finds in a picture.
 
@@ -193,7 +185,7 @@ def discover(tracker: Tracker, rgb: UInt8[np.ndarray, "H W 3"]) -> dict[str, np.
         taken hold of by their front or rim; and the ``least`` score that discovery follows.
     """
     found = tracker.find(rgb)
-    grips, panels, least = grips_of(found), found.panels, tracker.config.threshold
+    grips, panels, least = found.select(~np.isnan(found.box_px[:, 0])), found.panels, tracker.config.threshold
     bare = found.select(np.isin(found.labels, ("rim", "front")) & (found.panel >= 0))
     return {
         "uv_px": grips.uv_px, "box_px": grips.box_px, "score": grips.logit, "panel_px": panels.box_px,
@@ -205,12 +197,7 @@ def discover(tracker: Tracker, rgb: UInt8[np.ndarray, "H W 3"]) -> dict[str, np.
 def write_set(path: Path, name: str, rows: Sequence[RealRow], single: Sequence[RealRow], run: Run) -> None:
     """Write the result file of a set, whole or not at all.
 
-    Args:
-        path: the file.
-        name: of the set.
-        rows: of the table, with intervals.
-        single: of each clip and picture, of which only the numbers are kept.
-        run: what made them.
+    Of each clip and picture, in ``single``, only the numbers are kept.
     """
     raw = {
         "format": FORMAT,

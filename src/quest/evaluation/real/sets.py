@@ -39,13 +39,11 @@ class Labels:
     """Labels of K tracks of one clip, one row a label, N in all."""
 
     names: tuple[str, ...]
-    """Of the tracks."""
     moves: Bool[np.ndarray, " K"]
     """Whether the part that a track is on is moved against its surroundings."""
     track: Int[np.ndarray, " N"]
     """Index of the label's track."""
     frame: Int[np.ndarray, " N"]
-    """Index of its frame."""
     uv_px: Float[np.ndarray, "N 2"]
     """Pixels, centres at half-integers; NaN where nothing is known."""
     state: np.ndarray
@@ -87,7 +85,6 @@ class LabelledClip:
     folder: Path
     """A recording folder (``docs/recordings.md``); without a camera file the camera is guessed."""
     file: Path
-    """Its labels."""
 
     @property
     def name(self) -> str:
@@ -123,7 +120,6 @@ class Picture:
     """A picture with H labelled handles: boxes, or bars between two ends."""
 
     path: Path
-    """The picture."""
     boxes: Float[np.ndarray, "H 4"]
     """X0, y0, x1, y1 of each handle's box, or the two ends of its bar, pixels."""
     wanted: Bool[np.ndarray, " H"]
@@ -131,7 +127,6 @@ class Picture:
     panels: Mapping[str, Float[np.ndarray, "M 4"]] = field(default_factory=dict)
     """Boxes of doors and drawers by their kind; none where they are not labelled."""
     bars: bool = False
-    """Whether handles are bars."""
 
     @property
     def name(self) -> str:
@@ -171,11 +166,8 @@ class RealSet:
     """A set of labelled recordings: clips with tracks, pictures with handles, or both."""
 
     folder: Path
-    """Where it is."""
     clips: tuple[LabelledClip, ...]
-    """By name."""
     pictures: tuple[Picture, ...]
-    """By name."""
     far_px: float = 16.0
     """Beyond this a tracker's answer is far off, where its P(lost) should be high."""
 
@@ -197,10 +189,6 @@ class RealSet:
 
 def open_set(folder: Path, *, part: Part = "choosing") -> RealSet:
     """Find out what a folder holds.
-
-    Args:
-        folder: the set.
-        part: of pictures.
 
     Raises:
         InputError: it is no set, or its labels cannot be understood.

@@ -58,11 +58,7 @@ def real_table(
 ) -> RenderableType:
     """One table per set and kind of row.
 
-    Args:
-        sets: rows by the name of the set.
-        width: of the terminal in characters; columns that do not fit are left out whole.
-        shown: columns, of which those that have numbers are shown.
-        legend: below the tables.
+    Columns that do not fit into the width, in characters, are left out whole, as are those without numbers.
     """
     tables = []
     for name, rows in sets.items():

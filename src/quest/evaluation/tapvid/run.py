@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 
 from quest.baselines import ClipTracker, Inputs
 from quest.baselines.point_queries import lift_pixels
-from quest.evaluation.bootstrap import draw_objects, mean_value
+from quest.evaluation.bootstrap import Pool
 from quest.evaluation.metrics import Sums
-from quest.evaluation.real.run import KeptAnswers, RealRow, asked, kept_or_asked, shown
+from quest.evaluation.real.run import KeptAnswers, RealRow, asked, kept_or_asked, rows_of, shown
 from quest.evaluation.tables import Column
 from quest.evaluation.tapvid.scores import (
     PIXELS,
@@ -60,7 +60,6 @@ class Setting:
 class _Scored:
     """One tracker in one video."""
 
-    video: str
     tracks: int
     queries: int
     scores: Mapping[str, float]
@@ -78,14 +77,7 @@ def evaluate_videos(
 ) -> tuple[list[RealRow], list[RealRow]]:
     """Score trackers on videos.
 
-    Args:
-        files: of TAP-Vid or TAPVid-3D, by the name of the video.
-        trackers: with names of the registry.
-        setting: how they are asked and judged.
-        resamples: of the bootstrap over videos.
-        seed: of the bootstrap.
-        kept: where answers are kept as they come; nowhere by default.
-        progress: called after each video with how many are done.
+    Answers are kept as they come in ``kept``; ``progress`` is told after each video how many are done.
 
     Returns:
         Rows of the table, and rows of each video.
@@ -93,7 +85,7 @@ def evaluate_videos(
     Raises:
         InputError: a file cannot be used.
     """
-    found: dict[tuple[str, str, Inputs], list[_Scored]] = {}
+    found: dict[tuple[str, str, Inputs], dict[str, _Scored]] = {}
     for number, (name, path) in enumerate(files.items(), 1):
         video = read_video(path, name=name, square=setting.square)
         track, frame, uv_px = video.queries(setting.queries)
@@ -102,15 +94,11 @@ def evaluate_videos(
             ask = partial(follow, tracker, ways[inputs], frame, uv_px, both_ways=both_ways, alone=setting.alone)
             answers = kept_or_asked(kept, name, tracker.name, inputs, ask)
             for of, scores in _scores(video, track, frame, answers, setting):
-                scored = _Scored(name, len(np.unique(track)), len(track), scores)
-                found.setdefault((of, tracker.name, inputs), []).append(scored)
+                scored = _Scored(len(np.unique(track)), len(track), scores)
+                found.setdefault((of, tracker.name, inputs), {})[f"{name}, {of}"] = scored
         progress(number)
-    by_table = sorted(found.items(), key=lambda item: item[0][0])
-    rows = [_row(*key, scored, resamples=resamples, seed=seed) for key, scored in by_table]
-    single = [
-        _row(f"{s.video}, {of}", tracker, inputs, [s]) for (of, tracker, inputs), scored in by_table for s in scored
-    ]
-    return rows, single
+    by_table = dict(sorted(found.items(), key=lambda item: item[0][0]))
+    return rows_of(by_table, partial(_row, seed=seed), resamples)
 
 
 def follow(
@@ -180,15 +168,10 @@ def _scores(
         yield f"3D, {setting.queries}, scale: {setting.scaling}", {key: float(v) for key, v in scores.items()}
 
 
-def _row(
-    of: str, tracker: str, inputs: Inputs, scored: Sequence[_Scored], *, resamples: int = 1, seed: int = 0
-) -> RealRow:
+def _row(of: str, tracker: str, inputs: Inputs, scored: Sequence[_Scored], resamples: int, *, seed: int) -> RealRow:
     """Means over videos; those in which nothing is counted are left out."""
-    draws = draw_objects(len(scored), resamples=resamples, generator=np.random.default_rng(seed))
-    measures = {}
-    for name in scored[0].scores:
-        value = np.array([s.scores[name] for s in scored])
-        sums = Sums(np.nan_to_num(value), (~np.isnan(value)).astype(float))
-        measures[name] = mean_value(sums, np.arange(len(scored)), draws)
-    tracks, queries = (sum(getattr(s, name) for s in scored) for name in ("tracks", "queries"))
+    pool = Pool(scored, resamples=resamples, seed=seed)
+    values = {name: np.array([s.scores[name] for s in scored]) for name in scored[0].scores}
+    measures = {name: pool.ratio(Sums(np.nan_to_num(v), (~np.isnan(v)).astype(float))) for name, v in values.items()}
+    tracks, queries = sum(s.tracks for s in scored), sum(s.queries for s in scored)
     return RealRow(of, tracker, inputs, len(scored), tracks, queries, measures)

@@ -50,11 +50,8 @@ class Answered:
     query_frame: Int[np.ndarray, "*B N"]
     """Frame in which each track is asked for."""
     occluded: Bool[np.ndarray, "*B N T"]
-    """The truth."""
     points: Float[np.ndarray, "*B N T C"]
-    """The truth."""
     said_occluded: Bool[np.ndarray, "*B N T"]
-    """The answer."""
     said_points: Float[np.ndarray, "*B N T C"]
     """The answer; in space of any scale."""
 

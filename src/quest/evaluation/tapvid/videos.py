@@ -34,7 +34,6 @@ class PointVideo:
     """A video and N true tracks."""
 
     clip: Clip
-    """What trackers are shown."""
     occluded: Bool[np.ndarray, "N T"]
     """Whether a point is hidden or out of view."""
     uv_px: Float[np.ndarray, "N T 2"]
