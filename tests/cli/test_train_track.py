@@ -53,6 +53,12 @@ def one_line(text: str) -> bool:
     return text.startswith("error: ") and text.count("\n") == 1
 
 
+def evaluate(store: Path, weights: Path, result: Path) -> None:
+    words = ["eval", "--takes", store, "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
+    assert main([*map(str, words), "--weights", str(weights), "--resamples", "20", "--out", str(result)]) == 0
+    assert json.loads(result.read_text())
+
+
 @pytest.mark.slow
 def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(NetworkChanges, "apply", lambda *_: PAPER)
@@ -70,12 +76,7 @@ def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path,
     assert "step 3" in told
     assert "step 2:" not in told, "it goes on where it stopped"
 
-    result = tmp_path / "result.json"
-    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
-    assert (
-        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
-    )
-    assert json.loads(result.read_text())
+    evaluate(store, out / "weights.safetensors", tmp_path / "result.json")
 
 
 @pytest.mark.slow
@@ -102,12 +103,7 @@ def test_train_the_finder_track_evaluate(store: Path, weights: str, tmp_path: Pa
     assert (video / "overlay.mp4").stat().st_size > 1000
     assert "left" in capsys.readouterr().out
 
-    result = tmp_path / "result.json"
-    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
-    assert (
-        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
-    )
-    assert json.loads(result.read_text())
+    evaluate(store, out / "weights.safetensors", tmp_path / "result.json")
 
 
 @pytest.mark.slow
