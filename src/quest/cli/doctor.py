@@ -18,7 +18,7 @@ from rich.table import Table
 
 from quest.cli.console import Console
 from quest.errors import QuestError
-from quest.extras import EXTRA_OF, explain_missing, install_command, is_installed
+from quest.extras import MODULES_OF, explain_missing, install_command, is_installed
 from quest.wording import counted
 
 Status = Literal["ok", "optional", "broken"]
@@ -198,8 +198,8 @@ def _objects() -> Iterator[Finding]:
 
 
 def _extras() -> Iterator[Finding]:
-    for extra in dict.fromkeys(EXTRA_OF.values()):
-        missing = [module for module, owner in EXTRA_OF.items() if owner == extra and not is_installed(module)]
+    for extra, modules in MODULES_OF.items():
+        missing = [module for module in modules if not is_installed(module)]
         if missing:
             yield Finding(f"[{extra}]", "optional", f"missing: {', '.join(missing)}", install_command(extra))
         else:

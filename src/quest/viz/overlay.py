@@ -253,10 +253,10 @@ class OverlayPainter:
             self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
         joint = self._coordinate(t, k)
         two_lines = bool(joint) and row > 38 * u
-        name, at = fit_text(self._name(k), size, name_width), (40 * u, middle - 8 * u * two_lines)
-        draw_text(side, name, at, size=size, colour=TEXT if bound else MUTED)
+        at = (40 * u, middle - 8 * u * two_lines)
+        draw_text(side, self._name(k), at, size=size, colour=TEXT if bound else MUTED, width=name_width)
         if two_lines:
-            draw_text(side, fit_text(joint, small, name_width), (40 * u, middle + 11 * u), size=small, colour=MUTED)
+            draw_text(side, joint, (40 * u, middle + 11 * u), size=small, colour=MUTED, width=name_width)
         value = self._doing(t, k) if bound else "none yet"
         colour = {"none yet": MUTED, "lost": LOST, "held": HELD}.get(value, TEXT)
         self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
@@ -288,7 +288,7 @@ class OverlayPainter:
         draw_text(canvas, when, (canvas.shape[1] - 14 * u, middle), size=size, colour=TEXT, align="right")
         room = canvas.shape[1] - ink.text_size(when, size)[0] - 44 * u
         left = "    ".join((self._clip.name, *self._tracks.frame_flags))
-        draw_text(canvas, fit_text(left, size, room), (14 * u, middle), size=size, colour=MUTED)
+        draw_text(canvas, left, (14 * u, middle), size=size, colour=MUTED, width=room)
         done = canvas.shape[1] * (t + 1) / frames
         draw_box(canvas, 0, self._height, done, max(2, 2 * u), colour=query_colour(0))
 
