@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import base64
 import itertools
 import shutil
 import subprocess
@@ -81,42 +80,21 @@ class Page:
         for kind in ("keyDown", "keyUp"):
             await self.call("Input.dispatchKeyEvent", type=kind, key=name, code=name)
 
-    async def screenshot(self, path: Path) -> None:
-        """A PNG of what is seen."""
-        path.write_bytes(base64.b64decode((await self.call("Page.captureScreenshot"))["data"]))
 
-
-def browse(
-    url: str,
-    script: Callable[[Page], Awaitable[None]],
-    *,
-    width: int = 1280,
-    height: int = 900,
-    dark: bool = False,
-) -> list[str]:
+def browse(url: str, script: Callable[[Page], Awaitable[None]], *, width: int = 1280) -> list[str]:
     """Open a page, go through a script, and give the errors of its console."""
     assert CHROMIUM is not None
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as profile:
-        flags = [
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--enable-unsafe-swiftshader",
-            "--remote-debugging-port=0",
-            f"--user-data-dir={profile}",
-        ]
-        with subprocess.Popen(
-            [CHROMIUM, *flags, "about:blank"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        ) as process:
+        flags = ["--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader"]
+        flags += ["--remote-debugging-port=0", f"--user-data-dir={profile}", "about:blank"]
+        with subprocess.Popen([CHROMIUM, *flags], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
             try:
-                return asyncio.run(_browse(Path(profile) / "DevToolsActivePort", url, script, width, height, dark))
+                return asyncio.run(_browse(Path(profile) / "DevToolsActivePort", url, script, width))
             finally:
                 process.terminate()
 
 
-async def _browse(
-    port_file: Path, url: str, script: Callable[[Page], Awaitable[None]], width: int, height: int, dark: bool
-) -> list[str]:
+async def _browse(port_file: Path, url: str, script: Callable[[Page], Awaitable[None]], width: int) -> list[str]:
     import aiohttp
 
     ends_s = time.monotonic() + _START_S
@@ -131,11 +109,8 @@ async def _browse(
             page = Page(socket)
             for domain in ("Runtime", "Log", "Page"):
                 await page.call(f"{domain}.enable")
-            await page.call(
-                "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False
-            )
-            scheme = [{"name": "prefers-color-scheme", "value": "dark" if dark else "light"}]
-            await page.call("Emulation.setEmulatedMedia", features=scheme)
+            screen = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+            await page.call("Emulation.setDeviceMetricsOverride", **screen)
             await page.call("Page.navigate", url=url)
             await page.until("document.readyState === 'complete'")
             await script(page)

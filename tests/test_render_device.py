@@ -78,8 +78,6 @@ def test_prepare_sets_the_environment(tmp_path, monkeypatch):
     monkeypatch.setattr("quest.render_device.find_vulkan_icd", lambda: found)
     monkeypatch.setenv("VK_ICD_FILENAMES", "")
     assert prepare_renderer() == found
-    import os
-
     assert os.environ["VK_ICD_FILENAMES"] == str(icd)
 
 

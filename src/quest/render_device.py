@@ -84,32 +84,31 @@ class VulkanDriver:
 
 
 def find_vulkan_icd(*, environ: Mapping[str, str] | None = None, root: Path = Path("/")) -> VulkanDriver | None:
-    """Find the Vulkan driver that rendering should use.
+    """The Vulkan driver that rendering should use; None if there is none that is known to work.
 
-    Args:
-        environ: environment variables; those of the process by default.
-        root: where the file system starts (tests give a folder of their own).
-
-    Returns:
-        The driver, or None if there is none that is known to work.
+    Variables are those of the process by default; the file system starts at the root.
 
     Raises:
         RendererError: the user's environment names drivers that do not exist.
     """
     environ = os.environ if environ is None else environ
-    chosen = _chosen_by_user(environ)
-    if chosen is not None:
-        return chosen
+    for variable in ICD_VARIABLES:
+        named = environ.get(variable, "")
+        missing = [name for name in named.split(os.pathsep) if name and not Path(name).exists()]
+        if missing:
+            raise RendererError(
+                f"{variable} names {', '.join(missing)}, which does not exist; "
+                f"unset {variable} to let quest search, or correct it"
+            )
+        if named:
+            return VulkanDriver("chosen", named)
     if not sys.platform.startswith("linux"):
         return VulkanDriver("system", None)
     return _find_nvidia(root) or _find_swiftshader(root) or _find_lavapipe(root)
 
 
 def prepare_renderer() -> VulkanDriver:
-    """Choose the Vulkan driver of this process; call it before SAPIEN is imported.
-
-    Returns:
-        The driver that SAPIEN will load.
+    """Choose the Vulkan driver that SAPIEN will load in this process; call it before SAPIEN is imported.
 
     Raises:
         RendererError: no driver is known to work; the message says what to install.
@@ -148,21 +147,6 @@ def without_known_warnings() -> Iterator[None]:
                     os.write(2, line)
 
 
-def _chosen_by_user(environ: Mapping[str, str]) -> VulkanDriver | None:
-    for variable in ICD_VARIABLES:
-        value = environ.get(variable, "")
-        if not value:
-            continue
-        missing = [name for name in value.split(os.pathsep) if not Path(name).exists()]
-        if missing:
-            raise RendererError(
-                f"{variable} names {', '.join(missing)}, which does not exist; "
-                f"unset {variable} to let quest search, or correct it"
-            )
-        return VulkanDriver("chosen", value)
-    return None
-
-
 def _find_nvidia(root: Path) -> VulkanDriver | None:
     # A container may show the device without the driver's graphics libraries; Vulkan then finds nothing.
     device = (root / "dev/nvidia0").exists() or (root / "dev/nvidiactl").exists()
@@ -175,11 +159,8 @@ def _find_nvidia(root: Path) -> VulkanDriver | None:
 
 
 def _find_swiftshader(root: Path) -> VulkanDriver | None:
-    for place in SWIFTSHADER_PLACES:
-        icd = root / place
-        if icd.is_file():
-            return VulkanDriver("swiftshader", str(icd))
-    return None
+    icd = next((root / place for place in SWIFTSHADER_PLACES if (root / place).is_file()), None)
+    return None if icd is None else VulkanDriver("swiftshader", str(icd))
 
 
 def _find_lavapipe(root: Path) -> VulkanDriver | None:

@@ -19,6 +19,7 @@ from quest.errors import InputError
 from quest.extras import require
 from quest.untrusted import build, parse_json, reading, require_table
 from quest.whole_file import whole_file
+from quest.wording import counted
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,9 +28,19 @@ if TYPE_CHECKING:
 VERSION = 3
 JOINTS_VERSION = 1
 _SHOWN = 12
+_PER_FRAME = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm")
 _METADATA_KEY = b"quest-tracks"
 _POSES_KEY = b"quest-cam-from-world"
 """Of the camera's poses: T x 4 x 4 little-endian doubles, row by row."""
+
+_JOINT_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "axis": ("axis", (3,)),
+    "origin_m": ("origin", (3,)),
+    "q_min_seen": ("q_min_seen", ()),
+    "q_max_seen": ("q_max_seen", ()),
+    "covariance": ("covariance", (6, 6)),
+}
+"""Arrays of a joint by their names in JSON: the field of :class:`Joints`, and the shape for each query."""
 
 COLUMNS = {
     "frame": "int32",
@@ -94,15 +105,9 @@ class Joints:
     @classmethod
     def unknown(cls, frames: int, queries: int) -> Joints:
         """Joints of which nothing is known."""
-        return cls(
-            kind=("unknown",) * queries,
-            axis=np.full((queries, 3), np.nan, np.float32),
-            origin=np.full((queries, 3), np.nan, np.float32),
-            q_min_seen=np.full(queries, np.nan, np.float32),
-            q_max_seen=np.full(queries, np.nan, np.float32),
-            q=np.full((frames, queries), np.nan, np.float32),
-            covariance=np.full((queries, 6, 6), np.nan, np.float32),
-        )
+        shapes = {"q": (frames, queries), **{name: (queries, *shape) for name, shape in _JOINT_ARRAYS.values()}}
+        nothing = {name: np.full(shape, np.nan, np.float32) for name, shape in shapes.items()}
+        return cls(kind=("unknown",) * queries, **nothing)
 
     @property
     def axis_sigma_rad(self) -> Float[np.ndarray, " K"]:
@@ -218,7 +223,7 @@ class Tracks:
 
     def __repr__(self) -> str:
         k = len(self.names)
-        lines = [f"Tracks({len(self)} frames, {k} {'query' if k == 1 else 'queries'})"]
+        lines = [f"Tracks({len(self)} frames, {counted(k, 'query', 'queries')})"]
         lines += [f"  {self.describe(i)}" for i in range(min(k, _SHOWN))]
         return "\n".join(lines if k <= _SHOWN else [*lines, f"  and {k - _SHOWN} more"])
 
@@ -263,8 +268,7 @@ class Tracks:
     def select(self, queries: list[int] | np.ndarray) -> Tracks:
         """The same tracks of some queries only."""
         index = np.asarray(queries, dtype=int)
-        per_frame = ("uv_px", "point_world", "confidence", "visible", "state", "lost_p", "alarm")
-        known = {name: value for name in per_frame if (value := getattr(self, name)) is not None}
+        known = {name: value for name in _PER_FRAME if (value := getattr(self, name)) is not None}
         return replace(
             self,
             names=tuple(self.names[i] for i in index),
@@ -323,27 +327,26 @@ def tracks_table(tracks: Tracks) -> pa.Table:
 
     frames, queries = tracks.uv_px.shape[:2]
     frame, query = (index.ravel() for index in np.indices((frames, queries), dtype=np.int32))
-    uv_px, point = tracks.uv_px.reshape(-1, 2), tracks.point_world.reshape(-1, 3)
-    columns = {
-        "frame": frame,
-        "stamp_s": np.asarray(tracks.stamp_s, dtype=np.float64)[frame],
-        "query": query,
-        "name": [tracks.names[k] for k in query],
-        "label": [tracks.labels[k] for k in query],
-        "x_px": uv_px[:, 0],
-        "y_px": uv_px[:, 1],
-        "x_m": point[:, 0],
-        "y_m": point[:, 1],
-        "z_m": point[:, 2],
-        "confidence": tracks.confidence.ravel(),
-        "visible": tracks.visible.ravel(),
-        "state": [str(state) for state in tracks.state.ravel()],
-        "lost_p": [None] * len(frame) if tracks.lost_p is None else tracks.lost_p.ravel(),
-        "alarm": [None] * len(frame) if tracks.alarm is None else tracks.alarm.ravel(),
-        "q": [None] * len(frame) if tracks.joints is None else tracks.joints.q.ravel(),
-    }
+
+    def flat(values: np.ndarray | None) -> Any:
+        return [None] * len(frame) if values is None else values.ravel()
+
+    columns = (
+        frame,
+        np.asarray(tracks.stamp_s, dtype=np.float64)[frame],
+        query,
+        [tracks.names[k] for k in query],
+        [tracks.labels[k] for k in query],
+        *tracks.uv_px.reshape(-1, 2).T,
+        *tracks.point_world.reshape(-1, 3).T,
+        *map(flat, (tracks.confidence, tracks.visible)),
+        [str(state) for state in tracks.state.ravel()],
+        *map(flat, (tracks.lost_p, tracks.alarm, None if tracks.joints is None else tracks.joints.q)),
+    )
     schema = pa.schema(list(COLUMNS.items()))
-    arrays = [pa.array(columns[field.name], type=field.type, from_pandas=True) for field in schema]
+    arrays = [
+        pa.array(values, type=field.type, from_pandas=True) for values, field in zip(columns, schema, strict=True)
+    ]
     poses = tracks.cam_from_world
     extra = {} if poses is None else {_POSES_KEY: np.ascontiguousarray(poses, "<f8").tobytes()}
     metadata = {
@@ -436,16 +439,17 @@ def _tracks_of(table: pa.Table, metadata: dict[str, Any]) -> Tracks:
 def _joints_to_json(joints: Joints, *, digits: int | None = None) -> list[dict[str, Any]]:
     """One entry per query, without its coordinates."""
     return [
-        {
-            "kind": kind,
-            "axis": _plain(joints.axis[k], digits),
-            "origin_m": _plain(joints.origin[k], digits),
-            "q_min_seen": _plain(joints.q_min_seen[k], digits),
-            "q_max_seen": _plain(joints.q_max_seen[k], digits),
-            "covariance": _plain(joints.covariance[k], digits),
-        }
+        {"kind": kind} | {key: _plain(getattr(joints, name)[k], digits) for key, (name, _) in _JOINT_ARRAYS.items()}
         for k, kind in enumerate(joints.kind)
     ]
+
+
+def _joints_from_json(rows: list[dict[str, Any]], q: np.ndarray) -> Joints:
+    arrays = {
+        name: np.array([_numbers(row[key], shape) for row in rows]).reshape(q.shape[1], *shape).astype(np.float32)
+        for key, (name, shape) in _JOINT_ARRAYS.items()
+    }
+    return Joints(kind=tuple(row["kind"] for row in rows), q=q.astype(np.float32), **arrays)
 
 
 def _plain(values: np.ndarray | np.generic, digits: int | None = None) -> Any:
@@ -458,17 +462,8 @@ def _plain(values: np.ndarray | np.generic, digits: int | None = None) -> Any:
     return [_plain(value, digits) for value in np.asarray(values)]
 
 
-def _joints_from_json(rows: list[dict[str, Any]], q: np.ndarray) -> Joints:
-    joints = Joints.unknown(*q.shape)
-    for k, row in enumerate(rows):
-        joints.axis[k] = _numbers(row["axis"])
-        joints.origin[k] = _numbers(row["origin_m"])
-        joints.q_min_seen[k] = _numbers(row["q_min_seen"])
-        joints.q_max_seen[k] = _numbers(row["q_max_seen"])
-        if row["covariance"] is not None:
-            joints.covariance[k] = [[np.nan] * 6 if line is None else _numbers(line) for line in row["covariance"]]
-    return replace(joints, kind=tuple(row["kind"] for row in rows), q=q.astype(np.float32))
-
-
-def _numbers(values: float | list[float | None] | None) -> np.ndarray:
-    return np.array(values, np.float32)  # null becomes NaN
+def _numbers(values: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """The inverse of :func:`_plain`."""
+    if values is None:
+        return np.full(shape, np.nan)
+    return np.array([_numbers(value, shape[1:]) for value in values] if shape else float(values))

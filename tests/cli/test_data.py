@@ -81,9 +81,9 @@ def test_show(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
 def test_a_picture_is_written_whole_or_not_at_all(tmp_path: Path):
     wide = np.zeros((1, 20_000, 3), np.uint8)
     with pytest.raises(ConfigError, match=r"20000 x 1 px are too many for \.webp"):
-        write_picture(wide, tmp_path / "sheet.webp")
+        write_picture(wide, tmp_path / "sheet.webp", "a line")
     assert not list(tmp_path.iterdir())
-    write_picture(wide, tmp_path / "sheet.png")
+    write_picture(wide, tmp_path / "sheet.png", "a line")
     assert list(tmp_path.iterdir()) == [tmp_path / "sheet.png"]
 
 

@@ -30,6 +30,7 @@ from quest.track import Stream
 from quest.tracks import read_tracks
 from quest.types import Clip
 from tests.synthetic import make_take
+from tests.viz.test_report import make_tracks
 
 FRAMES = 6
 
@@ -126,15 +127,12 @@ def test_monitor_stops_where_the_recording_is_torn(
     assert "000004.png" in capsys.readouterr().err
 
 
-def test_points_beyond_the_end(sources: dict[str, str]):
-    source = Source(sources["clip.mcap"], point=(f"{FRAMES},1,1",))
-    with pytest.raises(ValueError, match=f"0 to {FRAMES - 1}, got {FRAMES}"):
-        source.queries(source.open())
-
-
-def test_names_are_utf8(sources: dict[str, str]):
-    source = Source(sources["clip.mcap"], point=("0,1,1,\udcff",))
-    with pytest.raises(InputError, match="UTF-8"):
+@pytest.mark.parametrize(
+    ("point", "said"), [(f"{FRAMES},1,1", f"0 to {FRAMES - 1}, got {FRAMES}"), ("0,1,1,\udcff", "UTF-8")]
+)
+def test_points_beyond_the_end_and_names_that_are_no_utf8(sources: dict[str, str], point: str, said: str):
+    source = Source(sources["clip.mcap"], point=(point,))
+    with pytest.raises(InputError, match=said):
         source.queries(source.open())
 
 
@@ -142,6 +140,7 @@ def test_every_clip_has_a_folder_of_its_own(
     clip: Clip, sources: dict[str, str], weights: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("quest.track.Tracker.track", lambda _, clip, *__, **___: make_tracks(frames=len(clip)))
     store = TakeStore(tmp_path / "takes")
     take = make_take(frames=FRAMES, views=2, entities=2, size=(64, 48), name="a.b")
     store.write(take)
@@ -154,61 +153,36 @@ def test_every_clip_has_a_folder_of_its_own(
     assert main(["track", "drawer.2/", *command]) == 0
     for episode in ("0", "1"):
         assert main(["track", sources["lerobot"], "--episode", episode, *command]) == 0
-    assert sorted(file.parent.name for file in Path("outputs").glob("*/tracks.parquet")) == [
-        "a.b-view0",
-        "a.b-view1",
-        "a.c-view0",
-        "drawer.1",
-        "drawer.2",
-        "lerobot-000000-front",
-        "lerobot-000001-front",
-    ]
+    views, episodes = ["a.b-view0", "a.b-view1", "a.c-view0"], ["lerobot-000000-front", "lerobot-000001-front"]
+    written = sorted(file.parent.name for file in Path("outputs").glob("*/tracks.parquet"))
+    assert written == [*views, "drawer.1", "drawer.2", *episodes]
 
 
-@pytest.mark.parametrize(
-    ("name", "folder"),
-    [
-        ("a/b", "a-b"),
-        ("..", "clip"),
-        ("C:\\x", "C--x"),
-        ("sample", "sample"),
-        ("caf\udce9", "caf-"),
-        ("Küche 1.5", "Küche 1.5"),
-    ],
-)
-def test_names_become_folders(clip: Clip, name: str, folder: str):
-    assert Track("anything")._name(replace(clip, name=name)) == folder
-
-
-@pytest.mark.parametrize("words", [["--depth", "d"], ["--camera", "c.json"], ["--depth-scale-m", "0.001"]])
-def test_a_take_has_depth_and_a_camera_of_its_own(words: list[str]):
-    with pytest.raises(RecordingError, match="and this is a take"):
-        tyro.cli(Track, args=["takes/a.zarr", *words]).open()
+def test_names_become_folders(clip: Clip):
+    folders = {
+        "a/b": "a-b", "..": "clip", "C:\\x": "C--x", "sample": "sample", "caf\udce9": "caf-", "Küche 1.5": "Küche 1.5",
+    }  # fmt: skip
+    assert {name: Track("anything")._name(replace(clip, name=name)) for name in folders} == folders
 
 
 @pytest.mark.parametrize(
     ("source", "words", "named"),
     [
+        ("takes/a.zarr", ["--depth", "d"], "and this is a take"),
+        ("takes/a.zarr", ["--camera", "c.json"], "and this is a take"),
+        ("takes/a.zarr", ["--depth-scale-m", "0.001"], "and this is a take"),
+        ("takes/a.zarr/", ["--episode", "2"], r"takes/a\.zarr/: --episode 2 is for a LeRobot v3 dataset"),
         ("folder", ["--episode", "1"], "--episode 1 is for a LeRobot v3 dataset, and this is a folder or video"),
         ("folder", ["--topic-depth", "none"], "--topic-depth none is for an MCAP file or a ROS bag"),
         ("clip.mcap", ["--camera-key", "front"], "--camera-key front is for a LeRobot v3 dataset"),
         ("lerobot", ["--sync-s", "0.1"], "--sync-s 0.1 is for an MCAP file or a ROS bag"),
         ("lerobot", ["--view", "1"], "--view 1 is for a take"),
+        ("nowhere.mcap", [], "no such file or folder"),
     ],
 )
 def test_options_of_other_kinds_are_refused(sources: dict[str, str], source: str, words: list[str], named: str):
     with pytest.raises(RecordingError, match=named):
-        tyro.cli(Track, args=[sources[source], *words]).open()
-
-
-def test_a_take_has_neither_episodes_nor_topics():
-    with pytest.raises(RecordingError, match=r"takes/a\.zarr/: --episode 2 is for a LeRobot v3 dataset"):
-        tyro.cli(Track, args=["takes/a.zarr/", "--episode", "2"]).open()
-
-
-def test_no_such_recording():
-    with pytest.raises(RecordingError, match="no such file or folder"):
-        Source("nowhere.mcap").open()
+        tyro.cli(Track, args=[sources.get(source, source), *words]).open()
 
 
 def test_a_store_where_a_take_is_expected(tmp_path: Path, weights: str, capsys):

@@ -53,6 +53,12 @@ def one_line(text: str) -> bool:
     return text.startswith("error: ") and text.count("\n") == 1
 
 
+def evaluate(store: Path, weights: Path, result: Path) -> None:
+    words = ["eval", "--takes", store, "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
+    assert main([*map(str, words), "--weights", str(weights), "--resamples", "20", "--out", str(result)]) == 0
+    assert json.loads(result.read_text())
+
+
 @pytest.mark.slow
 def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.setattr(NetworkChanges, "apply", lambda *_: PAPER)
@@ -70,12 +76,7 @@ def test_train_resume_evaluate_the_published_network(store: Path, encoder: Path,
     assert "step 3" in told
     assert "step 2:" not in told, "it goes on where it stopped"
 
-    result = tmp_path / "result.json"
-    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
-    assert (
-        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
-    )
-    assert json.loads(result.read_text())
+    evaluate(store, out / "weights.safetensors", tmp_path / "result.json")
 
 
 @pytest.mark.slow
@@ -102,12 +103,7 @@ def test_train_the_finder_track_evaluate(store: Path, weights: str, tmp_path: Pa
     assert (video / "overlay.mp4").stat().st_size > 1000
     assert "left" in capsys.readouterr().out
 
-    result = tmp_path / "result.json"
-    evaluate = ["eval", "--takes", str(store), "--protocol", "point", "semantic", "--trackers", "quest", "hold-still"]
-    assert (
-        main([*evaluate, "--weights", str(out / "weights.safetensors"), "--resamples", "20", "--out", str(result)]) == 0
-    )
-    assert json.loads(result.read_text())
+    evaluate(store, out / "weights.safetensors", tmp_path / "result.json")
 
 
 @pytest.mark.slow
@@ -180,20 +176,21 @@ def test_track_what_is_not_there(weights: str, tmp_path: Path, capsys, clip: str
     assert clip in error
 
 
-def test_train_without_a_start(store: Path, tmp_path: Path, capsys):
-    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run")]) == 2
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ([], "--encoder"),
+        (["--stage", "find", "--encoder", "{none}", "--detail", "{none}"], "import-encoder"),
+        (["--stage", "1", "--encoder", "{none}"], "import-encoder"),
+    ],
+)
+def test_train_without_a_start(store: Path, tmp_path: Path, capsys, words: list[str], said: str):
+    words = [word.format(none=tmp_path / "none.safetensors") for word in words]
+    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run"), *words]) == 2
     error = capsys.readouterr().err
     assert one_line(error)
-    assert "--encoder" in error
+    assert said in error
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize("stage", ["find", "1"])
-def test_train_with_a_missing_encoder(store: Path, tmp_path: Path, capsys, stage: str):
-    missing = ["--encoder", str(tmp_path / "none.safetensors")]
-    missing += ["--detail", str(tmp_path / "none.safetensors")] if stage == "find" else []
-    assert main(["train", "--data", str(store), "--out", str(tmp_path / "run"), "--stage", stage, *missing]) == 2
-    assert "import-encoder" in capsys.readouterr().err
 
 
 def test_train_on_an_empty_store(weights: str, tmp_path: Path, capsys):

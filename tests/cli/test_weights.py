@@ -22,7 +22,7 @@ from tests.monitor.streams import make_stream
 from tests.synthetic import make_take
 from tests.tiny import make_finder
 
-TAKES = 30
+TAKES = 20
 
 
 @pytest.fixture(scope="module")

@@ -9,8 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quest.cli.calibrate import Calibrate
-from quest.cli.evaluate_monitor import EvalMonitor
+from quest.cli.calibrate import Calibrate, EvalMonitor
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, InputError, WeightsError
 from quest.evaluation import stream_record

@@ -77,7 +77,7 @@ def test_what_is_refused_changes_nothing(clip: Clip):
     assert [header["state"] for header in watched.headers] == [header["state"] for header in plain.headers]
 
 
-@pytest.mark.parametrize("remembered_s", [3.0, 0.0])
+@pytest.mark.parametrize("remembered_s", [300.0, 0.0])
 def test_a_pixel_of_an_older_picture_is_carried_to_now(remembered_s: float, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("quest.live.session._REMEMBERED_S", remembered_s)
     square = np.zeros((120, 160, 3), np.uint8)

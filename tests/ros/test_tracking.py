@@ -26,6 +26,7 @@ from tests.ros.played import START_NS, bag_of, play
 from tests.ros.ros_types import Types, types_of
 
 FRAMES = 4
+JAZZY = types_of("jazzy")
 CLICK = (450.0, 228.0)
 
 
@@ -85,7 +86,12 @@ def changed(message: Any, **fields: Any) -> Any:
     return copy
 
 
-def statuses(tracking: Tracking, types: Types, now_ns: int = START_NS) -> dict[str, tuple[str, str]]:
+@pytest.fixture
+def tracking(tracker: Tracker) -> Tracking:
+    return Tracking(tracker, one_point(), JAZZY)
+
+
+def statuses(tracking: Tracking, types: Types = JAZZY, *, now_ns: int = START_NS) -> dict[str, tuple[str, str]]:
     """Level and message of each line of the diagnostics, as another node would receive them."""
     names = {0: "OK", 1: "WARN", 2: "ERROR"}
     diagnostics = tracking.diagnostics(now_ns)
@@ -95,15 +101,14 @@ def statuses(tracking: Tracking, types: Types, now_ns: int = START_NS) -> dict[s
 
 
 def test_answers_are_those_of_the_stream(tracker: Tracker, bag: Path, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types, topic=COLOUR)
+    tracking = Tracking(tracker, one_point(), JAZZY, topic=COLOUR)
     answers = run(tracking, messages)
     source = open_recording(str(bag))
     stream = tracker.stream(source.camera, [Query.point(0, *CLICK, name="handle")])
     states = [stream.step(frame.rgb, frame.depth_m, frame.stamp_s) for frame in source]
     assert len(answers) == len(states) == FRAMES
     for t, (answer, state) in enumerate(zip(answers, states, strict=True)):
-        tracks = types.again(answer.tracks)
+        tracks = JAZZY.again(answer.tracks)
         assert (tracks.header.frame_id, tracks.frame, tracks.stream) == (COLOUR_FRAME, t, 0)
         stamp = tracks.header.stamp
         assert stamp.sec + stamp.nanosec * 1e-9 == pytest.approx(state.stamp_s, abs=1e-6)
@@ -115,35 +120,32 @@ def test_answers_are_those_of_the_stream(tracker: Tracker, bag: Path, messages: 
         point = move(state.cam_from_world, state.point_world[0].astype(np.float64))
         np.testing.assert_allclose((track.point.x, track.point.y, track.point.z), point, atol=1e-6)
         assert track.joint.kind == {None: 0, "static": 1}[getattr(state.joint[0], "kind", None)]
-        types.serialise(answer.markers)
+        JAZZY.serialise(answer.markers)
         pixel = source.camera.matrix @ point
         np.testing.assert_allclose(pixel[:2] / pixel[2], state.uv_px[0], atol=0.01)
-    assert statuses(tracking, types)["handle"][0] == "OK"
-    assert statuses(tracking, types)["input"] == ("OK", f"{FRAMES} pictures tracked")
+    assert statuses(tracking)["handle"][0] == "OK"
+    assert statuses(tracking)["input"] == ("OK", f"{FRAMES} pictures tracked")
 
 
 def test_compressed_colours_and_none_of_depth(tracker: Tracker, messages: Any, clip: Clip):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(use_depth=False), types)
+    tracking = Tracking(tracker, one_point(use_depth=False), JAZZY)
     jpeg = cv2.imencode(".jpg", clip.rgb[0][..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
     tracking.take_info(messages[0][1])
     header = next(message for topic, message, _ in messages if topic == COLOUR).header
-    picture = types("sensor_msgs/msg/CompressedImage")(format="rgb8; jpeg compressed bgr8")
+    picture = JAZZY("sensor_msgs/msg/CompressedImage")(format="rgb8; jpeg compressed bgr8")
     picture.data.frombytes(jpeg)
     picture.header.stamp.sec, picture.header.frame_id = header.stamp.sec, COLOUR_FRAME
     tracking.take_colours(picture, START_NS)
     answer = tracking.step()
     assert answer is not None
-    track = types.again(answer.tracks).tracks[0]
+    track = JAZZY.again(answer.tracks).tracks[0]
     assert (track.x_px, track.y_px) == pytest.approx((CLICK[0] - 0.5, CLICK[1] - 0.5))
     assert np.isnan(track.point.x)
     assert track.joint.kind == 0
     assert answer.markers.markers == []
 
 
-def test_only_the_newest_picture_is_tracked_while_busy(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_only_the_newest_picture_is_tracked_while_busy(tracking: Tracking, messages: Any):
     for sent in messages:
         feed(tracking, sent)
     answer = tracking.step()
@@ -158,9 +160,7 @@ def test_only_the_newest_picture_is_tracked_while_busy(tracker: Tracker, message
     assert values["dropped while busy"] == str(FRAMES - 1)
 
 
-def test_a_bag_that_loops_begins_a_new_stream_and_a_late_picture_is_left_out(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_a_bag_that_loops_begins_a_new_stream_and_a_late_picture_is_left_out(tracking: Tracking, messages: Any):
     first = run(tracking, shifted(messages[:6], 3))
     again = run(tracking, messages[:6])
     assert [answer.tracks.stream for answer in first + again] == [0, 0, 1, 1]
@@ -169,8 +169,8 @@ def test_a_bag_that_loops_begins_a_new_stream_and_a_late_picture_is_left_out(tra
     assert any("time jumped back by" in text and "new stream" in text for text in told)
     assert all(answer.tracks.has_depth for answer in again)
     assert len(run(tracking, messages[1:2] + messages[6:9])) == 1
-    assert statuses(tracking, types)["input"][0] == "WARN"
-    assert "late: 1 picture" in statuses(tracking, types)["input"][1]
+    assert statuses(tracking)["input"][0] == "WARN"
+    assert "late: 1 picture" in statuses(tracking)["input"][1]
 
 
 def wrong_pictures(message: Any) -> dict[str, tuple[Any, str]]:
@@ -184,53 +184,47 @@ def wrong_pictures(message: Any) -> dict[str, tuple[Any, str]]:
     }
 
 
-def test_wrong_pictures_are_errors_in_the_diagnostics_and_the_next_one_is_tracked(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_wrong_pictures_are_errors_in_the_diagnostics_and_the_next_one_is_tracked(tracking: Tracking, messages: Any):
     run(tracking, messages[:3])
     feed(tracking, messages[5])  # depth is there already
     for picture, words in wrong_pictures(messages[4][1]).values():
         feed(tracking, (COLOUR, picture, START_NS))
         assert tracking.step() is None
-        level, message = statuses(tracking, types)["input"]
+        level, message = statuses(tracking)["input"]
         assert level == "ERROR"
         assert words in message
     answers = run(tracking, messages[6:9])
     assert answers[0].tracks.frame == 1
-    assert statuses(tracking, types)["input"][0] == "OK"
+    assert statuses(tracking)["input"][0] == "OK"
     errors = [notice for notice in tracking.notices() if notice.level == "ERROR"]
     assert len(errors) == 5  # each is logged once
 
 
-def test_camera_info_that_is_missing_or_wrong(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_camera_info_that_is_missing_or_wrong(tracking: Tracking, messages: Any):
     info, colours, depth = messages[:3]
     assert run(tracking, [colours, depth]) == []
-    assert "no camera_info" in statuses(tracking, types)["input"][1]
+    assert "no camera_info" in statuses(tracking)["input"][1]
     broken = {"never calibrated": np.zeros(9), "finite": info[1].k * np.nan}
     for k in broken.values():
         assert run(tracking, [(COLOUR_INFO, changed(info[1], k=k), 0), colours, depth]) == []
-        assert statuses(tracking, types)["input"][0] == "ERROR"
+        assert statuses(tracking)["input"][0] == "ERROR"
     assert len(run(tracking, messages[3:6])) == 1
     nan = (COLOUR_INFO, changed(info[1], k=info[1].k * np.nan), 0)
     assert len(run(tracking, [nan, *messages[7:9]])) == 1  # the stream has its camera already
-    assert statuses(tracking, types)["input"][0] == "WARN"
+    assert statuses(tracking)["input"][0] == "WARN"
 
 
-def test_depth_that_cannot_be_used_leaves_the_colours(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_depth_that_cannot_be_used_leaves_the_colours(tracking: Tracking, messages: Any):
     info, colours, depth = messages[:3]
     metres = np.frombuffer(depth[1].data, np.uint16).astype(np.float32)  # millimetres that say to be metres
     as_float = changed(depth[1], encoding="32FC1", step=640 * 4, data=np.frombuffer(metres.tobytes(), np.uint8))
     answers = run(tracking, [info, colours, (DEPTH, as_float, START_NS)])
     assert not answers[0].tracks.has_depth
-    assert "depth is not used" in statuses(tracking, types)["input"][1]
-    assert "in the median" in statuses(tracking, types)["input"][1]
+    assert "depth is not used" in statuses(tracking)["input"][1]
+    assert "in the median" in statuses(tracking)["input"][1]
     strange = changed(messages[5][1], encoding="rgb8")
     assert not run(tracking, [*messages[3:5], (DEPTH, strange, START_NS)])[0].tracks.has_depth
-    assert "'rgb8'" in statuses(tracking, types)["input"][1]
+    assert "'rgb8'" in statuses(tracking)["input"][1]
     small = changed(messages[8][1], width=320)
     assert not run(tracking, [*messages[6:8], (DEPTH, small, START_NS)])[0].tracks.has_depth
     holes = np.where(metres > np.median(metres), np.float32(np.nan), metres / 1000)
@@ -238,20 +232,18 @@ def test_depth_that_cannot_be_used_leaves_the_colours(tracker: Tracker, messages
     assert run(tracking, [*messages[9:11], (DEPTH, fine, START_NS)])[0].tracks.has_depth
 
 
-def test_without_depth_in_time_a_picture_waits_half_a_second(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, one_point(), types)
+def test_without_depth_in_time_a_picture_waits_half_a_second(tracking: Tracking, messages: Any):
     first, later = messages[1], shifted(messages[4:5], 1)[0]
     assert run(tracking, [messages[0], first]) == []
     answers = run(tracking, [later])
     assert [answer.tracks.has_depth for answer in answers] == [False]
-    assert "no depth within 0.02 s" in statuses(tracking, types)["input"][1]
+    assert "no depth within 0.02 s" in statuses(tracking)["input"][1]
 
 
 def test_pictures_of_another_size_begin_a_new_stream_once_camera_info_says_so(
     tracker: Tracker, messages: Any, clip: Clip
 ):
-    tracking = Tracking(tracker, Settings(discover=False, use_depth=False), types_of("jazzy"))
+    tracking = Tracking(tracker, Settings(discover=False, use_depth=False), JAZZY)
     assert len(run(tracking, messages[:2])) == 1
     colours, info = messages[4][1], messages[3][1]
     halved = np.ascontiguousarray(clip.rgb[1][::2, ::2])
@@ -264,16 +256,15 @@ def test_pictures_of_another_size_begin_a_new_stream_once_camera_info_says_so(
 
 
 def test_answers_in_the_world_frame_follow_tf(tracker: Tracker, messages: Any, bag: Path):
-    types = types_of("jazzy")
     world_from_camera = np.eye(4)
     world_from_camera[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
     world_from_camera[:3, 3] = (1, 2, 3)
-    tracking = Tracking(tracker, one_point(world_frame="map"), types)
+    tracking = Tracking(tracker, one_point(world_frame="map"), JAZZY)
     assert run(tracking, messages[:3]) == []
-    assert "no tf joins" in statuses(tracking, types)["input"][1]
+    assert "no tf joins" in statuses(tracking)["input"][1]
     for t in (0, 1):  # between them is the picture
         fields = transform("map", COLOUR_FRAME, world_from_camera, START_NS + t * SECOND)["transforms"][0]
-        tracking.take_transforms(_transforms(types, fields), START_NS, static=False)
+        tracking.take_transforms(_transforms(fields), START_NS, static=False)
     answer = run(tracking, messages[3:6])[0]
     assert answer.tracks.header.frame_id == "map"
     frame = next(iter(open_recording(str(bag))))
@@ -286,26 +277,25 @@ def test_answers_in_the_world_frame_follow_tf(tracker: Tracker, messages: Any, b
     np.testing.assert_allclose((track.point.x, track.point.y, track.point.z), expected, atol=0.02)
 
 
-def _transforms(types: Types, fields: dict[str, Any]) -> Any:
-    stamped = types("geometry_msgs/msg/TransformStamped")(child_frame_id=fields["child_frame_id"])
+def _transforms(fields: dict[str, Any]) -> Any:
+    stamped = JAZZY("geometry_msgs/msg/TransformStamped")(child_frame_id=fields["child_frame_id"])
     stamped.header.frame_id = fields["header"]["frame_id"]
     stamped.header.stamp.sec = fields["header"]["stamp"]["sec"]
     for part, values in fields["transform"].items():
         for name, value in values.items():
             setattr(getattr(stamped.transform, part), name, float(value))
-    return types("tf2_msgs/msg/TFMessage")(transforms=[stamped])
+    return JAZZY("tf2_msgs/msg/TFMessage")(transforms=[stamped])
 
 
 def test_requests(tracker: Tracker, messages: Any):
-    types = types_of("jazzy")
-    tracking = Tracking(tracker, Settings(discover=False), types)
+    tracking = Tracking(tracker, Settings(discover=False), JAZZY)
 
     def ask(service: str, method: Any, **fields: Any) -> Any:
-        request, response = (types(f"quest_msgs/srv/{service}_{half}")() for half in ("Request", "Response"))
+        request, response = (JAZZY(f"quest_msgs/srv/{service}_{half}")() for half in ("Request", "Response"))
         for name, value in fields.items():
             setattr(request, name, value)
         answered = method(request, response)
-        types.serialise(answered)
+        JAZZY.serialise(answered)
         return answered
 
     x, y = CLICK[0] - 0.5, CLICK[1] - 0.5
@@ -336,12 +326,12 @@ def test_requests(tracker: Tracker, messages: Any):
     assert not ask("RetireQuery", tracking.retire, query=-1, name="mine").success
     assert ask("RetireQuery", tracking.retire, query=0).success
     assert run(tracking, messages[6:9])[0].tracks.tracks == []
-    assert tracking.reset(None, types("std_srvs/srv/Trigger_Response")()).success
+    assert tracking.reset(None, JAZZY("std_srvs/srv/Trigger_Response")()).success
     assert run(tracking, messages[9:12])[0].tracks.stream == 1
 
 
 def test_a_query_that_cannot_be_followed_is_told_and_the_others_are_followed(tracker: Tracker, messages: Any):
-    tracking = Tracking(tracker, Settings(points=("9999,3,far", "449.5,227.5,near")), types_of("jazzy"))
+    tracking = Tracking(tracker, Settings(points=("9999,3,far", "449.5,227.5,near")), JAZZY)
     answer = run(tracking, messages[:3])[0]
     assert [track.name for track in answer.tracks.tracks] == ["near"]
     assert any("far" in notice.text for notice in tracking.notices() if notice.level == "ERROR")
@@ -350,7 +340,7 @@ def test_a_query_that_cannot_be_followed_is_told_and_the_others_are_followed(tra
 @pytest.mark.slow
 def test_labels_of_the_parameters(tracker: Tracker, messages: Any, bag: Path):
     settings = Settings.from_parameters({**vars(Settings()), "labels": ["handle:open", ""], "online_s": 1})
-    answers = run(Tracking(tracker, settings, types_of("jazzy")), messages[:3])
+    answers = run(Tracking(tracker, settings, JAZZY), messages[:3])
     frame, camera = next(iter(open_recording(str(bag)))), open_recording(str(bag)).camera
     stream = tracker.stream(camera, None, online=1.0)
     stream.add(Query.semantic("handle", intent="open"))
@@ -454,21 +444,21 @@ def test_alarms_and_joints(seen: tuple[StreamState, Any], messages: Any, distrib
 
 
 def test_an_error_of_the_program_is_told_and_the_next_picture_is_tracked(seen: Any, messages: Any):
-    types, (state, stream) = types_of("jazzy"), seen
-    tracking = Tracking(told_to([ZeroDivisionError("oh"), state], stream), one_point(), types)
+    state, stream = seen
+    tracking = Tracking(told_to([ZeroDivisionError("oh"), state], stream), one_point(), JAZZY)
     assert run(tracking, messages[:3]) == []
-    assert statuses(tracking, types)["input"] == ("ERROR", "ZeroDivisionError: oh")
+    assert statuses(tracking)["input"] == ("ERROR", "ZeroDivisionError: oh")
     assert "Traceback" in next(notice.text for notice in tracking.notices() if notice.level == "ERROR")
     assert len(run(tracking, messages[3:6])) == 1
 
 
 def test_silence_is_told(seen: Any, messages: Any):
-    types, (state, stream) = types_of("jazzy"), seen
-    tracking = Tracking(told_to([state], stream), one_point(), types, topic="/front/image")
-    assert statuses(tracking, types) == {
+    state, stream = seen
+    tracking = Tracking(told_to([state], stream), one_point(), JAZZY, topic="/front/image")
+    assert statuses(tracking) == {
         "input": ("WARN", "no pictures on /front/image yet"),
         "tracker": ("WARN", "no stream yet"),
     }
     run(tracking, messages[:3])
-    assert statuses(tracking, types)["input"][0] == "OK"
-    assert "for 10 s" in statuses(tracking, types, START_NS + 10 * SECOND)["input"][1]
+    assert statuses(tracking)["input"][0] == "OK"
+    assert "for 10 s" in statuses(tracking, now_ns=START_NS + 10 * SECOND)["input"][1]

@@ -11,8 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 
 from quest.bench.settings import Making
-from quest.cli.evaluate import Lineup, TrackerName, table_console
-from quest.errors import ConfigError
+from quest.cli.console import Console
+from quest.cli.evaluate import Lineup, TrackerName
+from quest.cli.progress import counting
+from quest.cli.takes import table_console
+from quest.data.provenance import combined_hash, command_line, file_hash
+from quest.errors import ConfigError, InputError
+from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -53,28 +58,19 @@ class BenchTable:
     """Folder of the tables."""
 
     def run(self) -> int:
-        """Make the tables.
-
-        Raises:
-            ConfigError: no such table, or a folder with runs of other settings.
-            MissingExtraError: an extra is missing: viz for pictures, sim to render takes.
-            ObjectError, RendererError: takes cannot be made here.
-        """
+        """Make the tables."""
         from quest.bench.tables import TABLES
         from quest.bench.workbench import Workbench
         from quest.bench.writing import draw, latex, markdown
-        from quest.cli.console import Console
-        from quest.data.provenance import command_line
         from quest.evaluation.report import provenance
         from quest.evaluation.results import write_report
-        from quest.whole_file import whole_file
 
         if unknown := [name for name in self.tables if name not in (*TABLES, ALL)]:
             raise ConfigError(f"bench: no table {unknown[0]!r}; expected some of {', '.join((*TABLES, ALL))}")
         making = self.making
         if self.smoke:
             making = replace(making, **SMOKE, work=making.work / "smoke")
-        console, output = Console(stderr=True, highlight=False), table_console(170)
+        console, output = Console(stderr=True, soft_wrap=False), table_console(170)
         for name in TABLES if ALL in self.tables else dict.fromkeys(self.tables):
             recipe = TABLES[name]
             found = recipe.make(Workbench(making, console))
@@ -91,7 +87,7 @@ class BenchTable:
             if recipe.figure is not None:
                 rows = [row for row in plain["rows"] if row["reading"] == "moved"]
                 draw(recipe.figure, recipe.about, rows, [self.out / f"{name}.{kind}" for kind in ("svg", "png")])
-            output.print(texts["md"], soft_wrap=True, markup=False)
+            output.print(texts["md"], soft_wrap=True)
             console.print(f"wrote {self.out / name}.json")
         return 0
 
@@ -130,17 +126,7 @@ class BenchTapvid:
     """Result file (.json)."""
 
     def run(self) -> int:
-        """Evaluate, print the tables, write the file.
-
-        Raises:
-            ConfigError: settings out of range.
-            InputError: there is no video, or one cannot be used.
-            WeightsError: the weights cannot be loaded.
-        """
-        from quest.cli.console import Console
-        from quest.cli.progress import counting
-        from quest.data.provenance import combined_hash, file_hash
-        from quest.errors import InputError
+        """Evaluate, print the tables, write the file."""
         from quest.evaluation.real.run import KeptAnswers, write_set
         from quest.evaluation.real.table import FULL_WIDTH, real_table
         from quest.evaluation.tapvid.run import COLUMNS, LEGEND, Setting, evaluate_videos
@@ -149,7 +135,7 @@ class BenchTapvid:
             raise ConfigError(
                 f"bench tapvid: expected a tracker, resamples >= 1, seed >= 0, --out FILE.json, got {self}"
             )
-        start_s, console = time.monotonic(), Console(stderr=True, highlight=False)
+        start_s, console = time.monotonic(), Console(stderr=True, soft_wrap=False)
         paths = sorted(self.data.rglob("*.npz"))
         files = {path.relative_to(self.data).with_suffix("").as_posix(): path for path in paths}
         if not files:
@@ -163,7 +149,7 @@ class BenchTapvid:
         bootstrap = {"resamples": self.resamples, "seed": self.seed}
         with counting(console, "tracking", len(files), "videos") as done:
             rows, single = evaluate_videos(files, lineup.trackers, setting, **bootstrap, kept=kept, progress=done)
-        name, output = self.data.resolve().name, table_console(FULL_WIDTH)
+        name, output = self.data.resolve().name, table_console(FULL_WIDTH, markup=True)
         output.print(real_table({name: rows}, width=output.width, shown=COLUMNS, legend=LEGEND))
         if self.out is not None and kept is not None:
             run = lineup.ended(start_s, data_hash=data_hash, **bootstrap)

@@ -10,13 +10,21 @@ from typing import Any, get_type_hints
 import rich.console
 import tyro
 from rich.segment import Segment
+from rich.text import Text
 
 _UNSHOWN = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f]")
 """Control characters, but for the tab and the end of a line."""
 
 
 class Console(rich.console.Console):
-    """As rich's own, but control characters of names and words are written out."""
+    """As rich's own, for lines of any length; names and words are no markup, and their control characters are shown."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**{"highlight": False, "markup": False, "soft_wrap": True, **options})
+
+    def note(self, text: str) -> None:
+        """Say what is less than it could be."""
+        self.print(Text.assemble(("note:", "yellow"), f" {text}"))
 
     def render(
         self, renderable: rich.console.RenderableType, options: rich.console.ConsoleOptions | None = None

@@ -8,7 +8,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,7 +18,7 @@ from rich.table import Table
 
 from quest.cli.console import Console
 from quest.errors import QuestError
-from quest.extras import EXTRA_OF, explain_missing, install_command, is_installed
+from quest.extras import MODULES_OF, explain_missing, install_command, is_installed
 from quest.wording import counted
 
 Status = Literal["ok", "optional", "broken"]
@@ -53,35 +53,25 @@ class Doctor:
 
     def run(self) -> int:
         """Print the table; 0 if a recorded clip can be tracked here, else 1."""
-        checks: list[Callable[[], Iterator[Finding]]] = [
-            _python,
-            _torch,
-            _pictures,
-            _video,
-            _weights,
-            _renderer,
-            *([_test_render] if self.render else []),
-            _objects,
-            _extras,
-            _disk,
-        ]
+        rendering = (_renderer, _test_render) if self.render else (_renderer,)
+        checks = (_python, _torch, _pictures, _video, _weights, *rendering, _objects, _extras, _disk)
         findings = [finding for check in checks for finding in check()]
         broken = [finding.part for finding in findings if finding.status == "broken"]
         if self.json:
             print(json.dumps([asdict(finding) for finding in findings], indent=1))
             return 1 if broken else 0
-        table = Table(
-            "", "part", "found", title="What this machine can do", title_justify="left", box=None, pad_edge=False
-        )
+        title = "What this machine can do"
+        table = Table("", "part", "found", title=title, title_justify="left", box=None, pad_edge=False)
+        remedies = []
         for finding in findings:
-            table.add_row(SIGNS[finding.status], escape(finding.part), escape(finding.found))
-        console = Console(highlight=False)
-        console.print(table)
-        for finding in findings:
+            sign, part = SIGNS[finding.status], escape(finding.part)
+            table.add_row(sign, part, escape(finding.found))
             if finding.remedy:
-                console.print(
-                    f"\n{SIGNS[finding.status]} {escape(finding.part)}: {escape(finding.remedy)}", soft_wrap=True
-                )
+                remedies.append(f"\n{sign} {part}: {escape(finding.remedy)}")
+        console = Console(markup=True, soft_wrap=False)
+        console.print(table)
+        for remedy in remedies:
+            console.print(remedy, soft_wrap=True)
         console.print()
         if broken:
             console.print(f"[bold red]cannot track recordings here[/]: {', '.join(broken)}")
@@ -126,24 +116,23 @@ def _pictures() -> Iterator[Finding]:
     except ImportError as error:
         remedy = "on Debian and Ubuntu: apt-get install libgl1 libglib2.0-0 libxcb1"
         yield Finding("pictures", "broken", f"OpenCV cannot be imported: {error}", remedy)
-        return
-    yield Finding("pictures", "ok", f"OpenCV {cv2.__version__}")
+    else:
+        yield Finding("pictures", "ok", f"OpenCV {cv2.__version__}")
 
 
 def _video() -> Iterator[Finding]:
     remedy = "pip install --force-reinstall av"
     try:
         import av
-    except (ImportError, OSError) as error:
-        yield Finding("video", "broken", f"PyAV cannot be imported: {error}", remedy)
-        return
-    try:
+
         av.Codec("h264", "r")
         encoder = av.Codec("libx264", "w").name
+    except (ImportError, OSError) as error:
+        yield Finding("video", "broken", f"PyAV cannot be imported: {error}", remedy)
     except ValueError:  # PyAV's error for an unknown codec
         yield Finding("video", "broken", f"PyAV {av.__version__} cannot read or write H.264", remedy)
-        return
-    yield Finding("video", "ok", f"PyAV {av.__version__} with FFmpeg inside, H.264 by {encoder}")
+    else:
+        yield Finding("video", "ok", f"PyAV {av.__version__} with FFmpeg inside, H.264 by {encoder}")
 
 
 def _weights() -> Iterator[Finding]:
@@ -185,11 +174,9 @@ def _test_render() -> Iterator[Finding]:
 
         settings = TakeSettings(views=1, size=64, every=8)
         take = generate_take(make_object(CATEGORIES[0], 0), 1, 0, renderer=Renderer(), settings=settings)
-    except QuestError as error:
-        yield Finding("render test", "optional", str(error))
-        return
-    except ModuleNotFoundError as error:
-        yield Finding("render test", "optional", str(explain_missing(error) or error))
+    except (QuestError, ModuleNotFoundError) as error:
+        missing = explain_missing(error) if isinstance(error, ModuleNotFoundError) else None
+        yield Finding("render test", "optional", str(missing or error))
         return
     seconds = time.monotonic() - start_s
     contrast = int(take.views[0].clip.rgb.std())
@@ -211,8 +198,8 @@ def _objects() -> Iterator[Finding]:
 
 
 def _extras() -> Iterator[Finding]:
-    for extra in dict.fromkeys(EXTRA_OF.values()):
-        missing = [module for module, owner in EXTRA_OF.items() if owner == extra and not is_installed(module)]
+    for extra, modules in MODULES_OF.items():
+        missing = [module for module in modules if not is_installed(module)]
         if missing:
             yield Finding(f"[{extra}]", "optional", f"missing: {', '.join(missing)}", install_command(extra))
         else:

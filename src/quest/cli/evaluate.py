@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,9 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import tyro
 from tyro.extras import literal_type_from_choices
 
-from quest.baselines import TRACKERS
+from quest.baselines import TRACKERS, line_up
 from quest.cli.console import Console
 from quest.cli.progress import advancing
+from quest.cli.takes import open_store, table_console
+from quest.data.provenance import code_hash, file_hash, package_versions
+from quest.errors import ConfigError
 from quest.wording import counted
 
 if TYPE_CHECKING:
@@ -22,7 +26,6 @@ if TYPE_CHECKING:
     from quest.evaluation.results import Results, Run
     from quest.evaluation.runner import Evaluated
 
-if TYPE_CHECKING:
     TrackerName = str
 else:
     TrackerName = literal_type_from_choices(TRACKERS)
@@ -80,16 +83,7 @@ class Eval:
     a file for each set."""
 
     def run(self) -> int:
-        """Evaluate, print the table, write the files.
-
-        Raises:
-            ConfigError: nothing to evaluate, or settings out of range.
-            InputError: a set of recordings is missing or damaged.
-            TakeError: the store is missing or a take is corrupt.
-            WeightsError: weights, ours or a rival's, cannot be loaded.
-        """
-        from quest.errors import ConfigError
-
+        """Evaluate, print the table, write the files."""
         if (self.takes is None) == (not self.real):
             raise ConfigError("eval: expected --takes STORE or --real FOLDER..., one of the two")
         if not self.protocol or self.resamples < 1 or self.seed < 0:
@@ -100,7 +94,6 @@ class Eval:
         return self._run_takes(self.takes) if self.takes is not None else self._run_real()
 
     def _run_real(self) -> int:
-        from quest.errors import ConfigError
         from quest.evaluation.real.run import KeptAnswers, RealRow, evaluate_set, write_set
         from quest.evaluation.real.sets import open_set
         from quest.evaluation.real.table import FULL_WIDTH, real_table
@@ -115,7 +108,7 @@ class Eval:
         if len(set(names)) < len(names):
             raise ConfigError(f"eval: expected sets of different names, got {', '.join(names)}; rename a folder")
         lineup = Lineup.of(self.trackers or _OF_REAL, self.weights, self.rivals)
-        console, found = Console(stderr=True), dict[str, list[RealRow]]()
+        console, found = Console(stderr=True, soft_wrap=False), dict[str, list[RealRow]]()
         with advancing(console, sum(len(real.clips) + len(real.pictures) for real in sets)) as advance:
             for real in sets:
                 start_s, data_hash, kept = time.monotonic(), real.data_hash(), None
@@ -129,15 +122,13 @@ class Eval:
                     run = lineup.ended(start_s, data_hash=data_hash, **bootstrap)
                     write_set(self.out / f"{real.name}.json", real.name, rows, single, run)
                     kept.remove()
-        output = table_console(FULL_WIDTH)
+        output = table_console(FULL_WIDTH, markup=True)
         output.print(real_table(found, width=output.width))
         if self.out is not None:
-            console.print(f"wrote {', '.join(str(self.out / f'{name}.json') for name in found)}", highlight=False)
+            console.print(f"wrote {', '.join(str(self.out / f'{name}.json') for name in found)}")
         return 0
 
     def _run_takes(self, takes: str) -> int:
-        from quest.cli.takes import open_store
-        from quest.errors import ConfigError
         from quest.evaluation.finished import FinishedTakes
         from quest.evaluation.results import write_results
         from quest.evaluation.runner import evaluate, has_protocol
@@ -160,7 +151,7 @@ class Eval:
         if self.out is not None:
             made_by = lineup.digest(self.protocol, [t.name for t in lineup.trackers], self.seed)
             finished = FinishedTakes(self.out.with_suffix(".parts"), made_by=made_by)
-        console, headers = Console(stderr=True), store.headers()
+        console, headers = Console(stderr=True, soft_wrap=False), store.headers()
         own = [headers[name] for i, name in enumerate(chosen) if i in shard]
         runs = sum(has_protocol(t, p) for t in lineup.trackers for p in self.protocol)
         with advancing(console, sum(header.frames * len(header.cameras) for header in own) * runs) as advance:
@@ -178,11 +169,11 @@ class Eval:
             return 0
         bootstrap = {"resamples": self.resamples, "seed": self.seed}
         run = lineup.ended(start_s, data_hash=hash_of([(store, chosen)]), **bootstrap)
-        results, output = self._results(found, broken, run), table_console(FULL_WIDTH)
+        results, output = self._results(found, broken, run), table_console(FULL_WIDTH, markup=True)
         output.print(results_table(results, width=output.width))
         if self.out is not None and finished is not None:
             write_results(results, self.out, records=found.records)
-            console.print(f"wrote {self.out}", highlight=False)
+            console.print(f"wrote {self.out}")
             finished.remove()
         return 0
 
@@ -215,25 +206,17 @@ class Lineup:
     @classmethod
     def of(cls, names: Sequence[str], weights: str, rivals: Path | None) -> Lineup:
         """Load trackers by their names."""
-        from quest.baselines import line_up
-
         return cls(list(line_up(names, weights=weights, rivals=rivals)), weights)
 
     @property
     def weights_hash(self) -> str | None:
         """Hash of the weights that trackers were made of, where it is known."""
-        from quest.data.provenance import file_hash
-
         return next((h for t in self.trackers if (h := getattr(t, "weights_hash", None))), None) or file_hash(
             self.weights
         )
 
     def digest(self, *asked: object) -> str:
         """What tells apart answers of other code, packages, weights, or to other questions."""
-        import hashlib
-
-        from quest.data.provenance import code_hash, package_versions
-
         rivals = [h for t in self.trackers if (h := getattr(t, "rival_hash", None))]
         made_by = [code_hash(), package_versions(), self.weights, self.weights_hash, rivals, *asked]
         return hashlib.sha256(repr(made_by).encode()).hexdigest()
@@ -246,9 +229,3 @@ class Lineup:
         weights, own_hash = (self.weights, self.weights_hash) if of_weights else (None, None)
         bootstrap = {"resamples": resamples, "seed": seed}
         return Run.ended(start_s, data_hash=data_hash, weights=weights, weights_hash=own_hash, **bootstrap)
-
-
-def table_console(full_width: int) -> Console:
-    """The terminal; a file or pipe has no width of its own and gets every column."""
-    output = Console()
-    return output if output.is_terminal else Console(width=full_width)

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
 from rich.table import Table
 
 from quest.cli.console import Console
+from quest.errors import ConfigError
 
 if TYPE_CHECKING:
     from quest.model.onnx_export import Difference
@@ -30,9 +30,8 @@ class Export:
 
     def run(self) -> int:
         """Export, compare, write."""
-        console = Console(highlight=False, soft_wrap=True)
-        console.print(f"exporting {escape(self.weights)}; this takes a minute or more")
-        from quest.errors import ConfigError
+        console = Console()
+        console.print(f"exporting {self.weights}; this takes a minute or more")
         from quest.model.onnx_export import TOLERANCE, require_empty
         from quest.model.weights import find_weights, load_network
         from quest.paper.network import is_paper
@@ -44,7 +43,7 @@ class Export:
         differences = export(load_network(self.weights), self.out)
         console.print(_table(differences))
         console.print(f"all within {TOLERANCE:.0e}; extents relative to their size, all else absolute")
-        console.print(f"wrote {escape(str(self.out))}: finder.onnx, features.onnx, manifest.json")
+        console.print(f"wrote {self.out}: finder.onnx, features.onnx, manifest.json")
         return 0
 
 

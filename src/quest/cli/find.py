@@ -7,14 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tyro
-from rich.markup import escape
 
 from quest.cli.console import Console
+from quest.errors import ConfigError, InputError
+from quest.types import Clip
+from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from quest.model.found import Found
 
 
@@ -46,10 +47,8 @@ class Find:
         import quest
         from quest.data.pictures import PICTURES, read_picture
         from quest.data.recording import read_recording
-        from quest.errors import ConfigError, InputError
         from quest.text import choose, understand
         from quest.track import Tracker
-        from quest.types import Clip
 
         if self.threshold is not None and not 0 <= self.threshold <= 1:
             raise ConfigError(f"find: expected a threshold from 0 to 1, got {self.threshold}")
@@ -67,12 +66,12 @@ class Find:
         found = tracker.find(clip.rgb[self.frame])
         config, missing = tracker.config, ""
         least = config.threshold if self.threshold is None else self.threshold
-        console = Console(highlight=False, soft_wrap=True)
+        console = Console()
         if meaning is not None:
             of_any = config.prompt_threshold if self.threshold is None else least
             chosen = choose(found, meaning, least=least, least_of_any=of_any)
             found, least, missing = found.select(chosen.rows), 0.0, chosen.missing
-            Console(highlight=False, soft_wrap=True, stderr=self.json).print(f"understood: {escape(str(meaning))}")
+            Console(stderr=self.json).print(f"understood: {meaning}")
         things = listed(found, least=least)
         if not things and not missing:
             missing = "nothing found; a lower --threshold shows what is less sure"
@@ -80,18 +79,17 @@ class Find:
             print(json.dumps(things, indent=1))
         else:
             for thing in things:
-                console.print(escape(_line(thing)))
-            console.print("; ".join(filter(None, (f"{len(things)} found" * bool(things), escape(missing)))))
+                console.print(_line(thing))
+            console.print("; ".join(filter(None, (f"{len(things)} found" * bool(things), missing))))
         if self.out is not None:
             self._write(clip.rgb[self.frame], found, things, least)
-            console.print(f"wrote {escape(str(self.out / 'found.png'))} and found.json")
+            console.print(f"wrote {self.out / 'found.png'} and found.json")
         return 0
 
     def _write(self, rgb: np.ndarray, found: Found, things: list[dict[str, Any]], least: float) -> None:
         from PIL import Image
 
         from quest.viz.found import draw_found
-        from quest.whole_file import whole_file
 
         assert self.out is not None
         self.out.mkdir(parents=True, exist_ok=True)
@@ -104,8 +102,6 @@ class Find:
 
 def listed(found: Found, *, least: float) -> list[dict[str, Any]]:
     """What was found with at least some probability, best first, as plain values."""
-    import numpy as np
-
     from quest.model.finder import OPENINGS, PANELS
 
     things = []

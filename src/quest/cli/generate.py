@@ -7,13 +7,14 @@ import shlex
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
-from rich.markup import escape
 
 from quest.cli.console import Console, words_of
 from quest.cli.progress import Report, counting
+from quest.data.split import object_split
+from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError
 from quest.sim.cameras import CAMERA_MOTIONS, MIXED
 from quest.wording import counted
@@ -114,12 +115,7 @@ class Generate:
     """Processor cores that each worker of the cluster claims."""
 
     def run(self) -> int:
-        """Render and write; 0 if every planned take is there or was skipped for a stated reason.
-
-        Raises:
-            ObjectError: there is no folder of objects to take the named ones from, or not one planned take can be made.
-        """
-        from quest.data.store import TakeStore
+        """Render and write; 0 if every planned take is there or was skipped for a stated reason."""
         from quest.sim.cluster import ClusterSettings, produce_on_cluster
         from quest.sim.plan import plan_takes
         from quest.sim.production import StudioSettings, missing_takes, produce
@@ -138,11 +134,10 @@ class Generate:
             settings=TakeSettings() if suites else self._settings(TakeSettings()),
             suites=suites,
         )
-        console = Console(stderr=True, highlight=False)
+        console = Console(stderr=True, soft_wrap=False)
         missing = missing_takes(takes, store)
         console.print(
-            f"{counted(len(takes), 'take')} planned, {len(takes) - len(missing)} there already; "
-            f"store {escape(str(self.out))}"
+            f"{counted(len(takes), 'take')} planned, {len(takes) - len(missing)} there already; store {self.out}"
         )
         if not missing:
             return 0
@@ -157,7 +152,7 @@ class Generate:
                     produce_on_cluster(missing, store, studio, cluster, report=made)
             finally:
                 if made.takes or made.skipped:
-                    console.print(f"{made}; store {escape(store.url)}", soft_wrap=True)
+                    console.print(f"{made}; store {store.url}", soft_wrap=True)
         if made.skipped == len(takes):
             raise ObjectError(f"generate: no planned take can be made ({len(takes)} skipped), for the reasons above")
         return 0
@@ -183,26 +178,13 @@ class Generate:
         """A preset with the changes of the arguments."""
         from quest.sim.sensor import SENSORS
 
-        given = {
-            name: getattr(self, name)
-            for name in ("views", "every", "frames_per_joint", "frames")
-            if getattr(self, name) is not None
-        }
-        if self.size:
-            given["size"] = self._size()
-        cameras = {"motion": self.camera, "azimuth_deg": self.azimuth, "elevation_deg": self.elevation}
-        if said := {name: value for name, value in cameras.items() if value is not None}:
-            given["cameras"] = dataclasses.replace(preset.cameras, **said)
-        if self.motion is not None or self.overlap is not None:
-            kind = preset.motion.kind if self.motion is None else self.motion
-            overlap = preset.motion.overlap if self.overlap is None else self.overlap
-            given["motion"] = dataclasses.replace(preset.motion, kind=kind, overlap=overlap)
-        if self.sensor is not None:
-            given["sensor"] = SENSORS[self.sensor]
-        if (self.gripper or self.hand) and not preset.pulled and self.frames_per_joint is None:
-            given["frames_per_joint"] = FRAMES_WITH_PULLER
+        pulled = (self.gripper or self.hand) and not preset.pulled and self.frames_per_joint is None
+        cameras = _given(motion=self.camera, azimuth_deg=self.azimuth, elevation_deg=self.elevation)
+        motion = _given(kind=self.motion, overlap=self.overlap)
         return dataclasses.replace(
             preset,
+            cameras=dataclasses.replace(preset.cameras, **cameras),
+            motion=dataclasses.replace(preset.motion, **motion),
             physics=preset.physics or self.physics,
             gripper=preset.gripper or self.gripper,
             hand=preset.hand or self.hand,
@@ -211,19 +193,26 @@ class Generate:
             randomize_materials=preset.randomize_materials and self.randomize_materials,
             stretch=self.stretch,
             broad_materials=self.mix == "broad",
-            **given,
+            **_given(
+                views=self.views,
+                every=self.every,
+                frames=self.frames,
+                frames_per_joint=FRAMES_WITH_PULLER if pulled else self.frames_per_joint,
+                size=self._size(),
+                sensor=None if self.sensor is None else SENSORS[self.sensor],
+            ),
         )
 
-    def _size(self) -> int | tuple[int, int]:
+    def _size(self) -> int | tuple[int, int] | None:
         """Side of square images, or width and height."""
-        sides = self.size if len(set(self.size)) > 1 else self.size[:1]
-        if not 1 <= len(self.size) <= 2:
+        if len(self.size) > 2:
             raise ConfigError(f"generate: expected --size SIDE or --size WIDTH HEIGHT, got {len(self.size)} numbers")
-        return sides[0] if len(sides) == 1 else (sides[0], sides[1])
+        if len(self.size) == 2 and self.size[0] != self.size[1]:
+            return self.size[0], self.size[1]
+        return self.size[0] if self.size else None
 
     def _chosen(self, category: str | None) -> list[tuple[str, str]]:
         """Source and id of every object that the arguments name; all of a category if that is given."""
-        from quest.data.split import object_split
         from quest.sim.plan import imported_objects, parse_object, procedural_objects
 
         chosen = [pair for text in self.objects for pair in parse_object(text)]
@@ -262,6 +251,11 @@ class Generate:
         return chosen
 
 
+def _given(**values: Any) -> dict[str, Any]:
+    """What is not None."""
+    return {name: value for name, value in values.items() if value is not None}
+
+
 def _seed_range(text: str) -> tuple[int, int]:
     first, dots, last = text.partition("..")
     last = last if dots else first
@@ -271,12 +265,7 @@ def _seed_range(text: str) -> tuple[int, int]:
 
 
 class _Made:
-    """Counts the takes of a production, and says each warning once.
-
-    Args:
-        console: where to say it.
-        report: the bar.
-    """
+    """Counts the takes of a production on a bar, and says each warning once."""
 
     def __init__(self, console: Console, report: Report) -> None:
         self.takes = self.skipped = 0
@@ -312,4 +301,4 @@ class _Made:
     def _warn(self, line: str) -> None:
         if line not in self._said:
             self._said.add(line)
-            self._console.print(f"[yellow]{escape(line)}[/]")
+            self._console.print(line, style="yellow")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
 
 import tyro
-from rich.markup import escape
+from rich.text import Text
 
 from quest.cli.console import Console
 from quest.errors import QuestError
@@ -88,10 +88,10 @@ COMMANDS: dict[str, Entry | Group] = {
     "track": Entry("track", "Track", "Track a recording or a take: a table of tracks and a video."),
     "find": Entry("find", "Find", "Find what can be taken hold of in a picture."),
     "report": Entry("report", "Report", "Write a page about a run of quest track: words, plots, video, settings."),
-    "pick": Entry("pick", "Pick", "Choose what to follow in a recording, on a local page."),
+    "pick": Entry("live", "Pick", "Choose what to follow in a recording, on a local page."),
     "live": Entry("live", "Live", "Follow a camera on a local page, and correct what is followed."),
     "monitor": Entry("monitor", "Monitor", "Watch a recording or a camera in the terminal: states, joints, alarms."),
-    "demo": Entry("demo", "Demo", "Track the packaged clips, and say which video to open."),
+    "demo": Entry("track", "Demo", "Track the packaged clips, and say which video to open."),
     "doctor": Entry("doctor", "Doctor", "Check this machine: devices, renderer, weights, extras."),
     "weights": Group(
         "List, show, share and tune weights.",
@@ -135,16 +135,13 @@ COMMANDS: dict[str, Entry | Group] = {
         },
     ),
     "calibrate": Entry("calibrate", "Calibrate", "Fit the monitor to takes."),
-    "eval-monitor": Entry("evaluate_monitor", "EvalMonitor", "Score the monitor beside plainer rules."),
+    "eval-monitor": Entry("calibrate", "EvalMonitor", "Score the monitor beside plainer rules."),
 }
 """Every command by its name on the command line, in the order of the help."""
 
 
 def parse(arguments: Sequence[str]) -> Command:
-    """Parse arguments into a command.
-
-    Args:
-        arguments: the words after ``quest`` on the command line.
+    """Parse the words after ``quest`` into a command.
 
     Raises:
         SystemExit: on ``--help`` (code 0) and on bad arguments (code 2, after a message on stderr).
@@ -184,10 +181,7 @@ def _unknown(program: str, word: str, commands: Mapping[str, Entry | Group]) -> 
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run ``quest``.
-
-    Args:
-        arguments: what follows ``quest``; those of the process by default.
+    """Run ``quest`` with the arguments of the process, or with others.
 
     Returns:
         The exit code: the command's own, 2 for an error that the user can mend, 130 when interrupted, 141 when nobody
@@ -236,7 +230,7 @@ def _run(arguments: Sequence[str]) -> int:
 
 def _fail(error: QuestError) -> int:
     message = " ".join(str(error).split())
-    Console(stderr=True, highlight=False).print(f"[bold red]error:[/] [red]{escape(message)}[/]", soft_wrap=True)
+    Console(stderr=True).print(Text.assemble(("error:", "bold red"), " ", (message, "red")))
     return EXIT_ERROR
 
 

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.markup import escape
-
 from quest.cli.console import Console
-from quest.cli.source import Source
+from quest.cli.source import Source, say_flags, say_shortfall
+from quest.data.frame_source import FrameSource
+from quest.errors import InputError
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from quest.data.frame_source import FrameSource
     from quest.track import Stream, StreamState
 
 EXIT_ALARM = 3
@@ -41,13 +40,7 @@ class Monitor(Source):
     """Play at the recording's own pace; no frame is skipped, so a slow machine falls behind."""
 
     def run(self) -> int:
-        """Step through the recording as it is read, show, write.
-
-        Raises:
-            ConfigError: alpha is no probability, or there are no frames.
-            InputError: a point is not in the clip, nothing to follow was found, or the lines cannot be written.
-        """
-        from quest.errors import InputError
+        """Step through the recording as it is read, show, write."""
         from quest.track.state_lines import StateLines
         from quest.viz.live import LiveView, query_words
 
@@ -67,13 +60,13 @@ class Monitor(Source):
             alpha_frames=budget.frames,
         )
         frames = "" if length is None else f"{counted(length, 'frame')}, "
-        console.print(f"watching {escape(source.name)}: {frames}{escape(self.weights)} on {tracker.device}")
+        console.print(f"watching {source.name}: {frames}{self.weights} on {tracker.device}")
         if stream.budget is None:
-            console.print(
-                "[yellow]note:[/] no calibration of the monitor: no alarms, P(lost) is unknown, and exit code 0 says "
-                "nothing; `quest calibrate` makes one"
+            console.note(
+                "no calibration of the monitor: no alarms, P(lost) is unknown, and exit code 0 says nothing; "
+                "`quest calibrate` makes one"
             )
-        self.say_shortfall(tracker, console, budget, frames=length)
+        say_shortfall(tracker, console, budget, frames=length)
         view = LiveView(console, name=source.name, frames=length if source.exact else None, budget=stream.budget)
         state, last = None, -1
         try:
@@ -94,16 +87,16 @@ class Monitor(Source):
         if state is None or not state.names:
             raise InputError(f"clip {source.name!r}: {NOTHING_FOUND}")
         for query in stream.unbound:
-            console.print(f"[yellow]note:[/] {escape(query_words(query))}: found no entity; ask for it by --point")
-        self.say_flags(source, console)
+            console.note(f"{query_words(query)}: found no entity; ask for it by --point")
+        say_flags(source, console)
         console.print(view.summary())
         return EXIT_ALARM if any(alarm is not None for alarm in state.alarm) else 0
 
     def _console(self) -> Console:
         to_output = str(self.jsonl) == "-"
-        # A table that redraws itself would run into lines which come out in the same terminal.
+        # A table that redraws itself would run into lines that come out in the same terminal.
         clash = to_output and sys.stdout.isatty()
-        console = Console(stderr=to_output, highlight=False, force_interactive=False if clash else None)
+        console = Console(stderr=to_output, force_interactive=False if clash else None)
         console.soft_wrap = not console.is_interactive
         return console
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import tyro
 
+from quest.cli.console import Console
+from quest.cli.progress import counting
+from quest.cli.takes import check_picture, write_picture
 from quest.errors import ConfigError, ObjectError
 from quest.wording import counted
 
@@ -20,25 +23,28 @@ if TYPE_CHECKING:
 _LINE = "{:<22} {:<18} {:>6}  {:<20}  {}"
 
 
+def _consoles() -> tuple[Console, Console]:
+    """Standard output and standard error, for whole lines."""
+    return Console(), Console(stderr=True)
+
+
 @dataclass(frozen=True)
 class ObjectsList:
     """List objects with their joints, entities and sizes, and the faults of those that cannot be used."""
 
     objects_root: Path | None = None
     """Folder of object folders; QUEST_OBJECTS by default."""
-
     procedural: bool = False
     """List the procedural categories instead, by one object of each."""
 
     def run(self) -> int:
         """Print a line for each object as it is read; returns 1 if an object cannot be used."""
-        from quest.cli.console import Console
         from quest.viz.object_sheet import entity_words, size_words
 
-        out, errors = (Console(stderr=e, highlight=False, markup=False, soft_wrap=True) for e in (False, True))
+        out, errors = _consoles()
         out.print(_LINE.format("object", "category", "joints", "size, m", "entities"), style="bold")
         problems = 0
-        for thing in _every_category() if self.procedural else _every_folder(self.objects_root):
+        for thing in self._things():
             if isinstance(thing, ObjectError):
                 problems += 1
                 errors.print(str(thing), style="red")
@@ -50,39 +56,44 @@ class ObjectsList:
         out.print("size: width x depth x height, closed")
         return 1 if problems else 0
 
+    def _things(self) -> Iterator[SimObject | ObjectError]:
+        from quest.sim.objects import find_objects, load_object
+        from quest.sim.procedural import CATEGORIES, make_object
+
+        if self.procedural:
+            yield from (make_object(category, 0) for category in CATEGORIES)
+            return
+        for folder in find_objects(self.objects_root):
+            try:
+                yield load_object(folder)
+            except ObjectError as error:
+                yield error
+
 
 @dataclass(frozen=True)
 class ObjectsShow:
     """Draw objects, closed and open, from a few sides, with their entities marked and named."""
 
-    objects: Annotated[tuple[str, ...], tyro.conf.Positional]
+    objects: tyro.conf.Positional[tuple[str, ...]]
     """Each an id (44817), ids (partnet:44817,23724), a folder or URDF of your own, a procedural object
     (procedural:chest-12), a category (procedural:chest), or a mix (procedural:usual, procedural:broad)."""
-
     out: Path = Path("objects.png")
     """Picture to write (PNG, JPEG, WebP)."""
-
     objects_root: Path | None = None
     """Folder of object folders; QUEST_OBJECTS by default."""
-
     count: int = 12
     """How many objects of a category or mix."""
-
     first_seed: int = 0
     """Seed of the first of them; the others count up."""
-
     sides: int = 2
     """From how many sides each is seen."""
-
     columns: int = 0
     """Objects beside each other; 0 chooses."""
-
     size: int = 240
     """Edge length of every portrait, pixels."""
 
     def run(self) -> int:
         """Write the picture and say where it is."""
-        from quest.cli.takes import check_picture, write_picture
         from quest.sim.plan import ObjectShelf
         from quest.sim.portrait import portray
         from quest.sim.renderer import Renderer
@@ -100,9 +111,7 @@ class ObjectsShow:
         renderer = Renderer()
         cards = [Card(t, portray(t, renderer, sides=self.sides, size_px=self.size)) for t in things]
         columns = self.columns or max(1, round((len(cards) / (2 * self.sides) * 1.6) ** 0.5))
-        sheet = object_sheet(cards, columns=columns)
-        write_picture(sheet, self.out)
-        print(f"{self.out}: {sheet.shape[1]} x {sheet.shape[0]} px, {counted(len(cards), 'object')}")
+        write_picture(object_sheet(cards, columns=columns), self.out, counted(len(cards), "object"))
         return 0
 
     def _named(self, name: str, shelf: ObjectShelf) -> list[SimObject]:
@@ -131,21 +140,18 @@ class ObjectsImport:
     What is there already is kept, so that an import that was stopped goes on.
     """
 
-    libraries: Annotated[tuple[Path, ...], tyro.conf.Positional]
+    libraries: tyro.conf.Positional[tuple[Path, ...]]
     """Libraries, such as those of Debian's package sweethome3d-furniture (.sh3f)."""
-
     out: Path
     """Folder that gets an object folder per model that opens, things/ with the others, and CREDITS.md."""
 
     def run(self) -> int:
         """Print what came out of each library, and what was left out; returns 1 if nothing came out of one."""
-        from quest.cli.console import Console
-        from quest.cli.progress import counting
         from quest.sim.sweethome import import_library
 
         if not self.libraries:
             raise ConfigError("objects import: no library is named; name an .sh3f file")
-        out, errors = (Console(stderr=e, highlight=False, markup=False, soft_wrap=True) for e in (False, True))
+        out, errors = _consoles()
         empty = 0
         for path in self.libraries:
             with counting(errors, f"importing {path.name}", None, "models") as tell:
@@ -161,19 +167,3 @@ class ObjectsImport:
             empty += not there
         out.print(f"{self.out}: see CREDITS.md for authors and licences")
         return 1 if empty else 0
-
-
-def _every_folder(root: Path | None) -> Iterator[SimObject | ObjectError]:
-    from quest.sim.objects import find_objects, load_object
-
-    for folder in find_objects(root):
-        try:
-            yield load_object(folder)
-        except ObjectError as error:
-            yield error
-
-
-def _every_category() -> Iterator[SimObject]:
-    from quest.sim.procedural import CATEGORIES, make_object
-
-    return (make_object(category, 0) for category in CATEGORIES)

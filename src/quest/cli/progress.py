@@ -5,28 +5,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Protocol, runtime_checkable
 
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from quest.cli.console import Console
 
 _LINE_EVERY_S = 10.0
 
 
-@runtime_checkable
-class Report(Protocol):
-    """To be called with the number that is done, and with that of all where it was not known before."""
-
-    def __call__(self, done: int, total: int | None = None, /) -> None:
-        """Show it."""
+Report = Callable[..., None]
+"""To be called with the number that is done, and with that of all where it was not known before."""
 
 
 def bars(console: Console, *, transient: bool = False, disable: bool = False) -> Progress:
@@ -45,14 +33,7 @@ def advancing(console: Console, total: int) -> Iterator[Callable[[str, int], Non
 
 @contextmanager
 def counting(console: Console, doing: str, total: int | None, noun: str = "frames") -> Iterator[Report]:
-    """Shows how many of something are done, and the time left.
-
-    Args:
-        console: where to show it.
-        doing: the work, such as ``tracking``.
-        total: how many there are; None if that is not known yet.
-        noun: the things that are counted.
-    """
+    """Shows how many of all are done of a work such as ``tracking``, and the time left."""
     if console.is_terminal:
         columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn(f"{noun},"))
         with Progress(*columns, TimeRemainingColumn(), TextColumn("left"), console=console, transient=True) as progress:

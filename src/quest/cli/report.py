@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import tyro
-from rich.markup import escape
 
 from quest.cli.console import Console
+from quest.data.store import locate_take
+from quest.errors import TakeError
+from quest.types import Take, Tracks
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from quest.types import Take, Tracks
     from quest.viz.report import Drift, RunRecord
 
 
@@ -31,31 +32,18 @@ class Report:
 
     def run(self) -> int:
         """Compare with the truth if there is any, write, open."""
-        import webbrowser
-
         from quest.viz.report import write_report
 
-        console = Console(highlight=False, soft_wrap=True)
+        console = Console()
         out = write_report(self.folder, self.out, compare=drift_of)
-        console.print(f"report: {escape(str(out))} ({out.stat().st_size / 2**20:.1f} MiB)")
+        console.print(f"report: {out} ({out.stat().st_size / 2**20:.1f} MiB)")
         if self.open and not webbrowser.open(out.resolve().as_uri()):
-            console.print("[yellow]note:[/] no browser could be opened; open the page yourself")
+            console.note("no browser could be opened; open the page yourself")
         return 0
 
 
 def drift_of(tracks: Tracks, run: RunRecord | None) -> Drift | str:
-    """How far the tracks of a run are from the truth, where it was on a take that is still there.
-
-    Args:
-        tracks: of the run.
-        run: how it was made.
-
-    Returns:
-        The drift, or why it is not known, in words.
-    """
-    from quest.data.store import locate_take
-    from quest.errors import TakeError
-
+    """How far the tracks of a run are from the truth of its take, or in words why that is not known."""
     if run is None:
         return "The recording is not known without run.json, so there is nothing to compare with."
     given = run.recording.given
@@ -75,8 +63,6 @@ def drift_of(tracks: Tracks, run: RunRecord | None) -> Drift | str:
 
 def measure_drift(tracks: Tracks, take: Take) -> Drift:
     """Distance of each track from the entity that it was nearest to at first, as ``docs/metrics.md`` defines it."""
-    import numpy as np
-
     from quest.evaluation.metrics import GATE, MISSING, accuracy, distance, identity
     from quest.evaluation.protocols import assign
     from quest.viz.report import Drift
@@ -101,8 +87,6 @@ def measure_drift(tracks: Tracks, take: Take) -> Drift:
 
 def _first_gap(tracks: Tracks, truth: np.ndarray, bound: np.ndarray) -> np.ndarray:
     """Mean distance in metres of each query and entity over the query's first frames; NaN where it has no point."""
-    import numpy as np
-
     from quest.evaluation.protocols import START_FRAMES
 
     gaps = np.full((len(tracks.names), truth.shape[1]), np.nan)

@@ -7,18 +7,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import tyro
-from rich.markup import escape
 
 from quest.cli.console import Console
 from quest.cli.progress import counting
-from quest.data.frame_source import Parts
+from quest.data.frame_source import FrameSource, Parts
+from quest.data.queries_file import read_queries
+from quest.errors import ConfigError, InputError, RecordingError
+from quest.monitor import Budget, Inputs
+from quest.types import Clip, Query
 from quest.wording import counted
 
 if TYPE_CHECKING:
-    from quest.data.frame_source import FrameSource
-    from quest.monitor import Budget, Inputs
     from quest.track import Tracker
-    from quest.types import Clip, Query
 
 
 @dataclass(frozen=True)
@@ -67,13 +67,7 @@ class Source:
     for the whole recording, and of a live camera for every block of the calibration."""
 
     def open(self) -> FrameSource:
-        """The recording or the view of a take, to be read frame by frame.
-
-        Raises:
-            RecordingError: there is no such recording, or it is not as expected.
-            TakeError: there is no such take, or it is corrupt.
-            MissingExtraError: bags need the extra ``ros``.
-        """
+        """The recording or the view of a take, to be read frame by frame; errors of :func:`open_recording`."""
         from quest.data.recording import open_recording
 
         return open_recording(
@@ -88,45 +82,23 @@ class Source:
     def read(self, console: Console) -> Clip:
         """All frames in memory; degradations are printed on standard error.
 
-        Args:
-            console: where to say how far it is.
-
         Raises:
             RecordingError: as in :meth:`open`, or the frames do not fit into memory.
-            TakeError: as in :meth:`open`.
         """
         source = self.open()
         _check_memory(source)
-        with counting(console, "reading", source.length) as report:
-            clip = source.clip(report=report)
-        self.say_flags(source, Console(stderr=True, highlight=False, soft_wrap=True))
-        return clip
-
-    def say_flags(self, source: FrameSource, console: Console) -> None:
-        """Print the degradations of a recording."""
-        for flag in source.flags:
-            console.print(f"[yellow]note:[/] {escape(source.name)}: {escape(flag)}")
+        return read_saying(source, console)
 
     def queries(self, clip: Clip | FrameSource) -> list[Query] | None:
-        """The queries; None where there are none, and entities are to be discovered.
-
-        Args:
-            clip: the frames that they are about; frames beyond its end are refused where its length is known.
+        """The queries about a clip; None where there are none, and entities are to be discovered.
 
         Raises:
-            InputError: a point or label is not written as expected, or its frame is not in the clip.
+            InputError: a point or label is not written as expected, or its frame is beyond the end of the clip.
         """
-        from quest.data.queries_file import read_queries
-        from quest.errors import InputError
-        from quest.types import Clip, Query
-
         length = len(clip) if isinstance(clip, Clip) else clip.length
         queries = [] if self.queries_file is None else read_queries(self.queries_file)
         for query in queries:
-            if length is not None and query.frame >= length:
-                raise InputError(
-                    f"--queries {self.queries_file}: expected frames of the clip, 0 to {length - 1}, got {query.frame}"
-                )
+            _check_frame(f"--queries {self.queries_file}: expected frames", query.frame, length)
         for text in self.point:
             parts = text.split(",", 3)
             try:
@@ -135,8 +107,7 @@ class Source:
                 raise InputError(
                     f"--point {text!r}: expected FRAME,X,Y or FRAME,X,Y,NAME, such as 0,120.5,88"
                 ) from error
-            if length is not None and frame >= length:
-                raise InputError(f"--point {text!r}: expected a frame of the clip, 0 to {length - 1}, got {frame}")
+            _check_frame(f"--point {text!r}: expected a frame", frame, length)
             name = parts[3] if len(parts) > 3 else ""
             if any("\ud800" <= letter <= "\udfff" for letter in name):
                 raise InputError(f"--point {text!r}: expected a name in UTF-8")
@@ -149,8 +120,6 @@ class Source:
 
     def check_alpha(self) -> None:
         """Raise ConfigError unless alpha is a probability, of some frames if it is of frames."""
-        from quest.errors import ConfigError
-
         if not 0.0 < self.alpha < 1.0:
             raise ConfigError(f"--alpha {self.alpha}: expected a number between 0 and 1, such as 0.05")
         if self.alpha_frames is not None and self.alpha_frames < 1:
@@ -158,51 +127,50 @@ class Source:
 
     def budget(self, tracker: Tracker, source: FrameSource | None = None) -> Budget:
         """How often alarms may be false; a source without an end shares alpha among its parts alike."""
-        from quest.monitor import Budget
-
         blocks = [calibration.block_frames for calibration in tracker.calibrations.values()]
         endless = source is not None and source.live and blocks
         return Budget(self.alpha, max(blocks) if endless and self.alpha_frames is None else self.alpha_frames)
 
-    def say_shortfall(
-        self,
-        tracker: Tracker,
-        console: Console,
-        budget: Budget,
-        *,
-        frames: int | None,
-        inputs: Inputs | None = None,
-    ) -> None:
-        """Print which alarms there will never be, if the monitor's calibration is too small for some.
-
-        Args:
-            tracker: with its calibrations.
-            console: to print on.
-            budget: of :meth:`budget`.
-            frames: length of the recording, if it is known.
-            inputs: what its frames bring, if that is known.
-        """
-        for brings, calibration in tracker.calibrations.items():
-            if inputs in (None, brings) and (why := calibration.shortfall(budget, frames=frames)):
-                console.print(f"[yellow]note:[/] monitor, {brings}: {why}; `quest calibrate`")
-
     def tracker(self) -> Tracker:
-        """The tracker of the weights.
-
-        Raises:
-            WeightsError: no such weights or calibrations, or a file is damaged.
-            ConfigError: no such device.
-            MissingExtraError: ONNX Runtime is not installed.
-        """
+        """The tracker of the weights; errors of :func:`quest.load`."""
         from quest.track import load
 
         return load(self.weights, device=self.device, monitor=self.monitor or True, engine=self.engine)
 
 
+def read_saying(source: FrameSource, console: Console) -> Clip:
+    """All frames in memory; how far it is goes to the console, degradations to standard error."""
+    with counting(console, "reading", source.length) as report:
+        clip = source.clip(report=report)
+    say_flags(source, Console(stderr=True))
+    return clip
+
+
+def say_flags(source: FrameSource, console: Console) -> None:
+    """Print the degradations of a recording."""
+    for flag in source.flags:
+        console.note(f"{source.name}: {flag}")
+
+
+def say_shortfall(
+    tracker: Tracker, console: Console, budget: Budget, *, frames: int | None, inputs: Inputs | None = None
+) -> None:
+    """Print which alarms there will never be, if the monitor's calibration is too small for some.
+
+    Length of the recording, and what its frames bring, are told where they are known.
+    """
+    for brings, calibration in tracker.calibrations.items():
+        if inputs in (None, brings) and (why := calibration.shortfall(budget, frames=frames)):
+            console.note(f"monitor, {brings}: {why}; `quest calibrate`")
+
+
+def _check_frame(expected: str, frame: int, length: int | None) -> None:
+    if length is not None and frame >= length:
+        raise InputError(f"{expected} of the clip, 0 to {length - 1}, got {frame}")
+
+
 def _check_memory(source: FrameSource) -> None:
     """Raise RecordingError if all frames at once would need more memory than there is."""
-    from quest.errors import RecordingError
-
     free_bytes = _free_bytes()
     if free_bytes is None or source.length is None:
         return

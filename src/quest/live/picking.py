@@ -32,14 +32,7 @@ class Picked:
 
 
 class Picking:
-    """What the page of ``quest pick`` asks for.
-
-    Args:
-        tracker: finds, and follows in the preview.
-        clip: the recording.
-        queries: those to begin with.
-        out: the file that is saved.
-    """
+    """What the page of ``quest pick`` asks for; the tracker finds, and follows in the preview."""
 
     def __init__(self, tracker: Tracker, clip: Clip, queries: Sequence[Query], out: Path) -> None:
         self._tracker, self._clip, self._queries, self._out = tracker, clip, list(queries), out

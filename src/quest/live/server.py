@@ -142,13 +142,8 @@ class Server:
     """Serves one page on the loopback interface, in a thread of its own; a context manager.
 
     Every address has a secret in it, and requests for another host or from another page are refused: what runs in a
-    browser, or as another user without that secret, can neither see nor change anything.
-
-    Args:
-        title: of the page.
-        mode: what the page is for.
-        routes: handlers by ``METHOD /path`` under the secret.
-        port: 0 takes one that is free.
+    browser, or as another user without that secret, can neither see nor change anything. Routes are handlers by
+    ``METHOD /path`` under the secret; port 0 takes one that is free.
 
     Raises:
         MissingExtraError: the extra ``live`` is not installed.
@@ -162,7 +157,7 @@ class Server:
         self._title, self._mode, self._routes, self._port = title, mode, routes, port
         self._secret = secrets.token_urlsafe(16)
         self._loop = asyncio.new_event_loop()
-        self._started: threading.Event = threading.Event()
+        self._started = threading.Event()
         self._failed: OSError | None = None
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 

@@ -76,13 +76,9 @@ class Shot:
 class Session:
     """Steps a stream through a source, shows every frame, and takes edits between frames.
 
-    Args:
-        tracker: follows.
-        source: frames.
-        queries: what to follow; None finds entities, in later frames too.
-        alpha, alpha_frames, wait: as in :meth:`quest.track.Tracker.stream`.
-        record: folder for ``frames.jsonl`` (the answers, a line a frame) and ``edits.jsonl`` (what was asked, with the
-            frame); None keeps nothing.
+    Without queries it finds entities, in later frames too. The folder ``record`` gets ``frames.jsonl`` (the answers, a
+    line a frame) and ``edits.jsonl`` (what was asked, with the frame). All else is as in
+    :meth:`quest.track.Tracker.stream`.
 
     Raises:
         InputError: a query is not as expected.

@@ -16,7 +16,7 @@ from jaxtyping import UInt8
 from quest.errors import InputError
 from quest.types import Take, View
 from quest.viz import ink
-from quest.viz.ink import Canvas, draw_box, draw_disc, draw_entity, draw_line, draw_path, draw_text, fit_text, grid
+from quest.viz.ink import Canvas, draw_box, draw_disc, draw_entity, draw_line, draw_path, draw_text, grid
 from quest.viz.palette import LINE, MUTED, RGB, SURFACE, TEXT, entity_colours, query_colour
 
 _MARGIN, _GAP, _HEAD, _NAME, _ROW = 24, 6, 96, 30, 26
@@ -47,9 +47,8 @@ def contact_sheet(
     near_m, far_m = _depth_range(take)
     rows: list[Canvas] = []
     for v, view in enumerate(take.views):
-        tiles = [_draw_frame(view, t, colours, take.tracked, tile_width_px) for t in shown]
         size = f"{view.clip.camera.width} x {view.clip.camera.height} px"
-        rows.append(_row(tiles, f"view {v}    {size}    {_camera_motion(view)}"))
+        rows.append(_frames_row(take, v, shown, tile_width_px, f"view {v}    {size}    {_camera_motion(view)}"))
         if view.clip.depth_m is not None:
             tiles = [_draw_depth(view.clip.depth_m[t], near_m, far_m, tile_width_px) for t in shown]
             words = f"view {v}    depth, {near_m:.2f} m red to {far_m:.2f} m blue, black where missing"
@@ -78,14 +77,13 @@ def takes_sheet(
         )
     rows = []
     for take in takes:
-        info, view = take.info, take.views[0]
-        colours = entity_colours(entity.label for entity in info.entities)
-        tiles = [_draw_frame(view, t, colours, take.tracked, tile_width_px) for t in _shown(take, columns)]
+        info = take.info
         suite = " ".join(str(word) for word in (info.suite, info.provenance.get("variant", "")) if word)
         facts = (info.name, info.category, suite, f"level {info.level}", f"{take.stamp_s[-1]:.1f} s")
-        rows.append([_row(tiles, "    ".join((*facts, _camera_motion(view))))])
+        words = "    ".join((*facts, _camera_motion(take.views[0])))
+        rows.append([_frames_row(take, 0, _shown(take, columns), tile_width_px, words)])
     sheet = grid(rows, head=_HEAD - 40, foot=_MARGIN, sides=_MARGIN, least_width=600)
-    draw_text(sheet, fit_text(title, 24, sheet.shape[1] - 2 * _MARGIN), (_MARGIN, 28), size=24, colour=TEXT)
+    draw_text(sheet, title, (_MARGIN, 28), size=24, colour=TEXT, width=sheet.shape[1] - 2 * _MARGIN)
     return sheet
 
 
@@ -141,9 +139,14 @@ def _draw_depth(depth_m: np.ndarray, near_m: float, far_m: float, width: int) ->
     return tile
 
 
+def _frames_row(take: Take, v: int, shown: list[int], width: int, words: str) -> Canvas:
+    colours = entity_colours(entity.label for entity in take.info.entities)
+    return _row([_draw_frame(take.views[v], t, colours, take.tracked, width) for t in shown], words)
+
+
 def _row(tiles: list[Canvas], name: str) -> Canvas:
     row = grid([tiles], gap=_GAP, head=_NAME, foot=_GAP)
-    draw_text(row, fit_text(name, 14, row.shape[1]), (0, _NAME / 2 + 2), size=14, colour=MUTED)
+    draw_text(row, name, (0, _NAME / 2 + 2), size=14, colour=MUTED, width=row.shape[1])
     return row
 
 
@@ -162,17 +165,17 @@ def _camera_motion(view: View) -> str:
 def _draw_head(head: Canvas, take: Take, shown: list[int], tile_width: int, every: int) -> None:
     info = take.info
     room = head.shape[1] - 2 * _MARGIN
-    draw_text(head, fit_text(info.name, 24, room), (_MARGIN, 28), size=24, colour=TEXT)
+    draw_text(head, info.name, (_MARGIN, 28), size=24, colour=TEXT, width=room)
     suite = [f"suite {info.suite}"] if info.suite != "standard" else []
     facts = (
         f"{info.category} {info.object_id} ({info.source})", f"level {info.level}", *suite, f"seed {info.seed}",
         f"{len(take)} frames at {info.frames_per_s / every:g}/s", f"half diagonal {info.half_diagonal_m:.3f} m",
     )  # fmt: skip
-    draw_text(head, fit_text("    ".join(facts), 15, room), (_MARGIN, 56), size=15, colour=MUTED)
+    draw_text(head, "    ".join(facts), (_MARGIN, 56), size=15, colour=MUTED, width=room)
     for i, t in enumerate(shown):
         x = _MARGIN + i * (tile_width + _GAP) + tile_width / 2
         label = f"frame {t * every}   {take.stamp_s[t]:.2f} s"
-        draw_text(head, fit_text(label, 13, tile_width), (x, 84), size=13, colour=TEXT, align="centre")
+        draw_text(head, label, (x, 84), size=13, colour=TEXT, align="centre", width=tile_width)
 
 
 def _draw_foot(take: Take, shown: list[int], colours: list[RGB], width: int) -> Canvas:
@@ -185,22 +188,20 @@ def _draw_foot(take: Take, shown: list[int], colours: list[RGB], width: int) -> 
 
 
 def _draw_entities(area: Canvas, take: Take, colours: list[RGB]) -> None:
-    width = area.shape[1]
-    columns = (0.0, 0.46 * width, 0.62 * width, 0.8 * width)
-    for x, title in zip(columns, ("entity", "joint", "moves at most", "seen in views"), strict=True):
+    joint_x, moves_x, seen_x = (share * area.shape[1] for share in (0.46, 0.62, 0.8))
+    for x, title in ((0, "entity"), (joint_x, "joint"), (moves_x, "moves at most"), (seen_x, "seen in views")):
         draw_text(area, title, (x, _NAME / 2 + 4), size=13, colour=MUTED)
     moves = np.linalg.norm(take.point_world - take.point_world[:1], axis=-1).max(axis=0)
     for e, entity in enumerate(take.info.entities):
         y = _NAME + (e + 0.5) * _ROW
         draw_disc(area, (8, y), 5, colour=colours[e])
-        name = fit_text(f"{e}   {entity.name}", 14, columns[1] - 30)
         kind = "fixed" if entity.fixed else take.info.joints[entity.joint].kind
         reach = f"{moves[e]:.2f} m = {moves[e] / take.info.half_diagonal_m:.2f}"
         seen = "   ".join(f"{100 * view.visible[:, e].mean():.0f} %" for view in take.views)
-        cells = (name, kind, reach, fit_text(seen, 14, width - columns[3]))
-        for x, cell in zip((22, *columns[1:]), cells, strict=True):
-            still = cell is reach and not take.moved[e]
-            draw_text(area, cell, (x, y), size=14, colour=MUTED if still else TEXT)
+        draw_text(area, f"{e}   {entity.name}", (22, y), size=14, colour=TEXT, width=joint_x - 30)
+        draw_text(area, kind, (joint_x, y), size=14, colour=TEXT)
+        draw_text(area, reach, (moves_x, y), size=14, colour=TEXT if take.moved[e] else MUTED)
+        draw_text(area, seen, (seen_x, y), size=14, colour=TEXT, width=area.shape[1] - seen_x)
 
 
 def _draw_joints(area: Canvas, take: Take, shown: list[int]) -> None:

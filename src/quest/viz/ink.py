@@ -61,9 +61,11 @@ def text_size(text: str, size: int) -> tuple[int, int]:
     return width, height
 
 
-def draw_text(canvas: Canvas, text: str, xy: XY, *, size: int, colour: RGB, align: Align = "left") -> None:
-    """Draw a line of text; ``xy`` is its left end, middle or right end, vertically centred."""
-    mask = _text_mask(text, size)
+def draw_text(
+    canvas: Canvas, text: str, xy: XY, *, size: int, colour: RGB, align: Align = "left", width: Number = float("inf")
+) -> None:
+    """Draw a line of text, cut to a width; ``xy`` is its left end, middle or right end, vertically centred."""
+    mask = _text_mask(fit_text(text, size, width), size)
     shift = {"left": 0.0, "centre": 0.5, "right": 1.0}[align]
     blend(canvas, mask, round(xy[0] - shift * mask.shape[1]), round(xy[1] - mask.shape[0] / 2), colour)
 

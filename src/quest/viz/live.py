@@ -44,13 +44,8 @@ _LIKELY, _POSSIBLE = 0.5, 0.2
 class LiveView:
     """Shows a stream while it is stepped; a context manager.
 
-    In a terminal it is a table that refreshes itself; elsewhere one line per event.
-
-    Args:
-        console: where to show it.
-        name: what is being watched.
-        frames: how many frames there will be; None where only the end tells.
-        budget: of false alarms; None where nothing raises any.
+    In a terminal it is a table that refreshes itself; elsewhere one line per event. ``frames`` is None where only the
+    end tells how many there will be, ``budget`` where nothing raises alarms.
     """
 
     def __init__(self, console: Console, *, name: str, frames: int | None, budget: Budget | None) -> None:
@@ -83,13 +78,9 @@ class LiveView:
     def show(
         self, frame: int, state: StreamState, *, waiting: Sequence[Query] = (), behind_s: float = 0.0
     ) -> tuple[Event, ...]:
-        """Take in the next frame; gives what happened in it.
+        """Take in the answers of the next frame; gives what happened in it.
 
-        Args:
-            frame: its index.
-            state: what the stream answered.
-            waiting: queries that have not found their entity.
-            behind_s: by how much the view lags behind the recording's own pace.
+        Queries that wait have not found their entity; the view is so much behind the recording's own pace.
         """
         self._frame, self._state, self._waiting, self._behind_s = frame, state, tuple(waiting), behind_s
         now_s = time.monotonic()

@@ -76,8 +76,8 @@ def _draw_card(card: Card) -> Canvas:
     facts = (
         f"{thing.category}   {size_words(thing)} m   {len(thing.articulation.joints)} joints   {entity_words(thing)}"
     )
-    draw_text(canvas, fit_text(thing.object_id, 16, width - 2 * _PAD), (_PAD, 14), size=16, colour=TEXT)
-    draw_text(canvas, fit_text(facts, 12, width - 2 * _PAD), (_PAD, 34), size=12, colour=MUTED)
+    draw_text(canvas, thing.object_id, (_PAD, 14), size=16, colour=TEXT, width=width - 2 * _PAD)
+    draw_text(canvas, facts, (_PAD, 34), size=12, colour=MUTED, width=width - 2 * _PAD)
     for n, line in enumerate(lines):
         for x, text, colour in line:
             y = _HEAD + edge + _PAD + (n + 0.5) * _ROW

@@ -7,26 +7,44 @@ they are known at the end, in all frames: the axis of turning with the arc that 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Bool, Float, UInt8
+from scipy.spatial.transform import Rotation
 
 from quest.data.video import frame_rate, write_video
 from quest.errors import InputError
 from quest.types import Clip, State, Tracks
 from quest.viz import ink
-from quest.viz.ink import Canvas, draw_box, draw_cased_path, draw_disc, draw_line, draw_ring, draw_text, fit_text
-from quest.viz.inset import Inset
-from quest.viz.joint_lines import joint_lines
+from quest.viz.ink import (
+    Canvas,
+    draw_box,
+    draw_cased_path,
+    draw_disc,
+    draw_line,
+    draw_path,
+    draw_ring,
+    draw_text,
+    fit_text,
+)
+from quest.viz.joint_lines import JointLines, joint_lines
 from quest.viz.palette import BACKGROUND, HELD, LINE, LOST, MUTED, RGB, SURFACE, TEXT, query_colour
 
 SMALLEST_HEIGHT_PX = 720
 _NEAREST_M = 0.02
 MOST_TAGS = 12
 """With more queries than this, tags on the picture carry numbers only; names stay in the panel."""
+_INSET = 0.86
+"""Height of the world's picture, of the width of the panel."""
+_AXIS_COLOURS: tuple[RGB, ...] = ((255, 107, 107), (105, 219, 124), (92, 160, 255))
+_TURNED = Rotation.from_euler("yx", [-32.0, 18.0], degrees=True).as_matrix()
+"""First about y, then about x."""
+_SMALLEST_BOX_M = 0.05
+_CORNERS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.float64)
+_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(_CORNERS[a] - _CORNERS[b]).sum() == 1]
 
 
 def write_overlay(clip: Clip, tracks: Tracks, path: str | Path, *, trail_s: float = 1.0) -> None:
@@ -64,9 +82,9 @@ class OverlayPainter:
         self._colours = [query_colour(k) for k in range(len(tracks.names))]
         self._held, self._lost = (np.asarray(tracks.state == state.value) for state in (State.HELD, State.LOST))
         self._joints = joint_lines(tracks)
-        size = (self._panel, round(0.86 * self._panel))
+        size = (self._panel, round(_INSET * self._panel))
         pose = clip.cam_from_world[0]
-        self._inset = Inset(tracks.point_world, pose, joints=self._joints, size=size, unit=self._unit)
+        self._inset = _Inset(tracks.point_world, pose, joints=self._joints, size=size, unit=self._unit)
         self._tag_side: dict[int, int] = {}
         self._still = self._draw_still()
 
@@ -77,8 +95,7 @@ class OverlayPainter:
 
     def frames(self) -> Iterator[UInt8[np.ndarray, "H W 3"]]:
         """All frames in order."""
-        for t in range(len(self._clip)):
-            yield self.frame(t)
+        return map(self.frame, range(len(self._clip)))
 
     def frame(self, t: int) -> UInt8[np.ndarray, "H W 3"]:
         """Frame ``t``."""
@@ -95,7 +112,7 @@ class OverlayPainter:
         self._draw_tags(picture, t, known)
         side = canvas[:, self._width :]
         colours = [LOST if lost else colour for lost, colour in zip(self._lost[t], self._colours, strict=True)]
-        self._inset.draw_tracks(side[: round(0.86 * self._panel)], t, colours, self._tracks.visible)
+        self._inset.draw_tracks(side[: round(_INSET * self._panel)], t, colours, self._tracks.visible)
         self._draw_rows(side, t)
         self._draw_footer(canvas, t)
         return canvas
@@ -107,7 +124,7 @@ class OverlayPainter:
         """Everything that is the same on all frames."""
         canvas, u = ink.blank(self._height + self._footer, self._width + self._panel), self._unit
         side = canvas[:, self._width :]
-        inset = side[: round(0.86 * self._panel)]
+        inset = side[: round(_INSET * self._panel)]
         self._inset.draw_frame(inset)
         for joint, colour in zip(self._joints, self._colours, strict=True):
             if joint is not None:
@@ -125,11 +142,11 @@ class OverlayPainter:
             for arm in joint.arms:
                 a, b = self._pixels(arm, t)
                 if np.isfinite((a, b)).all():
-                    draw_line(picture, tuple(a), tuple(b), colour=colour, width=max(1, round(1.5 * u)), opacity=0.5)
+                    draw_line(picture, tuple(a), tuple(b), colour=colour, width=round(1.5 * u), opacity=0.5)
             if joint.axis is not None:
-                draw_cased_path(picture, self._pixels(joint.axis, t), colour=colour, width=max(2, round(2.5 * u)))
+                draw_cased_path(picture, self._pixels(joint.axis, t), colour=colour, width=round(2.5 * u))
             path = self._pixels(joint.path, t)
-            draw_cased_path(picture, path, colour=colour, width=max(2, round(2 * u)))
+            draw_cased_path(picture, path, colour=colour, width=round(2 * u))
             for end in path[[0, -1]]:
                 if np.isfinite(end).all():
                     draw_disc(picture, tuple(end), 3.5 * u, colour=colour, edge=u)
@@ -144,7 +161,7 @@ class OverlayPainter:
     def _draw_trails(self, picture: Canvas, t: int) -> None:
         stamp_s = self._clip.stamp_s
         first = int(np.searchsorted(stamp_s, stamp_s[t] - self._trail_s))
-        width = max(2, round(2.5 * self._unit))
+        width = round(2.5 * self._unit)
         for k, s in np.ndindex(len(self._colours), t - first):
             s += first + 1
             a, b = self._uv[s - 1, k], self._uv[s, k]
@@ -157,7 +174,7 @@ class OverlayPainter:
 
     def _draw_mark(self, picture: Canvas, xy: tuple[float, ...], t: int, k: int, *, radius: float = 7.0) -> None:
         u, colour, centre = self._unit, self._colours[k], (xy[0], xy[1])
-        radius, width = radius * u, max(2, round(2 * u))
+        radius, width = radius * u, round(2 * u)
         if self._lost[t, k]:
             arm = 0.8 * radius
             for colour, thickness in ((BACKGROUND, width + 3), (LOST, width + 1)):
@@ -208,7 +225,7 @@ class OverlayPainter:
             colour = self._colour(t, k)
             if best >= 4:  # far from its mark: a leader shows whose it is
                 near = (float(np.clip(self._uv[t, k][0], x0, x1)), float(np.clip(self._uv[t, k][1], y0, y1)))
-                draw_line(picture, tuple(self._uv[t, k]), near, colour=colour, width=max(1, round(u)), opacity=0.8)
+                draw_line(picture, tuple(self._uv[t, k]), near, colour=colour, width=round(u), opacity=0.8)
             draw_box(picture, x0, y0, x1 - x0, height, colour=BACKGROUND, opacity=0.78, radius=round(6 * u))
             draw_box(picture, x0 + 7 * u, y0 + 7 * u, 8 * u, 8 * u, colour=colour, radius=round(4 * u))
             draw_text(picture, text, (x0 + 20 * u, y0 + height / 2), size=size, colour=TEXT)
@@ -216,7 +233,7 @@ class OverlayPainter:
     def _draw_rows(self, side: Canvas, t: int) -> None:
         """One row per query: its mark, name, confidence now and until now."""
         u = self._unit
-        top, bottom = 0.86 * self._panel + 8 * u, self._height - 6 * u
+        top, bottom = _INSET * self._panel + 8 * u, self._height - 6 * u
         queries = len(self._colours)
         row = float(np.clip((bottom - top) / max(queries, 1), 22 * u, 46 * u))
         shown = int((bottom - top) // row)
@@ -236,10 +253,10 @@ class OverlayPainter:
             self._draw_mark(side, (24 * u, middle), t, k, radius=5.5)
         joint = self._coordinate(t, k)
         two_lines = bool(joint) and row > 38 * u
-        name, at = fit_text(self._name(k), size, name_width), (40 * u, middle - 8 * u * two_lines)
-        draw_text(side, name, at, size=size, colour=TEXT if bound else MUTED)
+        at = (40 * u, middle - 8 * u * two_lines)
+        draw_text(side, self._name(k), at, size=size, colour=TEXT if bound else MUTED, width=name_width)
         if two_lines:
-            draw_text(side, fit_text(joint, small, name_width), (40 * u, middle + 11 * u), size=small, colour=MUTED)
+            draw_text(side, joint, (40 * u, middle + 11 * u), size=small, colour=MUTED, width=name_width)
         value = self._doing(t, k) if bound else "none yet"
         colour = {"none yet": MUTED, "lost": LOST, "held": HELD}.get(value, TEXT)
         self._draw_curve(side, k, t, (self._panel - 152 * u, middle - row * 0.3), (80 * u, row * 0.6))
@@ -260,7 +277,7 @@ class OverlayPainter:
         confidence = np.clip(np.nan_to_num(self._tracks.confidence[frames, k].astype(np.float64)), 0, 1)
         x, y = at[0] + size[0] * frames / last, at[1] + size[1] * (1 - confidence)
         for i, f in list(enumerate(frames.tolist()))[1:]:
-            width = max(1, round(1.3 * self._unit))
+            width = round(1.3 * self._unit)
             draw_line(side, (x[i - 1], y[i - 1]), (x[i], y[i]), colour=self._colour(f, k), width=width)
 
     def _draw_footer(self, canvas: Canvas, t: int) -> None:
@@ -271,9 +288,93 @@ class OverlayPainter:
         draw_text(canvas, when, (canvas.shape[1] - 14 * u, middle), size=size, colour=TEXT, align="right")
         room = canvas.shape[1] - ink.text_size(when, size)[0] - 44 * u
         left = "    ".join((self._clip.name, *self._tracks.frame_flags))
-        draw_text(canvas, fit_text(left, size, room), (14 * u, middle), size=size, colour=MUTED)
+        draw_text(canvas, left, (14 * u, middle), size=size, colour=MUTED, width=room)
         done = canvas.shape[1] * (t + 1) / frames
         draw_box(canvas, 0, self._height, done, max(2, 2 * u), colour=query_colour(0))
+
+
+class _Inset:
+    """An orthographic view of world tracks, turned a little from the camera's own view so that depth shows.
+
+    Its box takes in all points that will ever be drawn, metres, and the joints that are not far away. ``size`` is width
+    and height in pixels, ``unit`` the scale of lines and letters.
+    """
+
+    def __init__(
+        self,
+        point_world: Float[np.ndarray, "T K 3"],
+        cam_from_world: Float[np.ndarray, "4 4"],
+        *,
+        joints: Sequence[JointLines | None],
+        size: tuple[int, int],
+        unit: float,
+    ) -> None:
+        self._unit = unit
+        lines = [line for joint in joints if joint for line in (joint.path, joint.axis) if line is not None]
+        self._low, self._high = _bounds(point_world, lines)
+        self._rotation = (_TURNED @ cam_from_world[:3, :3])[:2]
+        corners = self._box() @ self._rotation.T
+        margin = 26 * unit
+        extent = np.maximum(np.ptp(corners, axis=0), 1e-9)
+        self._px_per_m = float(((np.array(size) - 2 * margin) / extent).min())
+        self._offset = np.array(size) / 2 - self._px_per_m * (corners.min(axis=0) + corners.max(axis=0)) / 2
+        self._xy = self.project(point_world.astype(np.float64))
+
+    def project(self, point_world: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 2"]:
+        """Pixels of the inset; NaN stays NaN."""
+        return point_world @ self._rotation.T * self._px_per_m + self._offset
+
+    def draw_frame(self, canvas: Canvas) -> None:
+        """Draw what never changes: the box, the axes at its lowest corner, and the length of its longest edge."""
+        corners = self.project(self._box())
+        for a, b in _EDGES:
+            draw_line(canvas, tuple(corners[a]), tuple(corners[b]), colour=LINE)
+        origin = corners[0]
+        for name, along, colour in zip("xyz", self._rotation.T, _AXIS_COLOURS, strict=True):
+            tip = origin + along * 30 * self._unit
+            draw_line(canvas, tuple(origin), tuple(tip), colour=colour, width=round(2 * self._unit))
+            label = tip + 9 * self._unit * along / max(float(np.linalg.norm(along)), 0.3)
+            draw_text(canvas, name, tuple(label), size=round(13 * self._unit), colour=colour, align="centre")
+        text = " x ".join(f"{edge:.2f}" for edge in self._high - self._low) + " m"
+        at = (canvas.shape[1] - 10 * self._unit, canvas.shape[0] - 12 * self._unit)
+        draw_text(canvas, text, at, size=round(12 * self._unit), colour=MUTED, align="right")
+
+    def draw_joint(self, canvas: Canvas, joint: JointLines, colour: RGB) -> None:
+        """Draw the axis of a joint and the path over its range."""
+        if joint.axis is not None:
+            axis = self.project(joint.axis)
+            draw_line(canvas, tuple(axis[0]), tuple(axis[1]), colour=colour, width=round(1.5 * self._unit))
+        for arm in map(self.project, joint.arms):
+            draw_line(canvas, tuple(arm[0]), tuple(arm[1]), colour=colour, opacity=0.4)
+        draw_path(canvas, self.project(joint.path), colour=colour, width=round(2 * self._unit))
+
+    def draw_tracks(self, canvas: Canvas, t: int, colours: list[RGB], visible: Bool[np.ndarray, "T K"]) -> None:
+        """Draw every path up to frame ``t`` and a mark where it is at ``t``: filled where visible, else hollow."""
+        for k, colour in enumerate(colours):
+            path = self._xy[: t + 1, k]
+            draw_path(canvas, path, colour=colour, width=round(self._unit))
+            if np.isfinite(path[t]).all():
+                radius = 4 * self._unit
+                draw_disc(canvas, tuple(path[t]), radius, colour=colour if visible[t, k] else (20, 22, 26))
+                draw_ring(canvas, tuple(path[t]), radius, colour=TEXT if visible[t, k] else colour)
+
+    def _box(self) -> np.ndarray:
+        return self._low + _CORNERS * (self._high - self._low)
+
+
+def _bounds(point_world: np.ndarray, lines: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a box round the points and what is near of lines; a few wild points may fall outside."""
+    points = point_world[np.isfinite(point_world).all(axis=-1)].astype(np.float64)
+    if len(points) == 0:
+        return np.zeros(3), np.ones(3)
+    low, high = np.percentile(points, [1, 99], axis=0)
+    reach = max(float((high - low).max()), _SMALLEST_BOX_M)
+    for line in lines:
+        if (line > low - reach).all() and (line < high + reach).all():
+            low, high = np.minimum(low, line.min(axis=0)), np.maximum(high, line.max(axis=0))
+    centre, half = (low + high) / 2, np.maximum((high - low) * 0.55, _SMALLEST_BOX_M / 2)
+    half = np.maximum(half, half.max() / 4)  # a box, not a plate
+    return centre - half, centre + half
 
 
 def _boxes(

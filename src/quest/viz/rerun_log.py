@@ -17,15 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from quest.data.take_format import DEPTH_SCALE_M, encode_depth
 from quest.errors import ConfigError
 from quest.extras import require
 from quest.geometry import invert, lift, transform
-from quest.types import LABELS, Camera, Clip, Take, Tracks, View
+from quest.types import Camera, Clip, Take, Tracks, View
 from quest.viz.joint_lines import joint_lines
-from quest.viz.palette import HELD, LINE, MUTED, RGB, query_colour
+from quest.viz.palette import HELD, LINE, MUTED, RGB, entity_colours, query_colour
 from quest.whole_file import whole_file
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def save_rrd(take: Take, path: str | Path | None, *, every: int = 1) -> None:
         MissingExtraError: the extra ``viz`` is not installed.
     """
     check_viewer(on_screen=path is None)
-    log = _Log("quest-take", take.info.name, take.info.half_diagonal_m, np.arange(len(take)) * every, take.stamp_s)
+    log = _Log("quest-take", take.info.name, take.stamp_s, size_m=take.info.half_diagonal_m, every=every)
     log.record(_take_blueprint(take), lambda: _log_take(log, take), path)
 
 
@@ -66,7 +66,7 @@ def save_tracks(clip: Clip, tracks: Tracks, path: str | Path | None) -> None:
     check_viewer(on_screen=path is None)
     points = tracks.point_world[np.isfinite(tracks.point_world).all(axis=-1)]
     size_m = max(float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) > 1 else 0.0, 0.2)
-    log = _Log("quest-tracks", clip.name, size_m, np.arange(len(clip)), clip.stamp_s)
+    log = _Log("quest-tracks", clip.name, clip.stamp_s, size_m=size_m)
     log.record(_tracks_blueprint(clip), lambda: _log_tracks(log, clip, tracks), path)
 
 
@@ -88,28 +88,19 @@ def check_viewer(*, on_screen: bool) -> None:
 class _Log:
     """A recording that knows no other times than those of its frames, and what takes and tracks have in common.
 
-    Args:
-        application: what Rerun calls this kind of recording.
-        name: of the recording.
-        size_m: of what is seen, for the sizes of marks.
-        frames: numbers of the frames.
-        stamp_s: their times.
+    ``size_m`` is that of what is seen, for the sizes of marks; frames are every n-th of a longer take.
     """
 
     def __init__(
-        self,
-        application: str,
-        name: str,
-        size_m: float,
-        frames: Int[np.ndarray, " T"],
-        stamp_s: Float[np.ndarray, " T"],
+        self, application: str, name: str, stamp_s: Float[np.ndarray, " T"], *, size_m: float, every: int = 1
     ) -> None:
         self.rerun = require("rerun")
         self.stream: Any = self.rerun.RecordingStream(application)
         self.stream.send_recording_name(name)
         self.stream.set_log_time_enabled(False)
         self.stream.set_log_tick_enabled(False)
-        self.size_m, self.frames, self.stamp_s = size_m, frames, stamp_s.astype(np.float64)
+        self.size_m, self.stamp_s = size_m, stamp_s.astype(np.float64)
+        self.frames = np.arange(len(stamp_s)) * every
 
     def record(self, blueprint: rrb.Blueprint, fill: Callable[[], None], path: str | Path | None) -> None:
         """Fill it into a file, whole or not at all, or into the viewer."""
@@ -172,10 +163,8 @@ class _Log:
         trail = points[begin : t + 1]
         trail = trail[np.isfinite(trail).all(axis=-1)]
         if len(trail):
-            mark = self.rerun.Points3D(
-                trail[-1:], colors=colour, radii=0.02 * self.size_m, labels=name, show_labels=False
-            )
-            self.stream.log(["world", "entities", name], mark)
+            look = {"colors": colour, "radii": 0.02 * self.size_m, "labels": name, "show_labels": False}
+            self.stream.log(["world", "entities", name], self.rerun.Points3D(trail[-1:], **look))
             line = self.rerun.LineStrips3D([trail], colors=trail_colour, radii=0.006 * self.size_m)
             self.stream.log(["world", "trails", name], line)
 
@@ -191,14 +180,11 @@ class _Log:
         self, path: list[str], label: str, colour: RGB, values: Float[np.ndarray, " T"], shown: Any = ...
     ) -> None:
         """Values over the frames, or over those that are shown."""
-        entity = self.rerun.new_entity_path(path)
-        self.stream.log(entity, self.rerun.SeriesLines(names=label, colors=colour), static=True)
-        times = [
-            self.rerun.TimeColumn("frame", sequence=self.frames[shown]),
-            self.rerun.TimeColumn("time", duration=self.stamp_s[shown]),
-        ]
-        columns = self.rerun.Scalars.columns(scalars=values[shown].astype(np.float64))
-        self.stream.send_columns(entity, times, columns)
+        rr, entity = self.rerun, self.rerun.new_entity_path(path)
+        self.stream.log(entity, rr.SeriesLines(names=label, colors=colour), static=True)
+        frames = rr.TimeColumn("frame", sequence=self.frames[shown])
+        times = rr.TimeColumn("time", duration=self.stamp_s[shown])
+        self.stream.send_columns(entity, [frames, times], rr.Scalars.columns(scalars=values[shown].astype(np.float64)))
 
 
 def _take_blueprint(take: Take) -> rrb.Blueprint:
@@ -246,7 +232,7 @@ def _eye(clip: Clip) -> Any:
 
 def _log_take(log: _Log, take: Take) -> None:
     info = take.info
-    colours = [query_colour(e) if entity.label in LABELS else MUTED for e, entity in enumerate(info.entities)]
+    colours = entity_colours(entity.label for entity in info.entities)
     log.stream.log("world", log.rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for v, view in enumerate(take.views):
         log.camera(f"world/view_{v}", view.clip.camera)

@@ -1,10 +1,11 @@
-"""The page itself: everything about a run in one HTML file that needs no network."""
+"""How a run was made, and the page about it: everything in one HTML file that needs no network."""
 
 from __future__ import annotations
 
 import base64
+import json
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,15 +16,17 @@ from quest.data.video import probe_video
 from quest.errors import InputError, RecordingError
 from quest.extras import require
 from quest.tracks import read_tracks
-from quest.types import Tracks
-from quest.untrusted import require_file
+from quest.types import Camera, Query, Tracks
+from quest.untrusted import build, read_json, reading, require_file
 from quest.viz.narrate import alarm_spans, narrate, summarise
 from quest.viz.palette import HELD, LOST
 from quest.viz.report.plots import Drift, Thinning, coordinates, drift_plot, time_lines, world
-from quest.viz.report.run_record import RunRecord, read_run
 from quest.whole_file import whole_file
 from quest.wording import counted
 
+RUN_FILE = "run.json"
+RUN_VERSION = 1
+_REMEDY = "track again, or delete it: the report then does without"
 MOST_VIDEO_BYTES = 64 * 2**20
 """A larger video is not put into the page."""
 MOST_ALARMS = 200
@@ -33,6 +36,80 @@ _MOST_KNOTS = 5000
 _LONGEST_NAME = 80
 _JOINERS = "\u200c\u200d"
 """Invisible, and part of how some scripts and pictographs are written."""
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """The recording that was tracked."""
+
+    given: str
+    """As it was given on the command line."""
+    view: int
+    """Which view of it, where it is a take."""
+    name: str
+    """Its name."""
+    frames: int
+    """How many were tracked."""
+    camera: Camera
+    """Intrinsics of every frame."""
+    has_depth: bool
+    """Whether it brought any depth."""
+    notes: tuple[str, ...]
+    """Its degradations in words."""
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """How a run was made."""
+
+    quest: str
+    """Version of quest."""
+    date: str
+    """When tracking ended, ISO 8601 with the offset of its time zone."""
+    command: str
+    """The command that does it again, in a shell's words."""
+    recording: Recorded
+    """What was tracked."""
+    weights: str
+    """Name or file of the weights."""
+    weights_hash: str | None
+    """SHA-256 of their file."""
+    alpha: float
+    """Of the monitor."""
+    alpha_frames: int | None
+    """Frames that alpha is for; None for the whole recording."""
+    device: str
+    """Where the networks ran."""
+    queries: tuple[Query, ...] | None
+    """As asked; None where entities were discovered."""
+    overlay: bool
+    """Whether the run drew ``overlay.mp4``."""
+    took_s: float
+    """Seconds that tracking took, without reading and drawing."""
+
+
+def write_run(run: RunRecord, folder: Path) -> None:
+    """Write ``run.json`` into a folder, whole or not at all."""
+    with whole_file(folder / RUN_FILE) as partial:
+        partial.write_text(json.dumps({"version": RUN_VERSION, **asdict(run)}, allow_nan=False, indent=1) + "\n")
+
+
+def read_run(folder: Path) -> RunRecord | None:
+    """The record in a folder; None where it has none.
+
+    Raises:
+        InputError: it is damaged or of another format version.
+    """
+    path = folder / RUN_FILE
+    if not path.exists():
+        return None
+    value = read_json(path, InputError, _REMEDY)
+    with reading(path, InputError, _REMEDY):
+        value = build(dict, value, "run")
+        version = value.pop("version", None)
+        if version != RUN_VERSION:
+            raise ValueError(f"format version {version!r}, expected {RUN_VERSION}")
+        return build(RunRecord, value, "run")
 
 
 class Video(NamedTuple):
@@ -86,10 +163,8 @@ def write_report(run: str | Path, out: str | Path | None = None, *, compare: Com
     )  # fmt: skip
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}
     files = {name: (own / f"page.{name}").read_text(encoding="utf-8") for name in ("css", "js")}
-    files["plotly"] = offline.get_plotlyjs()
-    text = environment.get_template("page.html").render(
-        page | files | {"plotly_version": require("plotly").__version__}
-    )
+    plotly = {"plotly": offline.get_plotlyjs(), "plotly_version": require("plotly").__version__}
+    text = environment.get_template("page.html").render(page | files | plotly)
     with whole_file(out) as partial:
         partial.write_bytes(text.encode("utf-8", "replace"))
     return out

@@ -19,8 +19,8 @@ ROW_PX = 58
 """Height of a query's time line."""
 MOST_NAMED = 12
 """With more lines than this a plot has no legend: a line says its name where one points at it."""
-_CODES = {State.TRACKING.value: 1, State.HELD.value: 2, State.LOST.value: 3}
-"""The larger, the worse; 0 is not bound yet."""
+_STATES = ("", State.TRACKING.value, State.HELD.value, State.LOST.value)
+"""The later, the worse; the first is not bound yet."""
 _SMALLEST_BOX_M = 0.1
 _TOP, _FOOT, _STRIP = 0.32, 0.74, 0.86
 """Where in its row P(lost) is 1 and 0, and the middle of the strip of states."""
@@ -118,15 +118,11 @@ def time_lines(tracks: Tracks, thinning: Thinning) -> Plot | None:
     if not queries:
         return None
     edge_s = _edges_s(tracks.stamp_s)
-    left, right = float(edge_s[0]), float(edge_s[-1])
     rows = np.arange(queries)
     levels = np.stack([rows + _TOP] * 2 + [rows * np.nan] + [rows + _FOOT] * 2 + [rows * np.nan], 1)
-    scale = {"x": [left, right, None] * 2 * queries, "y": _values(levels), "hoverinfo": "skip"}
-    data = [_line("scale", LINE, 1) | scale]
-    for k in range(queries):
-        data += [*_alarm_bars(tracks, k, thinning, edge_s), _state_bars(tracks, k, thinning, edge_s)]
-        if tracks.lost_p is not None and np.isfinite(tracks.lost_p[:, k]).any():
-            data.append(_lost_line(tracks, k, thinning))
+    ends_s = [float(edge_s[0]), float(edge_s[-1]), None]
+    data = [_line("scale", LINE, 1) | {"x": ends_s * 2 * queries, "y": _values(levels), "hoverinfo": "skip"}]
+    data += [trace for k in range(queries) for trace in _time_line(tracks, k, thinning, edge_s)]
     labels = [
         {"x": 0, "xref": "paper", "xanchor": "left", "y": k + 0.16, "showarrow": False, "text": _plain(name)}
         | {"font": {"color": _css(query_colour(k)), "size": 13}}
@@ -137,7 +133,42 @@ def time_lines(tracks: Tracks, thinning: Thinning) -> Plot | None:
     height = ROW_PX * queries + 56
     more = {"yaxis": rows_axis | {"tickfont": {"size": 10}}, "barmode": "overlay", "annotations": labels}
     about = f"Time lines of P(lost), alarms and states of {', '.join(tracks.names)}; the tables say the same in words."
-    return Plot("time-lines", about, height, data, _layout(height, _seconds(left, right), **more))
+    return Plot("time-lines", about, height, data, _layout(height, _seconds(edge_s), **more))
+
+
+def _time_line(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> list[Trace]:
+    """The alarms of a query, the strip of its states, and P(lost); of the frames in a bin the worst is shown."""
+
+    def bars(y: float, width: float, runs: Sequence[tuple[int, int]], marker: Trace, hover: Trace) -> Trace:
+        """A bar over every run of bins."""
+        ends = np.array(runs, dtype=int).reshape(-1, 2) * thinning.width
+        from_s, until_s = edge_s[np.minimum(ends, thinning.frames)].T
+        bar = {"type": "bar", "orientation": "h", "name": _plain(tracks.names[k]), "y": [y] * len(runs)}
+        bar |= {"base": _values(from_s), "x": _values(until_s - from_s), "width": width, "marker": marker}
+        return bar | hover
+
+    traces = []
+    if tracks.alarm is not None and tracks.alarm[:, k].any():
+        line, fill = {"color": _css(LOST), "width": 1}, f"rgba({','.join(map(str, LOST))},0.28)"
+        hover = {"hovertemplate": "alarm from %{base:.2f} s for %{x:.2f} s"}
+        runs = spans(thinning.largest(tracks.alarm[:, k]))
+        traces.append(bars(k + 0.62, 0.7, runs, {"color": fill, "line": line}, hover))
+    bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)
+    codes = sum(np.where(tracks.state[:, k] == state, code, 0) for code, state in enumerate(_STATES))
+    worst = thinning.largest(np.where(bound, codes, 0))
+    runs = spans(worst)
+    fills = [_css(colour) for colour in (TEXT, query_colour(k), HELD, LOST)]
+    marker = {"color": [fills[worst[first]] for first, _ in runs], "line": {"width": 0}}
+    said = {"customdata": [_STATES[worst[first]] for first, _ in runs]}
+    hover = said | {"hovertemplate": "%{customdata} from %{base:.2f} s for %{x:.2f} s"}
+    traces.append(bars(k + _STRIP, 0.12, runs, marker, hover))
+    if tracks.lost_p is not None and np.isfinite(tracks.lost_p[:, k]).any():
+        lost_p = tracks.lost_p[:, k].astype(np.float64)
+        shown = lost_p[thinning.extremes(lost_p)]
+        said = {"customdata": _values(shown, digits=3), "hovertemplate": "P(lost) %{customdata} at %{x:.2f} s"}
+        y = {"y": _values(k + _FOOT + (_TOP - _FOOT) * shown)}
+        traces.append(_over_time(tracks, k, lost_p, thinning) | y | said)
+    return traces
 
 
 def coordinates(tracks: Tracks, thinning: Thinning) -> list[Plot]:
@@ -181,13 +212,16 @@ def world(tracks: Tracks, thinning: Thinning) -> Plot | None:
             continue
         points = np.where(known[:, None], tracks.point_world[:, k].astype(np.float64), np.nan)
         colour, last = query_colour(k), int(np.flatnonzero(known)[-1])
-        data.append(_space(name, points[np.unique([*frames, last])], colour, 4) | {"legendgroup": str(k)})
-        mark = _space(name, points[last][None], colour, 0, mode="markers")
-        data.append(mark | {"marker": {"size": 5, "color": _css(colour)}, "legendgroup": str(k), "showlegend": False})
-        data += _joint_traces(name, joint, colour, str(k))
-    poses = _known_poses(tracks)
+        data.append(_space(name, points[np.unique([*frames, last])], colour, 4, str(k)))
+        data.append(_space(name, points[last][None], colour, 0, str(k), showlegend=False) | _mark(colour))
+        data += [] if joint is None else _joint_traces(name, joint, colour, str(k))
+    poses = np.zeros((0, 4, 4)) if tracks.cam_from_world is None else tracks.cam_from_world.astype(np.float64)
+    poses = poses[np.isfinite(poses).all(axis=(1, 2))]
     if len(poses):
-        data += _camera_traces(poses[thinning.every()] if len(poses) == len(tracks) else poses)
+        seen_from = poses[frames] if len(poses) == len(tracks) else poses
+        centres = -np.einsum("nji,nj->ni", seen_from[:, :3, :3], seen_from[:, :3, 3])
+        data.append(_space("camera", centres, TEXT, 3, "camera", showlegend=False))
+        data.append(_space("camera", centres[-1:], TEXT, 0, "camera") | _mark(TEXT, symbol="diamond"))
     if not data:
         return None
     margin = dict.fromkeys("lrtb", 0)
@@ -214,75 +248,24 @@ def _scene(data: list[Trace], poses: Float[np.ndarray, "N 4 4"]) -> dict[str, An
     return scene | {"aspectmode": "manual", "aspectratio": ratio, "dragmode": "orbit", "camera": looks}
 
 
-def _known_poses(tracks: Tracks) -> Float[np.ndarray, "N 4 4"]:
-    poses = np.zeros((0, 4, 4)) if tracks.cam_from_world is None else tracks.cam_from_world.astype(np.float64)
-    return poses[np.isfinite(poses).all(axis=(1, 2))]
-
-
-def _camera_traces(poses: Float[np.ndarray, "N 4 4"]) -> list[Trace]:
-    """Path of the camera's centre, and where it looks from at the end."""
-    centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
-    path = _space("camera", centres, TEXT, 3) | {"legendgroup": "camera"}
-    end = _space("camera", centres[-1:], TEXT, 0, mode="markers")
-    mark = {"marker": {"size": 5, "color": _css(TEXT), "symbol": "diamond"}, "legendgroup": "camera"}
-    return [path | {"showlegend": False}, end | mark]
-
-
-def _joint_traces(name: str, joint: JointLines | None, colour: RGB, group: str) -> list[Trace]:
-    if joint is None:
-        return []
-    more = {"legendgroup": group, "showlegend": False}
-    traces = [_space(f"{name}: range", joint.path, colour, 9) | more | {"opacity": 0.45}]
+def _joint_traces(name: str, joint: JointLines, colour: RGB, group: str) -> list[Trace]:
+    traces = [_space(f"{name}: range", joint.path, colour, 9, group, showlegend=False) | {"opacity": 0.45}]
     if joint.axis is not None:
-        axis = _space(f"{name}: axis", joint.axis, colour, 3)
-        traces.append(axis | more | {"line": {"color": _css(colour), "width": 3, "dash": "dash"}})
-    return traces + [_space(f"{name}: range", arm, colour, 1) | more for arm in joint.arms]
+        axis = _space(f"{name}: axis", joint.axis, colour, 3, group, showlegend=False)
+        traces.append(axis | {"line": {**axis["line"], "dash": "dash"}})
+    return traces + [_space(f"{name}: range", arm, colour, 1, group, showlegend=False) for arm in joint.arms]
 
 
-def _space(name: str, points: Float[np.ndarray, "N 3"], colour: RGB, width: int, *, mode: str = "lines") -> Trace:
+def _space(name: str, points: Float[np.ndarray, "N 3"], colour: RGB, width: int, group: str, **more: Any) -> Trace:
+    """A line in space."""
     places = {axis: _values(points[:, i]) for i, axis in enumerate("xyz")}
     hover = {"hovertemplate": "x %{x:.3f} m<br>y %{y:.3f} m<br>z %{z:.3f} m"}
-    return _line(name, colour, width) | {"type": "scatter3d", "mode": mode} | places | hover
+    return _line(name, colour, width) | {"type": "scatter3d", "legendgroup": group} | places | hover | more
 
 
-def _lost_line(tracks: Tracks, k: int, thinning: Thinning) -> Trace:
-    assert tracks.lost_p is not None
-    lost_p = tracks.lost_p[:, k].astype(np.float64)
-    line, shown = _over_time(tracks, k, lost_p, thinning), lost_p[thinning.extremes(lost_p)]
-    said = {"customdata": _values(shown, digits=3), "hovertemplate": "P(lost) %{customdata} at %{x:.2f} s"}
-    return line | {"y": _values(k + _FOOT + (_TOP - _FOOT) * shown)} | said
-
-
-def _state_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> Trace:
-    """The strip of states; of the frames in a bin it shows the worst."""
-    bound = np.isfinite(tracks.uv_px[:, k]).all(axis=-1)
-    codes = sum(np.where(tracks.state[:, k] == state, code, 0) for state, code in _CODES.items())
-    worst = thinning.largest(np.where(bound, codes, 0))
-    worst_of = spans(worst)
-    colours = (TEXT, query_colour(k), HELD, LOST)
-    words = {code: state for state, code in _CODES.items()}
-    fill = {"color": [_css(colours[worst[first]]) for first, _ in worst_of], "line": {"width": 0}}
-    said = [words[int(worst[first])] for first, _ in worst_of]
-    hover = {"customdata": said, "hovertemplate": "%{customdata} from %{base:.2f} s for %{x:.2f} s"}
-    return _bars(tracks, k, worst_of, thinning, edge_s) | {"width": 0.12, "marker": fill} | hover
-
-
-def _alarm_bars(tracks: Tracks, k: int, thinning: Thinning, edge_s: np.ndarray) -> list[Trace]:
-    if tracks.alarm is None or not tracks.alarm[:, k].any():
-        return []
-    alarmed = thinning.largest(tracks.alarm[:, k])
-    bars = _bars(tracks, k, spans(alarmed), thinning, edge_s)
-    fill = {"color": f"rgba({LOST[0]},{LOST[1]},{LOST[2]},0.28)", "line": {"color": _css(LOST), "width": 1}}
-    y = [k + 0.62] * len(bars["y"])
-    return [bars | {"y": y, "width": 0.7, "marker": fill, "hovertemplate": "alarm from %{base:.2f} s for %{x:.2f} s"}]
-
-
-def _bars(tracks: Tracks, k: int, bins: Sequence[tuple[int, int]], thinning: Thinning, edge_s: np.ndarray) -> Trace:
-    """Bars over spans of bins."""
-    ends = np.array(bins, dtype=int).reshape(-1, 2) * thinning.width
-    from_s, until_s = edge_s[np.minimum(ends, thinning.frames)].T
-    bars = {"type": "bar", "orientation": "h", "name": _plain(tracks.names[k]), "y": [k + _STRIP] * len(bins)}
-    return bars | {"base": _values(from_s), "x": _values(until_s - from_s)}
+def _mark(colour: RGB, **more: Any) -> Trace:
+    """What makes a line a mark."""
+    return {"mode": "markers", "marker": {"size": 5, "color": _css(colour), **more}}
 
 
 def _over_time(tracks: Tracks, k: int, values: Float[np.ndarray, " T"], thinning: Thinning) -> Trace:
@@ -294,10 +277,9 @@ def _over_time(tracks: Tracks, k: int, values: Float[np.ndarray, " T"], thinning
 
 
 def _lines_plot(id: str, about: str, tracks: Tracks, data: list[Trace], axis: str) -> Plot:
-    height, edge_s = 320, _edges_s(tracks.stamp_s)
     y = {"title": {"text": axis}, "gridcolor": _css(LINE), "zerolinecolor": _css(LINE), "automargin": True}
-    x = _seconds(float(edge_s[0]), float(edge_s[-1]))
-    return Plot(id, about, height, data, _layout(height, x, yaxis=y, showlegend=_named(data)))
+    layout = _layout(320, _seconds(_edges_s(tracks.stamp_s)), yaxis=y, showlegend=_named(data))
+    return Plot(id, about, 320, data, layout)
 
 
 def _named(data: list[Trace]) -> bool:
@@ -326,8 +308,9 @@ def _layout(height: int, xaxis: dict[str, Any], **more: Any) -> dict[str, Any]:
     }
 
 
-def _seconds(left: float, right: float) -> dict[str, Any]:
-    return {"title": {"text": "time, s"}, "range": [left, right], "gridcolor": _css(LINE), "zeroline": False}
+def _seconds(edge_s: np.ndarray) -> dict[str, Any]:
+    ends_s = [float(edge_s[0]), float(edge_s[-1])]
+    return {"title": {"text": "time, s"}, "range": ends_s, "gridcolor": _css(LINE), "zeroline": False}
 
 
 def _edges_s(stamp_s: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T1"]:
