@@ -10,7 +10,6 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -198,11 +197,7 @@ def test_a_worker_renders_what_one_process_renders(cluster: str, tmp_path: Path)
     spec = TakeSpec("partnet", "cabinet", 1, 0, settings)
     store = TakeStore(tmp_path / "takes")
     studio = Studio(tmp_path / "objects")
-    with ThreadPoolExecutor(1) as elsewhere:  # both compile shaders for many seconds
-        made = elsewhere.submit(
-            produce_on_cluster, [spec], store, Studio(studio.objects_root), ONE_CORE, report=lambda event: None
-        )
-        studio.open([spec])
-        take, _ = studio.make(spec)
-        made.result()
+    produce_on_cluster([spec], store, studio, ONE_CORE, report=lambda event: None)
+    studio.open([spec])
+    take, _ = studio.make(spec)
     assert hashes(store) == {spec.name: hash_take(take)}

@@ -240,8 +240,8 @@ def apply_appearance(
         scene: a ``sapien.Scene`` in which the object stands with its front towards +x.
         appearance: how it shall look.
         region: what the object sweeps; the floor lies under it, all else keeps off it.
-        bodies: the object's ``RenderBodyComponent``s, always in the same order; their shapes have the names of the
-            URDF's visuals (``handle-3``, ``drawer_front-1``), which tell parts apart.
+        bodies: the object's ``RenderBodyComponent``s; names of their shapes (``handle-3``, ``drawer_front-1``) tell
+            parts apart.
         procedural: whether the object came without materials worth keeping.
         wide: whether floor and wall reach far, for cameras that turn.
         room: whether the names begin with the piece of furniture and a slash, as those of a room do

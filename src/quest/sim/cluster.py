@@ -58,14 +58,9 @@ def produce_on_cluster(
     """Makes takes on the workers of a Ray cluster, which write them into a store.
 
     Every worker must reach the store by the same name: a folder on a file system that all nodes share, or an object
-    store. Interrupted, it kills its workers; the store never has a part of a take.
-
-    Args:
-        specs: the takes; those that the store has meanwhile are left alone.
-        store: where they go.
-        studio: what every worker opens one of.
-        cluster: where to work.
-        report: told of every take when it is in the store or cannot be made, and of workers that died.
+    store. Interrupted, it kills its workers; the store never has a part of a take. Takes that the store has meanwhile
+    are left alone. Every worker opens a copy of the studio. ``report`` is told of every take when it is in the store or
+    cannot be made, and of workers that died.
 
     Raises:
         ConfigError: there is no such cluster, or workers cannot reach the store.

@@ -50,14 +50,8 @@ def generate_take(
 ) -> Take:
     """Renders one take with its ground truth; same object, level, seed, suite and settings give the same arrays.
 
-    Args:
-        sim_object: the object.
-        level: how many joints move one after the other.
-        seed: of the motion, the cameras and the appearance.
-        renderer: the process's renderer.
-        settings: views, size, frames, and how cameras, joints and sensors behave.
-        suite: which suite it belongs to; None for an ordinary take. Its settings are not applied: pass them.
-        provenance: who made it, for the take's metadata; what is unusual about the take is added.
+    So many joints as ``level`` says move one after the other. A suite's settings are not applied: pass them.
+    ``provenance`` says who made it, for the take's metadata; what is unusual about the take is added.
 
     Raises:
         ConfigError: the suite cannot be made with these settings.
@@ -215,15 +209,15 @@ def _pictures(staging: Staging, paths: list[CameraPath]) -> Iterator[list[Pictur
     for t, kept in enumerate(played.kept.tolist()):
         cameras = [path.at(t) for path in paths]
         poses = (played.poses[t], *(c.cam_from_world for c in cameras), *(prop.pose(kept) for prop in staging.props))
-        if t > 0 and all(map(np.array_equal, poses, drawn)):  # nothing moved: the pictures are the same
-            yield pictures
-            continue
-        stage.pose(played.poses[t])
-        stage.aim(cameras)
-        for actor, prop in zip(actors, staging.props, strict=True):
-            prop.place(actor, kept)
-        stage.render()
+        moved = t == 0 or not all(map(np.array_equal, poses, drawn))  # else the pictures are the same
+        if moved:
+            stage.pose(played.poses[t])
+            stage.aim(cameras)
+            for actor, prop in zip(actors, staging.props, strict=True):
+                prop.place(actor, kept)
+            stage.render()
         if t > 0:
             yield pictures
-        pictures, drawn = stage.read_back(), poses
+        if moved:
+            pictures, drawn = stage.read_back(), poses
     yield pictures
