@@ -200,7 +200,7 @@ def test_killed_at_random_moments(place: str) -> None:
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["tests.sim.stub_studio"])
     store, specs, seen = TakeStore(place), plan(count), 0
-    kills = 5 if store.is_folder else 3  # seconds each where a server answers
+    kills = 8 if store.is_folder else 3  # seconds each where a server answers
     for _ in range(kills):
         running = processes.Process(target=produce_missing, args=(place, count, dict(os.environ)))
         running.start()

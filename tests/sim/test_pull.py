@@ -157,7 +157,7 @@ def opened(puller: Puller) -> np.ndarray:
 
 
 @PULLERS
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", range(3))
 def test_it_is_fixed_in_the_link_that_it_holds_and_meets_nothing_else(chest: SimObject, noun: str, seed: int) -> None:
     puller, poses = plan(noun, chest, 0, 1, seed=seed)
     assert all(isinstance(part, Prop) for part in puller.parts)
@@ -174,7 +174,7 @@ def test_it_is_fixed_in_the_link_that_it_holds_and_meets_nothing_else(chest: Sim
         assert away.min(axis=1).max() < 0.04
     samples = ObjectSamples(chest.articulation)
     front = chest.articulation.world_points(chest.articulation.rest)[:, 0].max()
-    for t in range(0, len(poses), 9):
+    for t in range(0, len(poses), 9 if noun == "hand" else 4):
         points, area_m2 = samples.world(poses[t])
         met = meets(puller, points, t)
         if isinstance(puller, Hand):
@@ -196,7 +196,7 @@ def test_it_comes_opens_and_goes(chest: SimObject, noun: str) -> None:
     assert away[-1] > 0.15
     width = opened(puller)
     np.testing.assert_allclose(width[first:end], width[first], atol=1e-9)
-    assert min(width[first - 8], width[-1]) > width[first] + 0.012
+    assert min(width[first - 8], width[-1]) > width[first] + (0.012 if noun == "hand" else 0.015)
     parts = world_from_part(puller)
     assert np.linalg.norm(np.diff(middle(puller), axis=0), axis=1).max() < 0.15  # nothing jumps
     assert np.linalg.norm(np.diff(parts[..., :3, 3], axis=0), axis=-1).max() < 0.2
@@ -268,7 +268,7 @@ def test_a_front_is_touched_and_a_thin_edge_is_pinched(tmp_path: Path) -> None:
     assert 0 < opened(gripper)[first] - scale * 0.006 < 0.03
     assert abs(gripper.parts[PADS[0]].pose(first)[2, 1]) > 0.9  # one finger above, one below
     samples = ObjectSamples(boxed.articulation)
-    assert max(meets(gripper, samples.world(poses[t])[0], t) for t in range(first, end, 3)) <= 3
+    assert max(meets(gripper, samples.world(poses[t])[0], t) for t in range(first, end)) <= 3
 
 
 @PULLERS
@@ -297,7 +297,7 @@ def test_looks_and_builds_differ() -> None:
 def test_the_arm_keeps_clear_of_the_camera(chest: SimObject) -> None:
     eye = np.array([[1.6, 0.1, 0.9]])
     angles = []
-    for seed in range(4):
+    for seed in range(6):
         hand = plan_a_hand(chest, 0, seed=seed, eyes=eye)
         ((_, first, end),) = hand.grasps
         wrist, elbow = (hand.parts[n].world_from_shape[first:end, :3, 3] for n in (HAND_PALM, -1))
