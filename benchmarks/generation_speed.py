@@ -16,7 +16,6 @@ import os
 import pstats
 import tempfile
 import time
-from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -29,10 +28,8 @@ from rich.console import Console
 from quest.data.store import TakeStore
 from quest.evaluation.bootstrap import interval_over
 from quest.evaluation.report import provenance, write_report
-from quest.sim.cameras import PosedCamera
-from quest.sim.objects import SimObject
-from quest.sim.plan import ObjectShelf, plan_takes, procedural_objects
-from quest.sim.production import make_take, write_once
+from quest.sim.plan import plan_takes, procedural_objects
+from quest.sim.production import Studio, write_once
 from quest.sim.renderer import Renderer, Stage
 from quest.types import Take
 
@@ -52,22 +49,24 @@ class GenerationSpeed:
 
     def run(self) -> int:
         """Time both take by take and print means with 95 % bootstrap intervals over takes."""
-        renderer = _WatchedRenderer()
+        studio = Studio()
         specs = plan_takes(procedural_objects(self.takes + 1, 0), levels=(self.level,), takes_per_object=1)
         timed: list[tuple[float, ...]] = []
         profiler = cProfile.Profile() if self.profile else None
         with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(1) as writer:
-            store, shelf, writing = TakeStore(folder), ObjectShelf(), _done()
+            store, writing = TakeStore(folder), _done()
+            studio.open(specs)
             for spec in specs:
                 if profiler and timed:
                     profiler.enable()
                 start = _now()
-                take, _ = make_take(spec, renderer=renderer, shelf=shelf)
+                take, _ = studio.make(spec)
                 writing.result()
                 generate_s = _now() - start
                 if profiler:
                     profiler.disable()
-                bare_s = _bare_loop(renderer.latest(), take)
+                assert Renderer.latest is not None
+                bare_s = _bare_loop(Renderer.latest, take)
                 # It is written while the next one is made, and by then the bare loop is over.
                 writing = writer.submit(write_once, store, take)
                 timed.append((len(take) * len(take.views), *generate_s, *bare_s))
@@ -76,30 +75,13 @@ class GenerationSpeed:
             last, rest = timed[-1], _now() - start
             timed[-1] = (last[0], last[1] + rest[0], last[2] + rest[1], *last[3:])
         result = _summary(np.array(timed[1:])) | {"first_take_s": timed[0][1], "level": self.level}
-        result |= provenance() | {"load": os.getloadavg()[0], "renderer": str(renderer.device)}
+        result |= provenance() | {"load": os.getloadavg()[0], "renderer": studio.describe()["renderer"]}
         Console().print_json(data=result, default=asdict)
         if profiler:
             pstats.Stats(profiler).sort_stats("tottime").print_stats(25)
         if self.out is not None:
             write_report(result, self.out)
         return 0
-
-
-class _WatchedRenderer(Renderer):
-    """A renderer that says which stage it made last."""
-
-    _made: Stage | None = None
-
-    def stage(
-        self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Callable[..., None] | None = None
-    ) -> Stage:
-        self._made = super().stage(sim_object, cameras, dress)
-        return self._made
-
-    def latest(self) -> Stage:
-        """The stage of the last take."""
-        assert self._made is not None
-        return self._made
 
 
 def _now() -> np.ndarray:
@@ -109,7 +91,7 @@ def _now() -> np.ndarray:
 
 def _bare_loop(stage: Stage, take: Take) -> np.ndarray:
     """Seconds and processor seconds that rendering and fetching alone take."""
-    scene, cameras = stage._scene, [camera for camera, _ in stage._cameras]
+    scene, cameras = stage.scene, stage.cameras
     start = _now()
     last: Any = None
     for pose in take.link_pose:

@@ -26,12 +26,11 @@ from quest.sim.cameras import CameraStyle, sample_camera_paths
 from quest.sim.generate import record_take
 from quest.sim.motion import minimum_jerk
 from quest.sim.objects import SimObject
-from quest.sim.occlusion import Episode, slopes_to_hide
 from quest.sim.plan import ObjectShelf
 from quest.sim.props import Occluder, fit_shape, sample_occluder_surface, slide_in
 from quest.sim.renderer import Renderer
 from quest.sim.settings import TakeSettings
-from quest.sim.staging import Playback, Staging, played_frames
+from quest.sim.staging import Episode, Playback, Staging, slopes_to_hide
 from quest.types import Take
 
 ASSETS = Path(__file__).parents[1] / "src" / "quest" / "assets"
@@ -154,7 +153,7 @@ def film(name: str, scene: Scene, thing: SimObject, size: tuple[int, int], rende
             raise SystemExit(f"{name}: {thing.entities[entity].name} cannot be occluded; change the scene")
         poses = slide_in(shape, camera, episode.away(frames), rng)
         occluders.append(Occluder(shape, sample_occluder_surface(rng), poses))
-        hidden.append((thing.entities[entity].name, *played_frames(playback.kept, episode.hidden, episode.shown)))
+        hidden.append((thing.entities[entity].name, *playback.shows(episode.hidden, episode.shown)))
     joints = tuple(episode.joint for episode in scene.episodes)
     stage = renderer.stage(thing, [camera])
     staging = Staging(joints, playback, (path,), stage, tuple(occluders), {"hidden": hidden})

@@ -11,21 +11,21 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import zarr  # noqa: F401 (a fork of this process finds it imported)
 
 from quest.data.store import TakeStore
-from quest.errors import ObjectError, RendererError
+from quest.errors import ObjectError
 from quest.sim.plan import TakeSpec
-from quest.sim.production import missing_takes, produce
+from quest.sim.production import Studio, missing_takes, produce
 from quest.types import Take
 from tests.synthetic import make_take
 
 
-@dataclass(frozen=True)
-class StubStudio:
-    """Opens and is a studio."""
+@dataclass
+class StubStudio(Studio):
+    """A studio that renders nothing."""
 
     seconds: float = 0.0
     """How long a take takes at least."""
@@ -35,13 +35,9 @@ class StubStudio:
     """Names of takes that kill the process that makes them."""
     notes: Path | None = None
     """Folder for what tests want to know: who made what."""
-    broken: bool = False
-    """Whether no studio can be opened."""
 
-    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> Self:
-        if self.broken:
-            raise RendererError("no device can render")
-        return self
+    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> None:
+        """Nothing to set up."""
 
     def describe(self) -> dict[str, Any]:
         return {"renderer": "stub"}

@@ -14,10 +14,10 @@ from quest.sim.cameras import CameraStyle, PosedCamera
 from quest.sim.generate import generate_take
 from quest.sim.motion import HOLD_FRAMES, MotionStyle
 from quest.sim.objects import SimObject
-from quest.sim.occlusion import SURROUNDINGS, occlusion_script
 from quest.sim.props import fit_shape, slide_in
 from quest.sim.renderer import Renderer
 from quest.sim.settings import TakeSettings
+from quest.sim.staging import SURROUNDINGS, occlusion_script
 from quest.sim.suites import HIDDEN_FRAMES, SUITES, find_suites
 from quest.types import Camera, Take
 from tests.sim.small_objects import articulation

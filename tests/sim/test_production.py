@@ -22,7 +22,7 @@ from quest.sim.plan import TakeSpec
 from quest.sim.production import (
     Event,
     Notice,
-    StudioSettings,
+    Studio,
     TakeMade,
     TakeSkipped,
     missing_takes,
@@ -176,9 +176,9 @@ def test_objects_that_a_studio_lacks(tmp_path: Path) -> None:
     (tmp_path / "1" / "mobility.urdf").write_text("<robot/>")
     specs = [TakeSpec("partnet", object_id, 1, 0) for object_id in ("1", "2")]
     with pytest.raises(ObjectError, match="objects 2: no such folders"):
-        StudioSettings(tmp_path).open(specs, complete=True)
+        Studio(tmp_path).open(specs, complete=True)
     with pytest.raises(ObjectError):
-        StudioSettings(tmp_path / "nowhere").open([TakeSpec("partnet", "1", 1, 0)])
+        Studio(tmp_path / "nowhere").open([TakeSpec("partnet", "1", 1, 0)])
 
 
 @pytest.fixture(params=["folder", "s3"])

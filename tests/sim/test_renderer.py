@@ -76,7 +76,8 @@ def test_mirrored_meshes_show_their_outside_in_their_own_colour(renderer: Render
     red = '<material name="red"><color rgba="0.8 0.05 0.05 1"/></material></visual></link><joint name="joint_door"'
     urdf.write_text(text.replace('</visual></link><joint name="joint_door"', red))
     cabinet = load_object(folder)
-    stage = renderer.stage(cabinet, [POSED], lambda scene, _: scene.set_ambient_light([1.0, 1.0, 1.0]))
+    stage = renderer.stage(cabinet, [POSED])
+    stage.scene.set_ambient_light([1.0, 1.0, 1.0])
     stage.pose(cabinet.articulation.poses(np.zeros(2)))
     (mirrored,) = stage.pictures()
     door = plain.body == 3

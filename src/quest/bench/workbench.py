@@ -41,7 +41,7 @@ from quest.paper.network import PaperNetwork, read_paper
 from quest.paper.tracker import PaperTracker
 from quest.sim.cluster import ClusterSettings, connected, produce_on_cluster
 from quest.sim.plan import TakeSpec, parse_object, plan_takes, procedural_objects
-from quest.sim.production import Notice, StudioSettings, TakeSkipped, missing_takes, produce
+from quest.sim.production import Notice, Studio, TakeSkipped, missing_takes, produce
 from quest.sim.settings import TakeSettings
 from quest.sim.suites import Suite, find_suites
 from quest.track.tracker import pick_device
@@ -127,7 +127,7 @@ class Workbench:
         if not missing:
             return store
         self.console.print(f"takes {name}: {len(missing)} of {len(specs)} are to be rendered")
-        studio = StudioSettings(self.making.objects_root, f"quest bench (takes {name})")
+        studio = Studio(self.making.objects_root, f"quest bench (takes {name})")
 
         def told(event: object) -> None:
             if isinstance(event, Notice | TakeSkipped):

@@ -118,7 +118,7 @@ class Generate:
         """Render and write; 0 if every planned take is there or was skipped for a stated reason."""
         from quest.sim.cluster import ClusterSettings, produce_on_cluster
         from quest.sim.plan import plan_takes
-        from quest.sim.production import StudioSettings, missing_takes, produce
+        from quest.sim.production import Studio, missing_takes, produce
         from quest.sim.settings import TakeSettings
 
         suites = self._suites()
@@ -141,7 +141,7 @@ class Generate:
         )
         if not missing:
             return 0
-        studio = StudioSettings(self.objects_root, self.command_line())
+        studio = Studio(self.objects_root, self.command_line())
         with counting(console, "rendering", len(missing), "takes") as report:
             made = _Made(console, report)
             try:

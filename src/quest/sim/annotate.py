@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from quest.sim.articulation import apply
 from quest.sim.cameras import PosedCamera
 from quest.sim.entities import SimEntity
+from quest.sim.objects import SimObject
 from quest.sim.renderer import Picture
 
 VISIBLE_WITHIN = 0.02
@@ -15,6 +18,13 @@ VISIBLE_WITHIN = 0.02
 
 MASK_RADIUS = 0.05
 """Rims and fronts have no mesh of their own: their mask is their body within this distance, normalised units."""
+
+
+def entity_points(entities: Sequence[SimEntity], poses: Float[np.ndarray, "*T B 4 4"]) -> Float[np.ndarray, "*T E 3"]:
+    """World points of entities on bodies that stand at ``world_from_body``."""
+    carried_by = poses[..., np.array([e.body for e in entities], int), :, :]
+    point = np.array([e.point for e in entities]).reshape(-1, 3, 1)
+    return (carried_by[..., :3, :3] @ point)[..., 0] + carried_by[..., :3, 3]
 
 
 def project_points(point_world: Float[np.ndarray, "E 3"], posed: PosedCamera) -> tuple[
@@ -26,6 +36,15 @@ def project_points(point_world: Float[np.ndarray, "E 3"], posed: PosedCamera) ->
     camera = posed.camera
     uv = np.stack((camera.fx * point[:, 0] / z + camera.cx, camera.fy * point[:, 1] / z + camera.cy), axis=-1)
     return uv, point[:, 2]
+
+
+def see_entities(
+    sim_object: SimObject, posed: PosedCamera, picture: Picture, point_world: Float[np.ndarray, "E 3"]
+) -> tuple[Float[np.ndarray, "E 2"], Bool[np.ndarray, " E"]]:
+    """Pixel of every entity in a picture, and which of them are seen."""
+    uv, depth = project_points(point_world, posed)
+    bodies = [e.body for e in sim_object.entities]
+    return uv, visible_entities(picture, uv, depth, bodies, half_diagonal_m=sim_object.half_diagonal_m)
 
 
 def visible_entities(

@@ -10,7 +10,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -44,6 +44,13 @@ _MORE_FOR_ROOMS: tuple[TextureKind, ...] = ("bricks", "concrete", "marble", "wea
 _MORE_FOR_OBJECTS: tuple[TextureKind, ...] = ("marble", "scratched", "stickers", "weave", "concrete")
 
 
+_Shape = Literal["box", "sphere", "cylinder"]
+_SHAPES: tuple[_Shape, ...] = get_args(_Shape)
+_ODD_KINDS: tuple[TextureKind, ...] = ("checker", "stripes", "tiles", "speckle", "noise")
+_ROLE = re.compile(r"^(.*?)-?\d*$")
+_PANE = re.compile(r"(?:glass|window)(?:-|$)")
+
+
 @dataclass(frozen=True)
 class Light:
     """One light."""
@@ -61,7 +68,7 @@ class Light:
 class Distractor:
     """A thing that has nothing to do with the object."""
 
-    kind: Literal["box", "sphere", "cylinder"]
+    kind: _Shape
     size: tuple[float, float, float]
     """Half extents in half diagonals of the region (sphere: the first; cylinder: the first two)."""
     side: int
@@ -187,7 +194,7 @@ def _sample_look(rng: np.random.Generator, more: tuple[TextureKind, ...]) -> Obj
 
 
 def _sample_distractor(rng: np.random.Generator) -> Distractor:
-    kind: Literal["box", "sphere", "cylinder"] = ("box", "sphere", "cylinder")[int(rng.integers(3))]
+    kind = _SHAPES[int(rng.integers(3))]
     size = rng.uniform(0.06, 0.4, 3)
     size[2] *= rng.uniform(0.8, 2.2)
     return Distractor(
@@ -199,9 +206,6 @@ def _sample_distractor(rng: np.random.Generator) -> Distractor:
         turn_rad=float(rng.uniform(0, np.pi)),
         surface=sample_surface(rng, textured=0.5),
     )
-
-
-_ODD_KINDS: tuple[TextureKind, ...] = ("checker", "stripes", "tiles", "speckle", "noise")
 
 
 def odd_appearance(appearance: Appearance, rng: np.random.Generator) -> Appearance:
@@ -236,22 +240,15 @@ def apply_appearance(
         scene: a ``sapien.Scene`` in which the object stands with its front towards +x.
         appearance: how it shall look.
         region: what the object sweeps; the floor lies under it, all else keeps off it.
-        bodies: the object's ``RenderBodyComponent``s, always in the same order; their shapes have the names of the
-            URDF's visuals (``handle-3``, ``drawer_front-1``), which tell parts apart.
+        bodies: the object's ``RenderBodyComponent``s; names of their shapes (``handle-3``, ``drawer_front-1``) tell
+            parts apart.
         procedural: whether the object came without materials worth keeping.
         wide: whether floor and wall reach far, for cameras that turn.
         room: whether the names begin with the piece of furniture and a slash, as those of a room do
             (:mod:`quest.sim.room`).
     """
-    _light(scene, appearance, region)
-    _surround(scene, appearance, region, wide)
-    if appearance.look is not None:
-        _paint(appearance.look, bodies, own=procedural or appearance.look.repaint_original, room=room)
-
-
-def _light(scene: Any, appearance: Appearance, region: Region) -> None:
-    scene.set_ambient_light(list(appearance.ambient))
     size = region.half_diagonal_m
+    scene.set_ambient_light(list(appearance.ambient))
     for index, light in enumerate(appearance.lights):
         towards = np.asarray(light.towards_light)
         if light.kind == "directional":
@@ -265,11 +262,7 @@ def _light(scene: Any, appearance: Appearance, region: Region) -> None:
             reach = light.distance * size
             power = np.asarray(light.strength) * reach**2  # falls off with the square of the distance
             scene.add_point_light((region.centre + reach * towards).tolist(), power.tolist(), shadow=False)
-
-
-def _surround(scene: Any, appearance: Appearance, region: Region, wide: bool) -> None:
-    size, ground = region.half_diagonal_m, float(region.low[2]) - 1e-3
-    back = float(region.low[0])
+    back, ground = float(region.low[0]), float(region.low[2]) - 1e-3
     for distractor in appearance.distractors:
         centre, reach = distractor_place(distractor, region)
         back = min(back, float(centre[0]) - reach)
@@ -282,6 +275,8 @@ def _surround(scene: Any, appearance: Appearance, region: Region, wide: bool) ->
         x = back - appearance.wall_gap * size
         wall = square + np.array([region.centre[1], ground + extent])
         _add_quad(scene, np.column_stack([np.full(4, x), wall]), wall, appearance.wall)
+    if appearance.look is not None:
+        _paint(appearance.look, bodies, own=procedural or appearance.look.repaint_original, room=room)
 
 
 def distractor_place(distractor: Distractor, region: Region) -> tuple[Float[np.ndarray, "3"], float]:
@@ -297,8 +292,7 @@ def distractor_place(distractor: Distractor, region: Region) -> tuple[Float[np.n
     size = region.half_diagonal_m
     turn = distractor.side * np.deg2rad(90.0 - CAMERA_AZIMUTH_DEG)
     normal, along = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
-    low, high = region.low[:2], region.high[:2]
-    corners = np.array([[low[0], low[1]], [low[0], high[1]], [high[0], low[1]], [high[0], high[1]]])
+    corners = np.array([[x, y] for x in (region.low[0], region.high[0]) for y in (region.low[1], region.high[1])])
     half = np.asarray(distractor.size) * size
     reach = float(np.hypot(half[0], half[1])) if distractor.kind == "box" else float(half[0])
     # A turned plane touches the object at the back corner of the other side, from where it leads away from it.
@@ -390,10 +384,6 @@ def _room_surface(seed: int, name: str) -> Surface:
     """What a part of the room wears: walls and pictures what walls do, things on top anything."""
     kinds = (*_WALLS, *_MORE_FOR_ROOMS) if name.startswith("wall") else TEXTURE_KINDS
     return sample_surface(np.random.default_rng([seed, *name.encode()]), kinds=kinds, textured=0.5)
-
-
-_ROLE = re.compile(r"^(.*?)-?\d*$")
-_PANE = re.compile(r"(?:glass|window)(?:-|$)")
 
 
 def choose_surface(look: ObjectLook, name: str, link: int) -> Surface:

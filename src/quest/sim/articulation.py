@@ -147,6 +147,17 @@ class Articulation:
             hulls.append(points)
         return hulls
 
+    def swept(self, poses: Float[np.ndarray, "T B 4 4"], *, moments: int = 16) -> Float[np.ndarray, "N 3"]:
+        """World points that bound the object at some of its poses."""
+        some = poses[np.unique(np.linspace(0, len(poses) - 1, moments).astype(int))]
+        hulls = enumerate(self.body_hulls)
+        return np.concatenate([apply(pose[b], hull) for b, hull in hulls if len(hull) for pose in some])
+
+    @property
+    def each_opened(self) -> Float[np.ndarray, "K J"]:
+        """Positions of all joints at rest, and with each of them open by itself."""
+        return np.stack((self.rest, *(self.rest + np.diag([j.opening() for j in self.joints]))))
+
     def world_points(self, position: Float[np.ndarray, " J"]) -> Float[np.ndarray, "N 3"]:
         """All vertices in the world at given joint positions."""
         poses = self.poses(position)

@@ -11,7 +11,7 @@ band of the hands' physiological tremor, 8 to 12 Hz.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -171,6 +171,15 @@ class PosedCamera:
     camera: Camera
     cam_from_world: Float[np.ndarray, "4 4"]
 
+    @property
+    def eye(self) -> Float[np.ndarray, "3"]:
+        """Where it stands in the world, metres."""
+        return -self.cam_from_world[:3, :3].T @ self.cam_from_world[:3, 3]
+
+    def distance_m(self, points: Float[np.ndarray, "N 3"]) -> float:
+        """Along the line of sight, to the middle of some world points."""
+        return float(self.cam_from_world[2, :3] @ points.mean(axis=0) + self.cam_from_world[2, 3])
+
 
 @dataclass(frozen=True)
 class CameraPath:
@@ -233,14 +242,12 @@ class CameraStyle:
             )
         if self.turn not in ("around", "over", "any"):
             raise ConfigError(f"camera orbit: expected a turn around, over or any, got {self.turn!r}")
-        low, high = self.azimuth_deg
-        if not -180 <= low <= high <= 180:
-            raise ConfigError(f"camera azimuth: expected a range within -180 to 180 degrees, got {low} to {high}")
-        if self.elevation_deg is not None and not 0 <= self.elevation_deg[0] <= self.elevation_deg[1] <= 89:
-            raise ConfigError(
-                f"camera elevation: expected a range within 0 to 89 degrees, got {self.elevation_deg[0]} to "
-                f"{self.elevation_deg[1]}"
-            )
+        azimuth, elevation = self.azimuth_deg, self.elevation_deg or ELEVATION_DEG
+        for what, (low, high), least, most in (("azimuth", azimuth, -180, 180), ("elevation", elevation, 0, 89)):
+            if not least <= low <= high <= most:
+                raise ConfigError(
+                    f"camera {what}: expected a range within {least} to {most} degrees, got {low} to {high}"
+                )
         if not 0 < self.sweep_deg <= 90:
             raise ConfigError(
                 f"camera orbit: expected a sweep of more than 0 and up to 90 degrees, got {self.sweep_deg}"
@@ -378,7 +385,7 @@ def _orbit_ends(request: PathRequest) -> tuple[tuple[float, float], tuple[float,
 def _handheld(request: PathRequest) -> CameraPath:
     """A person holds the camera, with drift and tremor: how unsteadily is drawn, shifts grow with the distance."""
     rng, posed = request.rng, request.aimed(_HANDHELD_FILL)
-    distance = _distance(request.points, posed)
+    distance = posed.distance_m(request.points)
     shake = hand_shake(request.frames, rng)
     turn = np.deg2rad(rng.uniform(*_SHAKE_TURN_DEG)) * shake[:, :3]
     shift = rng.uniform(*_SHAKE_SHIFT) * distance * shake[:, 3:]
@@ -392,9 +399,8 @@ def _pan(request: PathRequest) -> CameraPath:
     start = posed.cam_from_world[:3, :3]
     azimuth, elevation = np.arctan2(-start[2, 1], -start[2, 0]), np.arcsin(np.clip(-start[2, 2], -1, 1))
     (towards,), (level,) = look(np.array([azimuth]), np.array([elevation]))
-    rolled = start @ level.T
-    eye = -start.T @ posed.cam_from_world[:3, 3]
-    reach = rng.uniform(*_NECK) * _distance(points, posed)
+    rolled, eye = start @ level.T, posed.eye
+    reach = rng.uniform(*_NECK) * posed.distance_m(points)
     centre = points.mean(axis=0)
     glance = rng.uniform(*_GLANCE, size=(32, 1))
     seen = eye - (centre + glance * (points[rng.integers(len(points), size=32)] - centre))
@@ -419,8 +425,7 @@ def _walk(request: PathRequest) -> CameraPath:
     tasks); the camera is turned by most of what would keep the object where it is in the image.
     """
     rng, points, posed = request.rng, request.points, request.aimed(_WALK_FILL)
-    start, distance = posed.cam_from_world[:3, :3], _distance(request.points, posed)
-    eye = -start.T @ posed.cam_from_world[:3, 3]
+    start, eye, distance = posed.cam_from_world[:3, :3], posed.eye, posed.distance_m(points)
     seconds = np.arange(request.frames) / FRAMES_PER_S
     way = min(rng.uniform(*_WALK_M_PER_S) * seconds[-1], rng.uniform(*_WALK_SHARE) * distance)
     heading = rng.choice([0.0, np.pi]) + rng.uniform(-1, 1) * np.deg2rad(_WALK_OBLIQUE_DEG)
@@ -442,11 +447,6 @@ def _angles(towards: Float[np.ndarray, "S 3"]) -> tuple[Float[np.ndarray, " S"],
     """Azimuth and elevation of directions, radians."""
     level = np.hypot(towards[:, 0], towards[:, 1])
     return np.arctan2(towards[:, 1], towards[:, 0]), np.arctan2(towards[:, 2], level)
-
-
-def _distance(points: Float[np.ndarray, "N 3"], posed: PosedCamera) -> float:
-    """Along the line of sight, from a camera to the middle of what it sees, metres."""
-    return float(posed.cam_from_world[2, :3] @ points.mean(axis=0) + posed.cam_from_world[2, 3])
 
 
 def _poses(rotation: Float[np.ndarray, "S 3 3"], eye: Float[np.ndarray, "S 3"]) -> Float[np.ndarray, "S 4 4"]:
@@ -480,8 +480,8 @@ def sample_cameras(
 
     The points lie around the origin: the object in all its joint states. How the style moves does not matter here.
     """
-    directions = _directions(points, count, rng, style)
-    return [PathRequest(points, d, 1, rng, style, width, height).aimed() for d in directions]
+    still = replace(style, motion="static")
+    return [p.at(0) for p in sample_camera_paths(points, count, 1, rng, style=still, width=width, height=height)]
 
 
 def sample_camera_paths(

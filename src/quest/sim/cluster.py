@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 from quest.data.store import TakeStore
 from quest.errors import ConfigError, ObjectError, QuestError, RendererError
 from quest.extras import require
-from quest.sim.production import Event, Notice, Report, StudioOpener, TakeMade, TakeSkipped, write_once
+from quest.sim.production import Event, Notice, Report, Studio, TakeMade, TakeSkipped, write_once
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -53,19 +53,14 @@ class ClusterSettings:
 
 
 def produce_on_cluster(
-    specs: Sequence[TakeSpec], store: TakeStore, opener: StudioOpener, cluster: ClusterSettings, *, report: Report
+    specs: Sequence[TakeSpec], store: TakeStore, studio: Studio, cluster: ClusterSettings, *, report: Report
 ) -> None:
     """Makes takes on the workers of a Ray cluster, which write them into a store.
 
     Every worker must reach the store by the same name: a folder on a file system that all nodes share, or an object
-    store. Interrupted, it kills its workers; the store never has a part of a take.
-
-    Args:
-        specs: the takes; those that the store has meanwhile are left alone.
-        store: where they go.
-        opener: how a worker's studio is set up.
-        cluster: where to work.
-        report: told of every take when it is in the store or cannot be made, and of workers that died.
+    store. Interrupted, it kills its workers; the store never has a part of a take. Takes that the store has meanwhile
+    are left alone. Every worker opens a copy of the studio. ``report`` is told of every take when it is in the store or
+    cannot be made, and of workers that died.
 
     Raises:
         ConfigError: there is no such cluster, or workers cannot reach the store.
@@ -77,7 +72,7 @@ def produce_on_cluster(
         raise ConfigError(f"store {store.url}: workers of a cluster cannot reach this process's memory; give another")
     ray = require("ray")
     with connected(ray, cluster):
-        crew = _Crew(ray, list(specs), store, opener, cluster, report)
+        crew = _Crew(ray, list(specs), store, studio, cluster, report)
         try:
             crew.work()
         finally:
@@ -121,9 +116,9 @@ def _unreachable(cluster: ClusterSettings, error: Exception) -> ConfigError:
 class Worker:
     """What lives on a node: a studio in a thread of its own, and what it has made is written beside it."""
 
-    def __init__(self, store: str, opener: StudioOpener, specs: Sequence[TakeSpec]) -> None:
+    def __init__(self, store: str, studio: Studio, specs: Sequence[TakeSpec]) -> None:
         self._node = f"{socket.gethostname()}/{require('ray').get_runtime_context().get_node_id()[:8]}"
-        self._store, self._opener, self._specs = store, opener, specs
+        self._store, self._studio, self._specs = store, studio, specs
         self._making = ThreadPoolExecutor(1, thread_name_prefix="quest-make")
 
     def open(self) -> tuple[str, dict[str, Any]]:
@@ -134,7 +129,7 @@ class Worker:
         """
         with _named(self._node):
             self._takes = TakeStore(self._store)
-            self._studio = self._making.submit(self._opener.open, self._specs, complete=True).result()
+            self._making.submit(self._studio.open, self._specs, complete=True).result()
             return self._node, self._studio.describe()
 
     def make(self, spec: TakeSpec) -> Event:
@@ -185,13 +180,13 @@ class _Crew:
         ray: ModuleType,
         specs: list[TakeSpec],
         store: TakeStore,
-        opener: StudioOpener,
+        studio: Studio,
         cluster: ClusterSettings,
         report: Report,
     ) -> None:
         self._ray, self._report, self._cpus = ray, report, cluster.cpus_per_worker
         where = str(store.root.resolve()) if store.is_folder else store.url
-        self._arguments = ray.put(where), ray.put(opener), ray.put(specs)
+        self._arguments = ray.put(where), ray.put(studio), ray.put(specs)
         self._todo = deque(specs)
         self._deaths: Counter[str] = Counter()
         self._failed_openings = 0

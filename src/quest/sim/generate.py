@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import asdict, is_dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from quest.sim.annotate import entity_mask
+from quest.sim.annotate import entity_mask, see_entities
 from quest.sim.appearance import Region, apply_appearance, odd_appearance, sample_appearance
 from quest.sim.cameras import CameraPath
 from quest.sim.motion import FRAMES_PER_S
 from quest.sim.objects import SimObject
-from quest.sim.occlusion import stage_occlusion
 from quest.sim.procedural.model import Dice
 from quest.sim.renderer import Picture, Renderer
 from quest.sim.room import furnished
-from quest.sim.sensor import SensorModel, sense
+from quest.sim.sensor import sense
 from quest.sim.settings import TakeSettings
-from quest.sim.staging import Staging, see_entities, stage_plain
+from quest.sim.staging import Staging, stage_occlusion, stage_plain
 from quest.sim.stretch import draw_stretch, stretched
 from quest.sim.suites import Suite
-from quest.types import Clip, Entity, Take, TakeInfo, View
+from quest.types import Camera, Clip, Entity, Take, TakeInfo, View
 
 _DEFAULTS = TakeSettings()
+_TOLD = (
+    "cameras", "motion", "sensor",
+    "physics", "gripper", "hand", "disturbance", "broad_materials", "fixed_scene", "room", "things",
+)  # fmt: skip
+"""Settings that a take's provenance names where they are unusual."""
 
 
 def take_name(object_id: str, level: int, seed: int, suite: Suite | None = None) -> str:
@@ -45,14 +50,8 @@ def generate_take(
 ) -> Take:
     """Renders one take with its ground truth; same object, level, seed, suite and settings give the same arrays.
 
-    Args:
-        sim_object: the object.
-        level: how many joints move one after the other.
-        seed: of the motion, the cameras and the appearance.
-        renderer: the process's renderer.
-        settings: views, size, frames, and how cameras, joints and sensors behave.
-        suite: which suite it belongs to; None for an ordinary take. Its settings are not applied: pass them.
-        provenance: who made it, for the take's metadata; what is unusual about the take is added.
+    So many joints as ``level`` says move one after the other. A suite's settings are not applied: pass them.
+    ``provenance`` says who made it, for the take's metadata; what is unusual about the take is added.
 
     Raises:
         ConfigError: the suite cannot be made with these settings.
@@ -68,19 +67,14 @@ def generate_take(
     motion_rng, camera_rng, appearance_rng, props_rng, sensor_rng = (
         np.random.default_rng([*(scene if n in (1, 2) else key), n]) for n in range(5)
     )
-    sim_object, shape = _shaped(sim_object, np.random.default_rng([*key, 5]), settings)
+    about = {**(provenance or {}), **_conditions(settings, suite)}
+    if settings.stretch != 1:
+        factors = draw_stretch(np.random.default_rng([*key, 5]), settings.stretch)
+        sim_object, about["stretch"] = stretched(sim_object, factors), factors.tolist()
     if settings.room:
-        sim_object, beside = furnished(sim_object, Dice(np.random.PCG64([*scene, 6])), things=settings.things)
-        shape = {**shape, "beside": beside}
-    if hiding is None:
-        staging = stage_plain(
-            sim_object, level, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
-        )
-    else:
-        staging = stage_occlusion(
-            sim_object, level, hiding, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings
-        )
-    about = {**(provenance or {}), **_conditions(settings, suite), **shape}
+        sim_object, about["beside"] = furnished(sim_object, Dice(np.random.PCG64([*scene, 6])), things=settings.things)
+    stage = stage_plain if hiding is None else partial(stage_occlusion, hiding=hiding)
+    staging = stage(sim_object, level, motion_rng, camera_rng, props_rng, renderer=renderer, settings=settings)
     return record_take(
         sim_object,
         staging,
@@ -116,7 +110,13 @@ def record_take(
     """
     played = staging.playback
     stamp_s = played.kept / FRAMES_PER_S
-    views = _record(sim_object, staging, appearance_rng, settings)
+    paths = [path.kept(played.kept) for path in staging.cameras]
+    films = _film(sim_object, staging, paths, appearance_rng, settings)
+    views = []
+    for v, (path, film, rng) in enumerate(zip(paths, films, sensor_rng.spawn(len(films)), strict=True)):
+        rgb, depth_m = sense(film.pop("rgb"), film.pop("depth_m"), settings.sensor, rng, camera=path.camera)
+        clip = Clip(f"{name}/view{v}", path.camera, rgb, depth_m, stamp_s, path.cam_from_world)
+        views.append(View(clip, **film))
     flow = np.zeros_like(played.points)
     flow[:-1] = np.diff(played.points, axis=0)
     info = TakeInfo(
@@ -136,10 +136,7 @@ def record_take(
     )
     return Take(
         info=info,
-        views=tuple(
-            r.view(f"{name}/view{v}", stamp_s, settings.sensor, rng)
-            for v, (r, rng) in enumerate(zip(views, sensor_rng.spawn(len(views)), strict=True))
-        ),
+        views=tuple(views),
         stamp_s=stamp_s,
         point_world=played.points.astype(np.float32),
         flow_world=flow.astype(np.float32),
@@ -150,105 +147,77 @@ def record_take(
     )
 
 
-def _shaped(
-    sim_object: SimObject, rng: np.random.Generator, settings: TakeSettings
-) -> tuple[SimObject, dict[str, Any]]:
-    """The object in the shape that it has in this take, and what is unusual about that."""
-    if settings.stretch == 1:
-        return sim_object, {}
-    factors = draw_stretch(rng, settings.stretch)
-    return stretched(sim_object, factors), {"stretch": factors.tolist()}
-
-
 def _conditions(settings: TakeSettings, suite: Suite | None) -> dict[str, Any]:
     """How a take is made, for its provenance: a digest of all settings, and what is unusual in plain words."""
-    ordinary, found = TakeSettings(), {}
-    for what in ("cameras", "motion", "sensor"):
-        if getattr(settings, what) != getattr(ordinary, what):
-            found[what] = asdict(getattr(settings, what))
-    for what in ("physics", "gripper", "hand", "disturbance", "broad_materials", "fixed_scene", "room", "things"):
-        if getattr(settings, what) != getattr(ordinary, what):
-            found[what] = getattr(settings, what)
-    variant = {"variant": suite.variant} if suite is not None and suite.variant else {}
-    return {"settings": settings.digest, **variant, **found}
+    found: dict[str, Any] = {"settings": settings.digest}
+    if suite is not None and suite.variant:
+        found["variant"] = suite.variant
+    for what in _TOLD:
+        value = getattr(settings, what)
+        if value != getattr(_DEFAULTS, what):
+            found[what] = asdict(value) if is_dataclass(value) and not isinstance(value, type) else value
+    return found
 
 
-def _record(
-    sim_object: SimObject, staging: Staging, appearance_rng: np.random.Generator, settings: TakeSettings
-) -> list[_ViewRecorder]:
-    """Dresses the scene, plays the take and photographs every frame."""
+def _film(
+    sim_object: SimObject,
+    staging: Staging,
+    paths: list[CameraPath],
+    appearance_rng: np.random.Generator,
+    settings: TakeSettings,
+) -> list[dict[str, np.ndarray]]:
+    """Dresses the scene, plays the take and draws every frame: colours, depth and ground truth of every view."""
     appearance = sample_appearance(
         appearance_rng, randomize_materials=settings.randomize_materials, broad=settings.broad_materials
     )
     if settings.disturbance == "texture":
         appearance = odd_appearance(appearance, appearance_rng)
-    played, stage, props = staging.playback, staging.stage, staging.props
-    region = Region.around(played.swept)
+    procedural = sim_object.source == "procedural"
     wide = not all(path.static for path in staging.cameras)
-    actors: list[Any] = []
+    region = Region.around(staging.playback.swept)
+    scene, bodies = staging.stage.scene, staging.stage.bodies
+    apply_appearance(scene, appearance, region, bodies, procedural=procedural, wide=wide, room=settings.room)
+    points, o = staging.playback.points, sim_object
+    films = [_blank(len(points), len(o.entities), path.camera) for path in paths]
+    for t, pictures in enumerate(_pictures(staging, paths)):
+        for film, path, picture in zip(films, paths, pictures, strict=True):
+            posed = path.at(t)
+            film["rgb"][t], film["depth_m"][t], film["link_id"][t] = picture.rgb, picture.depth_m, picture.body
+            film["entity_id"][t] = entity_mask(picture, o.entities, points[t], posed, half_diagonal_m=o.half_diagonal_m)
+            film["uv_px"][t], film["visible"][t] = see_entities(o, posed, picture, points[t])
+    return films
 
-    def dress(scene: Any, bodies: list[Any]) -> None:
-        procedural = sim_object.source == "procedural"
-        room = settings.room
-        apply_appearance(scene, appearance, region, bodies, procedural=procedural, wide=wide, room=room)
-        actors.extend(prop.add(scene) for prop in props)
 
-    stage.dress(dress)
-    paths = [path.kept(played.kept) for path in staging.cameras]
-    recorders = [_ViewRecorder(sim_object, path, len(played.kept)) for path in paths]
+def _blank(frames: int, entities: int, camera: Camera) -> dict[str, np.ndarray]:
+    shape = (frames, camera.height, camera.width)
+    return {
+        "rgb": np.zeros((*shape, 3), np.uint8),
+        "depth_m": np.zeros(shape, np.float32),
+        "link_id": np.zeros(shape, np.uint8),
+        "entity_id": np.zeros(shape, np.uint8),
+        "uv_px": np.zeros((frames, entities, 2), np.float32),
+        "visible": np.zeros((frames, entities), bool),
+    }
+
+
+def _pictures(staging: Staging, paths: list[CameraPath]) -> Iterator[list[Picture]]:
+    """What the cameras see at every kept frame; while the caller looks at one, the next one is drawn."""
+    stage, played = staging.stage, staging.playback
+    actors = [prop.add(stage.scene) for prop in staging.props]
     pictures: list[Picture] = []
     drawn: tuple[np.ndarray, ...] = ()
-
-    def annotate(t: int) -> None:
-        for recorder, picture in zip(recorders, pictures, strict=True):
-            recorder.add(t, picture, played.points[t])
-
-    for t, kept in enumerate(played.kept):
+    for t, kept in enumerate(played.kept.tolist()):
         cameras = [path.at(t) for path in paths]
-        poses = (played.poses[t], *(c.cam_from_world for c in cameras), *(prop.pose(int(kept)) for prop in props))
-        if t == 0 or not all(map(np.array_equal, poses, drawn)):  # else nothing moved: the pictures are the same
+        poses = (played.poses[t], *(c.cam_from_world for c in cameras), *(prop.pose(kept) for prop in staging.props))
+        moved = t == 0 or not all(map(np.array_equal, poses, drawn))  # else the pictures are the same
+        if moved:
             stage.pose(played.poses[t])
             stage.aim(cameras)
-            for actor, prop in zip(actors, props, strict=True):
-                prop.place(actor, int(kept))
-            stage.shoot()
-            if t > 0:
-                annotate(t - 1)  # while this frame is drawn
-            pictures, drawn = stage.develop(), poses
-        else:
-            annotate(t - 1)
-    annotate(len(played.kept) - 1)
-    return recorders
-
-
-@dataclass
-class _ViewRecorder:
-    """Collects what one camera sees, frame by frame."""
-
-    sim_object: SimObject
-    path: CameraPath
-    frames: int
-    _arrays: dict[str, np.ndarray] = field(init=False)
-
-    def __post_init__(self) -> None:
-        t, h, w, e = self.frames, self.path.camera.height, self.path.camera.width, len(self.sim_object.entities)
-        self._arrays = {
-            "rgb": np.zeros((t, h, w, 3), np.uint8),
-            "depth_m": np.zeros((t, h, w), np.float32),
-            "link_id": np.zeros((t, h, w), np.uint8),
-            "entity_id": np.zeros((t, h, w), np.uint8),
-            "uv_px": np.zeros((t, e, 2), np.float32),
-            "visible": np.zeros((t, e), bool),
-        }
-
-    def add(self, t: int, picture: Picture, point_world: Float[np.ndarray, "E 3"]) -> None:
-        o, a, posed = self.sim_object, self._arrays, self.path.at(t)
-        a["rgb"][t], a["depth_m"][t], a["link_id"][t] = picture.rgb, picture.depth_m, picture.body
-        a["entity_id"][t] = entity_mask(picture, o.entities, point_world, posed, half_diagonal_m=o.half_diagonal_m)
-        a["uv_px"][t], a["visible"][t] = see_entities(o, posed, picture, point_world)
-
-    def view(self, name: str, stamp_s: Float[np.ndarray, " T"], sensor: SensorModel, rng: np.random.Generator) -> View:
-        a = self._arrays
-        rgb, depth_m = sense(a["rgb"], a["depth_m"], sensor, rng, camera=self.path.camera)
-        clip = Clip(name, self.path.camera, rgb, depth_m, stamp_s, self.path.cam_from_world)
-        return View(clip, a["uv_px"], a["visible"], a["link_id"], a["entity_id"])
+            for actor, prop in zip(actors, staging.props, strict=True):
+                prop.place(actor, kept)
+            stage.render()
+        if t > 0:
+            yield pictures
+        if moved:
+            pictures, drawn = stage.read_back(), poses
+    yield pictures

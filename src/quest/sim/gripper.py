@@ -1,4 +1,4 @@
-"""A parallel gripper that comes, takes hold of what is to move, moves with it, lets go and leaves: a prop of a take.
+"""A parallel gripper that comes, takes hold of what is to move, moves with it, lets go and leaves.
 
 Its frame lies between the pads: x across them, y from one finger to the other, z from the fingertips back to the palm.
 Sizes at scale 1 are those of common electric grippers (Franka Hand, Robotiq 2F-85): it opens to 85 mm.
@@ -12,11 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.entities import SimEntity
-from quest.sim.grasp import Boxes, Grasp, ObjectSamples, Tool, search_grasp
-from quest.sim.objects import SimObject
 from quest.sim.props import Occluder, Shape
-from quest.sim.pull import Puller, plan_pull
+from quest.sim.pull import Boxes, Puller, Task, Tool, plan_pull
 from quest.sim.surfaces import Surface, sample_colour, sample_handle_surface
 
 OPENING_M = 0.085
@@ -25,6 +22,10 @@ REACH_M = 0.044
 """From the middle of the pads back to the palm."""
 LENGTH_M = 0.245
 """From the middle of the pads to the end of the wrist."""
+_FULL_SIZE_M = 0.3
+"""Objects with at least this half diagonal meet a gripper of full size, smaller ones a smaller one."""
+_SMALLEST = 0.2
+_ALONG_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T
 
 Material = Literal["shell", "metal", "rubber"]
 
@@ -74,16 +75,6 @@ def sample_gripper_surfaces(rng: np.random.Generator) -> dict[Material, Surface]
     return {"shell": shell, "metal": sample_handle_surface(rng), "rubber": rubber}
 
 
-_FULL_SIZE_M = 0.3
-"""Objects with at least this half diagonal meet a gripper of full size, smaller ones a smaller one."""
-_SMALLEST = 0.2
-
-
-def gripper_scale(half_diagonal_m: float) -> float:
-    """Size of the gripper for an object: 1 for furniture, less for what is small."""
-    return float(np.clip(half_diagonal_m / _FULL_SIZE_M, _SMALLEST, 1.0))
-
-
 @dataclass(frozen=True)
 class GripperTool(Tool):
     """A gripper for the search and the ways."""
@@ -95,14 +86,14 @@ class GripperTool(Tool):
         centre = self.scale * np.array([p.centre_m for p in GRIPPER_PARTS])
         centre[:, 1] += opening_m / 2 * np.array([p.side for p in GRIPPER_PARTS])
         half = self.scale * np.array([p.half_m for p in GRIPPER_PARTS]) - shrink_m
-        return Boxes(centre - half, centre + half)
+        return np.stack((centre - half, centre + half), axis=1)
 
 
 def gripper_tool(half_diagonal_m: float) -> GripperTool:
-    """The gripper for an object."""
+    """The gripper for an object: at scale 1 for furniture, smaller for what is small."""
     return GripperTool(
         noun="gripper",
-        scale=gripper_scale(half_diagonal_m),
+        scale=float(np.clip(half_diagonal_m / _FULL_SIZE_M, _SMALLEST, 1.0)),
         pad_half_m=PAD_HALF_M,
         span_share=0.0,
         opening_m=OPENING_M,
@@ -118,53 +109,18 @@ def gripper_tool(half_diagonal_m: float) -> GripperTool:
     )
 
 
-def find_grasp(
-    sim_object: SimObject, entity: SimEntity, samples: ObjectSamples, motion: Float[np.ndarray, "M B 4 4"]
-) -> tuple[Grasp, float]:
-    """The best way to hold an entity with a gripper, and what it costs, by :func:`quest.sim.grasp.search_grasp`."""
-    return search_grasp(gripper_tool(sim_object.half_diagonal_m), sim_object, entity, samples, motion)
-
-
-@dataclass(frozen=True)
-class Gripper(Puller):
-    """A gripper that moves; a prop."""
-
-    parts: tuple[Occluder, ...]
-
-
-def plan_gripper(
-    sim_object: SimObject,
-    script: Float[np.ndarray, "S J"],
-    moved_joints: tuple[int, ...],
-    *,
-    margin: tuple[int, int],
-    frames_per_joint: int,
-    rng: np.random.Generator,
-) -> Gripper:
-    """A gripper that pulls one joint after the other; arguments and errors are those of :func:`plan_pull`."""
-    surfaces, scale = sample_gripper_surfaces(rng), gripper_scale(sim_object.half_diagonal_m)
-    pull = plan_pull(
-        sim_object,
-        script,
-        moved_joints,
-        margin=margin,
-        frames_per_joint=frames_per_joint,
-        rng=rng,
-        noun="gripper",
-        find=find_grasp,
-    )
+def plan_gripper(task: Task, rng: np.random.Generator) -> Puller:
+    """A gripper that pulls one joint after the other; errors are those of :func:`plan_pull`."""
+    surfaces, tool = sample_gripper_surfaces(rng), gripper_tool(task.sim_object.half_diagonal_m)
+    pull = plan_pull(task, rng, tool.noun, lambda path: [tool])
     parts = []
     for part in GRIPPER_PARTS:
-        local = np.tile(np.eye(4), (len(script), 1, 1))
-        local[:, :3, 3] = scale * np.array(part.centre_m)
+        local = np.tile(np.eye(4), (len(task.script), 1, 1))
+        local[:, :3, 3] = tool.scale * np.array(part.centre_m)
         local[:, 1, 3] += part.side * pull.opening_m / 2
-        half = scale * np.array(part.half_m)
+        half = tool.scale * np.array(part.half_m)
         if part.kind == "cylinder":  # whose axis is x
             local[:, :3, :3], half = _ALONG_Z, half[[2, 0, 1]]
-        parts.append(
-            Occluder(Shape(part.kind, half, np.eye(4)), surfaces[part.material], pull.world_from_gripper @ local)
-        )
-    return Gripper(tuple(parts), pull.held)
-
-
-_ALONG_Z = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).T
+        shape = Shape(part.kind, half, np.eye(4))
+        parts.append(Occluder(shape, surfaces[part.material], pull.world_from_gripper @ local))
+    return Puller(tuple(parts), pull.held)

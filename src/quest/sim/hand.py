@@ -1,4 +1,4 @@
-"""A person's hand that comes, takes hold of what is to move, pulls it, lets go and leaves: a prop of a take.
+"""A person's hand that comes, takes hold of what is to move, pulls it, lets go and leaves.
 
 It grasps as a gripper does, in one of three grips, with an arm that leads to where a person stands in front of the
 object. Wrist and elbow bend as it moves.
@@ -7,48 +7,43 @@ object. Wrist and elbow bend as it moves.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from quest.errors import ObjectError
+from quest.sim.annotate import entity_points
 from quest.sim.appearance import add_shape
-from quest.sim.articulation import apply
 from quest.sim.entities import SimEntity
-from quest.sim.grasp import CLEARANCE_M, Boxes, Grasp, ObjectSamples, Tool, search_grasp
-from quest.sim.hand_mesh import (
-    ELBOW_BALL_M,
-    FOREARM_SECTIONS_M,
-    UPPER_ARM_SECTIONS_M,
-    bone_balls,
-    folds,
-    nail_balls,
-    palm_balls,
-    rounded,
-    shoulder_ball,
-    sleeve_sections,
-    tube_of_sections,
-    upper_sleeve_sections,
-    web_balls,
-)
-from quest.sim.hand_pose import (
+from quest.sim.hand_shape import (
     BONES_M,
+    ELBOW_BALL_M,
     FOREARM_M,
+    FOREARM_SECTIONS_M,
     GRIPS,
     HAND_M,
     TIP_RADIUS_M,
+    UPPER_ARM_SECTIONS_M,
     Grip,
     HandBuild,
     HandPose,
+    bone_balls,
     elbow_direction,
+    folds,
+    hand_balls,
     hand_targets,
+    nail_balls,
+    palm_balls,
     pose_hand,
+    rounded,
+    sleeve_sections,
+    tube_of_sections,
+    unit_rows,
+    upper_sleeve_sections,
 )
-from quest.sim.objects import SimObject
 from quest.sim.procedural.model import Mesh, join
-from quest.sim.pull import Pull, Puller, plan_pull
+from quest.sim.pull import CLEARANCE_M, Boxes, Grasp, Pull, Puller, Task, Tool, plan_pull
 from quest.sim.surfaces import Surface, make_material, sample_colour, sample_surface, triple
 
 SKIN_TONES = (
@@ -84,7 +79,6 @@ class Person:
     """Where the shoulder of the person is whose hand pulls, relative to what it pulls."""
 
     build: HandBuild
-    """The hand."""
     ahead_m: float
     """How far in front of the entity's farthest place."""
     aside_m: float
@@ -93,11 +87,6 @@ class Person:
     """How far above the entity, for the person stoops."""
     top_m: float
     """Its height above the ground at most, when the person stands upright."""
-
-    @property
-    def leaves_to(self) -> int:
-        """Sign of the side of the object, along y, that the shoulder is on: there the hand comes from and goes to."""
-        return self.build.side if self.aside_m >= 0 else -self.build.side
 
     def shoulder(self, path: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "3"]:
         """Where it is in the world while an entity takes a path."""
@@ -125,8 +114,8 @@ class HandTool(Tool):
         self, world_from_gripper: Float[np.ndarray, "4 4"], width_m: float, opening_m: float, *, shrink_m: float = 0.0
     ) -> Boxes:
         """Cubes along its bones, in its palm and in the forearm, each smaller by ``shrink_m`` on all sides."""
-        balls = hand_balls(self.build, self.pose(width_m, opening_m))
-        palm = self.pose(width_m, width_m).hand_from_palm
+        balls = hand_balls(self.build, self._pose(width_m, opening_m))
+        palm = self._pose(width_m, width_m).hand_from_palm
         world = world_from_gripper @ palm
         towards = elbow_direction(world[:, :3, 3], world[:, :3, 2], self.shoulder[None], self.build)
         elbow = towards[0] @ world_from_gripper[:3, :3]
@@ -135,9 +124,9 @@ class HandTool(Tool):
         arm = np.column_stack((palm[0, :3, 3] + self.build.scale * along[:, None] * elbow, self.build.scale * radii))
         balls = np.concatenate((balls, arm))
         half = 0.75 * balls[:, 3:] - shrink_m
-        return Boxes(balls[:, :3] - half, balls[:, :3] + half)
+        return np.stack((balls[:, :3] - half, balls[:, :3] + half), axis=1)
 
-    def pose(self, width_m: float, opening_m: float) -> HandPose:
+    def _pose(self, width_m: float, opening_m: float) -> HandPose:
         """Its bones at a single moment."""
         return pose_hand(self.build, hand_targets(self.build, self.grip, width_m, np.array([opening_m])))
 
@@ -145,8 +134,7 @@ class HandTool(Tool):
         """What a bent wrist, a thumb that points away from the head, the floor and an odd grip cost."""
         palm = world_from_gripper @ self._usual_palm
         wrist, straight = palm[:, :3, 3], palm[:, :3, 2]
-        away = self.shoulder - wrist
-        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-6)
+        away = unit_rows(self.shoulder - wrist, 1e-6)
         thumb = -self.build.side * world_from_gripper[:, :3, 0]
         natural = np.array([0.2, -0.6 * self.build.side, 0.75]) / np.linalg.norm([0.2, 0.6, 0.75])
         cost = _WRIST_COST * float(np.mean(1 - np.sum(straight * away, axis=1)))
@@ -159,27 +147,12 @@ class HandTool(Tool):
     @cached_property
     def _usual_palm(self) -> Float[np.ndarray, "4 4"]:
         """Pose of the palm when it holds something of usual width."""
-        return self.pose(0.02, 0.02).hand_from_palm[0]
-
-
-def hand_balls(build: HandBuild, pose: HandPose) -> Float[np.ndarray, "N 4"]:
-    """Centres and radii of balls that fill palm and fingers at the first of some moments, in the hand's frame."""
-    palm = np.concatenate((palm_balls(build.side, build.thickness), web_balls(build.side, build.thickness)))
-    palm = np.concatenate((palm, (palm[:4] + palm[[4, 4, 5, 5]]) / 2))
-    found = [np.column_stack((apply(pose.hand_from_palm[0], build.scale * palm[:, :3]), build.scale * palm[:, 3]))]
-    for finger, joints in enumerate(pose.joints[0]):
-        for bone in range(3):
-            ends = bone_balls(finger, bone, 0.0, build.thickness)[:2, 3]
-            for share in (0.0, 0.5, 1.0):
-                radius = (1 - share) * ends[0] + share * ends[1]
-                centre = (1 - share) * joints[bone] + share * joints[bone + 1]
-                found.append(np.array([[*centre, build.scale * radius]]))
-    return np.concatenate(found)
+        return self._pose(0.02, 0.02).hand_from_palm[0]
 
 
 @dataclass(frozen=True)
 class MeshPart:
-    """A mesh with a material that moves."""
+    """A mesh with a material that moves; a prop."""
 
     mesh: Mesh
     surface: Surface
@@ -202,10 +175,14 @@ class MeshPart:
 
         actors.set_pose(sapien.Pose(self.world_from_shape[frame]))
 
+    def pose(self, frame: int) -> Float[np.ndarray, "4 4"]:
+        """Where it is at a frame of the script."""
+        return self.world_from_shape[frame]
+
 
 @dataclass(frozen=True)
 class Hand(Puller):
-    """A hand with its arm that moves; a prop."""
+    """A hand with its arm that moves."""
 
     parts: tuple[MeshPart, ...]
     grips: tuple[Grip, ...]
@@ -246,9 +223,8 @@ def sample_skin(rng: np.random.Generator) -> Surface:
 def sample_hand_look(rng: np.random.Generator) -> HandLook:
     """Draw skin, now and then a glove, and a long, turned-up or short sleeve of any cloth."""
     skin = sample_skin(rng)
-    tone = np.array(skin.colour)
-    nail = Surface(triple(np.clip(0.82 * tone + [0.17, 0.10, 0.10], 0, 1)), 0.3, 0.0, 0.5)
-    glove = rng.random() < 0.12
+    nail = Surface(triple(np.clip(0.82 * np.array(skin.colour) + [0.17, 0.10, 0.10], 0, 1)), 0.3, 0.0, 0.5)
+    glove = bool(rng.random() < 0.12)
     worn = Surface(sample_colour(rng), float(rng.uniform(0.5, 0.95)), 0.0, float(rng.uniform(0.1, 0.3)))
     cloth = sample_surface(rng, kinds=("weave", "stripes", "checker", "noise"), textured=0.6)
     cloth = replace(cloth, roughness=float(rng.uniform(0.8, 1.0)), metallic=0.0, specular=float(rng.uniform(0.0, 0.15)))
@@ -256,22 +232,23 @@ def sample_hand_look(rng: np.random.Generator) -> HandLook:
     start = (rng.uniform(0.0, 0.03), rng.uniform(0.08, 0.17), FOREARM_M + rng.uniform(0.03, 0.12))[kind]
     cuff = float(rng.uniform(0.02, 0.05)) if kind < 2 and rng.random() < 0.6 else 0.0
     loose = float(rng.uniform(0.006, 0.016))
-    return HandLook(
-        skin,
-        nail,
-        worn if glove else skin,
-        cloth,
-        bool(glove),
-        float(start),
-        loose,
-        loose * rng.uniform(0.1, 0.35),
-        cuff,
-    )
+    deep = loose * rng.uniform(0.1, 0.35)
+    return HandLook(skin, nail, worn if glove else skin, cloth, glove, float(start), loose, deep, cuff)
 
 
 def hand_scale(half_diagonal_m: float, length_m: float = HAND_M) -> float:
     """Scale of a hand of some length for an object: its own for furniture, less for what is small."""
     return length_m / HAND_M * float(np.clip(half_diagonal_m / _FULL_SIZE_M, _SMALLEST, 1.0))
+
+
+def sample_hand_build(half_diagonal_m: float, rng: np.random.Generator, *, glove: bool) -> HandBuild:
+    """Draw a hand for an object: its length, its side, how thick and how curled its fingers are."""
+    return HandBuild(
+        hand_scale(half_diagonal_m, float(rng.uniform(*_LENGTHS_M))),
+        1 if rng.random() < _RIGHT_HANDED else -1,
+        float(rng.uniform(0.9, 1.18)) * (1.06 if glove else 1.0),
+        float(rng.uniform(0.2, 1.0)),
+    )
 
 
 def hand_tool(grip: Grip, person: Person, shoulder: Float[np.ndarray, "3"]) -> HandTool:
@@ -295,7 +272,8 @@ def hand_tool(grip: Grip, person: Person, shoulder: Float[np.ndarray, "3"]) -> H
         turns=tuple(2 * np.pi * np.arange(16) / 16),
         touch_turns=16,
         sides_alike=False,
-        exits=((1, person.leaves_to),),
+        # It comes from and goes to the side on which the shoulder is.
+        exits=((1, build.side if person.aside_m >= 0 else -build.side),),
         exit_back=0.5,
         build=build,
         grip=grip,
@@ -303,102 +281,34 @@ def hand_tool(grip: Grip, person: Person, shoulder: Float[np.ndarray, "3"]) -> H
     )
 
 
-def find_hand_grasp(
-    person: Person,
-    sim_object: SimObject,
-    entity: SimEntity,
-    samples: ObjectSamples,
-    motion: Float[np.ndarray, "M B 4 4"],
-) -> tuple[Grasp, float]:
-    """The best way to hold an entity in any grip, and what it costs, by :func:`quest.sim.grasp.search_grasp`.
+def plan_hand(task: Task, rng: np.random.Generator, eyes: Float[np.ndarray, "N 3"]) -> Hand:
+    """A hand that pulls one joint after the other; its arm keeps clear of cameras at some world points if it can.
 
-    Raises:
-        ObjectError: everything that was tried is blocked by the object itself.
-    """
-    shoulder = person.shoulder(_path(motion, entity))
-    found: list[tuple[float, int, Grasp]] = []
-    problem: ObjectError | None = None
-    for n, grip in enumerate(GRIPS):
-        tool = hand_tool(grip, person, shoulder)
-        try:
-            grasp, cost = search_grasp(tool, sim_object, entity, samples, motion)
-        except ObjectError as error:
-            problem = error
-            continue
-        found.append((cost, n, grasp))
-    if not found:
-        assert problem is not None
-        raise problem
-    cost, _, grasp = min(found)
-    return grasp, cost
-
-
-def plan_hand(
-    sim_object: SimObject,
-    script: Float[np.ndarray, "S J"],
-    moved_joints: tuple[int, ...],
-    *,
-    margin: tuple[int, int],
-    frames_per_joint: int,
-    eyes: Float[np.ndarray, "N 3"],
-    rng: np.random.Generator,
-) -> Hand:
-    """A hand that pulls one joint after the other.
-
-    Arguments and errors are those of :func:`quest.sim.pull.plan_pull`; the arm keeps clear of cameras at the world
-    points ``eyes`` if it can.
+    Errors are those of :func:`quest.sim.pull.plan_pull`.
     """
     look = sample_hand_look(rng)
-    build = HandBuild(
-        hand_scale(sim_object.half_diagonal_m, float(rng.uniform(*_LENGTHS_M))),
-        1 if rng.random() < _RIGHT_HANDED else -1,
-        float(rng.uniform(0.9, 1.18)) * (1.06 if look.glove else 1.0),
-        float(rng.uniform(0.2, 1.0)),
-    )
-    person = _standing(sim_object, script, moved_joints, build, eyes, rng)
+    build = sample_hand_build(task.sim_object.half_diagonal_m, rng, glove=look.glove)
+    person = _standing(task, build, eyes, rng)
 
-    pull = plan_pull(
-        sim_object,
-        script,
-        moved_joints,
-        margin=margin,
-        frames_per_joint=frames_per_joint,
-        rng=rng,
-        noun="hand",
-        find=partial(find_hand_grasp, person),
-    )
-    grips: tuple[Grip, ...] = tuple(_tool(grasp).grip for grasp in pull.grasps)
-    return Hand(_parts(build, look, pull, rng), pull.held, grips, build)
+    def tools(path: Float[np.ndarray, "M 3"]) -> list[HandTool]:
+        shoulder = person.shoulder(path)
+        return [hand_tool(grip, person, shoulder) for grip in GRIPS]
+
+    pull = plan_pull(task, rng, "hand", tools)
+    return Hand(_parts(build, look, pull, rng), pull.held, tuple(_tool(grasp).grip for grasp in pull.grasps), build)
 
 
-def _standing(
-    sim_object: SimObject,
-    script: Float[np.ndarray, "S J"],
-    moved_joints: tuple[int, ...],
-    build: HandBuild,
-    eyes: Float[np.ndarray, "N 3"],
-    rng: np.random.Generator,
-) -> Person:
+def _standing(task: Task, build: HandBuild, eyes: Float[np.ndarray, "N 3"], rng: np.random.Generator) -> Person:
     """Where the person stands: the first draw in which the arm keeps clear of all cameras, or the clearest."""
-    poses = sim_object.articulation.poses(script[:: max(1, len(script) // 8)])
-    moved = [e for e in sim_object.entities if e.joint in moved_joints and e.label != "hinge"]
-    paths = [_path(poses, e) for e in moved]
-    best: tuple[float, Person] | None = None
-    for _ in range(_STANDING_DRAWS):
+    moved = [e for e in task.sim_object.entities if e.joint in task.joints and e.label != "hinge"]
+    paths = entity_points(moved, task.poses[:: max(1, len(task.script) // 8)]).swapaxes(0, 1)
+    people: list[tuple[float, Person]] = []
+    while len(people) < _STANDING_DRAWS and not (people and people[-1][0] >= _CLEAR_RAD):
         ahead, aside = float(rng.uniform(0.28, 0.45)), float(rng.uniform(-0.2, 0.45))
         above, top = float(rng.uniform(0.2, 0.5)), float(rng.uniform(1.2, 1.5))
         person = Person(build, build.scale * ahead, build.scale * aside, build.scale * above, top)
-        clear = min((person.clearance_rad(path, eyes) for path in paths), default=np.pi)
-        if best is None or clear > best[0]:
-            best = (clear, person)
-        if clear >= _CLEAR_RAD:
-            break
-    assert best is not None
-    return best[1]
-
-
-def _path(poses: Float[np.ndarray, "M B 4 4"], entity: SimEntity) -> Float[np.ndarray, "M 3"]:
-    return np.array([apply(pose[entity.body], entity.point) for pose in poses])
+        people.append((min((person.clearance_rad(path, eyes) for path in paths), default=np.pi), person))
+    return max(people, key=lambda drawn: drawn[0])[1]
 
 
 def _parts(build: HandBuild, look: HandLook, pull: Pull, rng: np.random.Generator) -> tuple[MeshPart, ...]:
@@ -411,9 +321,14 @@ def _parts(build: HandBuild, look: HandLook, pull: Pull, rng: np.random.Generato
         targets = targets.mixed(hand_targets(build, _tool(grasp).grip, grasp.width_m, pull.opening_m), share)
         shoulder += share[:, None] * (_tool(grasp).shoulder - shoulder)
     pose = pose_hand(build, targets)
-    return (
-        *_hand_parts(build, look, pose, pull.world_from_gripper),
-        *_arm_parts(build, look, pull.world_from_gripper @ pose.hand_from_palm, shoulder + _STEP * _steps(pull), rng),
+    world_from_palm = pull.world_from_gripper @ pose.hand_from_palm
+    pieces = [
+        *_hand_pieces(build, look, pose, pull.world_from_gripper, world_from_palm),
+        *_arm_pieces(build, look, world_from_palm, shoulder + _STEP * _steps(pull), rng),
+    ]
+    return tuple(
+        MeshPart(replace(mesh, vertices=build.scale * mesh.vertices), surface, frames)
+        for mesh, surface, frames in pieces
     )
 
 
@@ -430,66 +345,62 @@ def _steps(pull: Pull) -> Float[np.ndarray, "S 3"]:
     return steps * [1.0, 1.0, 0.0]
 
 
-def _hand_parts(
-    build: HandBuild, look: HandLook, pose: HandPose, world_from_hand: Float[np.ndarray, "S 4 4"]
-) -> list[MeshPart]:
-    palm = join([rounded(balls(build.side, build.thickness)) for balls in (palm_balls, web_balls)])
-    parts = [MeshPart(_sized(palm, build), look.hand, world_from_hand @ pose.hand_from_palm)]
-    for finger in range(5):
-        for bone in range(3):
-            frame = _frames(
-                pose.joints[:, finger, bone],
-                pose.joints[:, finger, bone + 1] - pose.joints[:, finger, bone],
-                across=pose.across[:, finger],
-            )
-            length = float(BONES_M[finger, bone])
-            mesh = rounded(bone_balls(finger, bone, length, build.thickness))
-            parts.append(MeshPart(_sized(mesh, build), look.hand, world_from_hand @ frame))
-            if bone == 2 and not look.glove:
-                nail = rounded(nail_balls(finger, length, build.thickness))
-                parts.append(MeshPart(_sized(nail, build), look.nail, world_from_hand @ frame))
-    return parts
+_Piece = tuple[Mesh, Surface, np.ndarray]
+"""A mesh at scale 1, what it wears, and where it is in the world at every frame."""
 
 
-def _arm_parts(
+def _hand_pieces(
+    build: HandBuild,
+    look: HandLook,
+    pose: HandPose,
+    world_from_hand: Float[np.ndarray, "S 4 4"],
+    world_from_palm: Float[np.ndarray, "S 4 4"],
+) -> list[_Piece]:
+    pieces: list[_Piece] = [(join([rounded(balls) for balls in palm_balls(build)]), look.hand, world_from_palm)]
+    for finger, lengths in enumerate(BONES_M.tolist()):
+        joints, across = pose.joints[:, finger], pose.across[:, finger]
+        for bone, length in enumerate(lengths):
+            frame = world_from_hand @ _frames(joints[:, bone], joints[:, bone + 1] - joints[:, bone], across)
+            pieces.append((rounded(bone_balls(finger, bone, length, build.thickness)), look.hand, frame))
+        if not look.glove:
+            pieces.append((rounded(nail_balls(finger, lengths[-1], build.thickness)), look.nail, frame))
+    return pieces
+
+
+def _arm_pieces(
     build: HandBuild,
     look: HandLook,
     world_from_palm: Float[np.ndarray, "S 4 4"],
     shoulder: Float[np.ndarray, "S 3"],
     rng: np.random.Generator,
-) -> list[MeshPart]:
+) -> list[_Piece]:
     wrist, across = world_from_palm[:, :3, 3], world_from_palm[:, :3, 0]
     towards = elbow_direction(wrist, world_from_palm[:, :3, 2], shoulder, build)
     elbow = wrist + build.scale * FOREARM_M * towards
-    lower = _frames(wrist, towards, across=across)
+    lower = _frames(wrist, towards, across)
     # The upper arm does not turn about itself: from the forearm's frame by the shortest way.
-    onwards = (shoulder - elbow) / np.maximum(np.linalg.norm(shoulder - elbow, axis=1, keepdims=True), 1e-9)
+    onwards = unit_rows(shoulder - elbow, 1e-9)
     level = np.sum(lower[:, :3, 0] * onwards, axis=1) / np.maximum(1 + np.sum(towards * onwards, axis=1), 1e-6)
-    upper = _frames(elbow, onwards, across=lower[:, :3, 0] - level[:, None] * (towards + onwards))
+    upper = _frames(elbow, onwards, lower[:, :3, 0] - level[:, None] * (towards + onwards))
     pieces = [(tube_of_sections(FOREARM_SECTIONS_M), look.skin, lower)]
     pieces += [(mesh, look.skin, upper) for mesh in (rounded(ELBOW_BALL_M), tube_of_sections(UPPER_ARM_SECTIONS_M))]
     if look.sleeve_start_m < FOREARM_M:
-        sections = sleeve_sections(look.sleeve_start_m, FOREARM_M, look.loose_m, cuff_m=look.cuff_m)
+        sections = sleeve_sections(look.sleeve_start_m, look.loose_m, cuff_m=look.cuff_m)
         pieces.append((tube_of_sections(sections, folds(len(sections), look.folds_m, rng)), look.sleeve, lower))
         pieces.append((rounded(ELBOW_BALL_M + np.array([0.0, 0.0, 0.0, 0.5 * look.loose_m])), look.sleeve, upper))
     sections = upper_sleeve_sections(max(0.0, look.sleeve_start_m - FOREARM_M), look.loose_m)
+    shoulder_ball = np.array([[0.0, 0.0, sections[-1, 0] - 0.01, sections[-1, 1] + 0.004]])
     pieces.append((tube_of_sections(sections, folds(len(sections), look.folds_m, rng)), look.sleeve, upper))
-    pieces.append((rounded(shoulder_ball(sections)), look.sleeve, upper))
-    return [MeshPart(_sized(mesh, build), surface, frames) for mesh, surface, frames in pieces]
+    return [*pieces, (rounded(shoulder_ball), look.sleeve, upper)]
 
 
 def _frames(
-    origin: Float[np.ndarray, "S 3"], along: Float[np.ndarray, "S 3"], *, across: Float[np.ndarray, "S 3"]
+    origin: Float[np.ndarray, "S 3"], along: Float[np.ndarray, "S 3"], across: Float[np.ndarray, "S 3"]
 ) -> Float[np.ndarray, "S 4 4"]:
     """Frames at some places with z along directions and x as near as it gets to others."""
     frames = np.tile(np.eye(4), (len(origin), 1, 1))
-    z = along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    x = across - np.sum(across * z, axis=1, keepdims=True) * z
-    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-9)
+    z = unit_rows(along, 1e-9)
+    x = unit_rows(across - np.sum(across * z, axis=1, keepdims=True) * z, 1e-9)
     frames[:, :3, 0], frames[:, :3, 1], frames[:, :3, 2] = x, np.cross(z, x), z
     frames[:, :3, 3] = origin
     return frames
-
-
-def _sized(mesh: Mesh, build: HandBuild) -> Mesh:
-    return replace(mesh, vertices=build.scale * mesh.vertices)

@@ -58,19 +58,12 @@ def draw_profile(
     It starts at ``closing_from`` if it closes, which it then does completely; None if it opens from closed to 0.6 or
     more (``creep``: 0.85 or more).
     """
-    if closing_from is None:
-        top = rng.uniform(*(_CREEP_AMPLITUDE if kind == "creep" else _AMPLITUDE))
-        return _person(frames, rng, opens_to=top) if kind == "human" else top * _way(kind, frames, rng)
-    return closing_from * (1 - _way(kind, frames, rng))
-
-
-def _way(kind: ProfileKind, frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
-    """Progress that ends at 1 and never leaves [0, 1]."""
-    if kind == "creep":
-        return _creep(frames, rng)
-    if kind == "robot":
-        return _robot(frames, rng)
-    return _person(frames, rng)
+    # Progress that ends at 1 and never leaves [0, 1].
+    way = {"human": _person, "robot": _robot, "creep": _creep}[kind]
+    if closing_from is not None:
+        return closing_from * (1 - way(frames, rng))
+    top = rng.uniform(*(_CREEP_AMPLITUDE if kind == "creep" else _AMPLITUDE))
+    return _person(frames, rng, opens_to=top) if kind == "human" else top * way(frames, rng)
 
 
 def _person(frames: int, rng: np.random.Generator, *, opens_to: float | None = None) -> Float[np.ndarray, " N"]:
@@ -88,7 +81,7 @@ def _person(frames: int, rng: np.random.Generator, *, opens_to: float | None = N
     else:
         back = rng.uniform(0.2, 0.6) * top
         knots, weights = [0.0, top, back, rng.uniform(back, top)], [1.2, 0.8, 0.8]
-    return _along(knots, _with_last_stop(weights, rng), frames, minimum_jerk)
+    return _along(knots, weights, frames, minimum_jerk, rng)
 
 
 def _robot(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
@@ -108,7 +101,7 @@ def _robot(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
             knots.append(knots[-1])
     go(1.0)
     ramp = rng.uniform(*_RAMP)
-    return _along(knots, _with_last_stop(weights, rng), frames, lambda share: trapezoid(share, ramp))
+    return _along(knots, weights, frames, lambda share: trapezoid(share, ramp), rng)
 
 
 def _creep(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
@@ -132,19 +125,15 @@ def _creep(frames: int, rng: np.random.Generator) -> Float[np.ndarray, " N"]:
     return np.clip(steady + _WAVER / (2 * np.pi * turns) * np.sin(2 * np.pi * turns * steady), 0.0, 1.0)
 
 
-def _with_last_stop(weights: list[float], rng: np.random.Generator) -> list[float]:
-    """The end of the script may come a little before the end of the share."""
-    return [*weights, rng.uniform(0.0, 0.15) * sum(weights)]
-
-
 def _along(
     knots: list[float],
     weights: list[float],
     frames: int,
     ease: Callable[[np.ndarray], np.ndarray],
+    rng: np.random.Generator,
 ) -> Float[np.ndarray, " N"]:
-    """From knot to knot in times that go with the weights, and rest at the last."""
-    knots = [*knots, knots[-1]]
+    """From knot to knot in times that go with the weights, and rest at the last for a little while or not at all."""
+    knots, weights = [*knots, knots[-1]], [*weights, rng.uniform(0.0, 0.15) * sum(weights)]
     ends = np.concatenate(([0.0], np.cumsum(weights) / np.sum(weights)))
     share = np.arange(1, frames + 1) / frames
     segment = np.clip(np.searchsorted(ends, share, side="left") - 1, 0, len(weights) - 1)
@@ -256,15 +245,8 @@ def long_script(
     """Joint positions at every one of ``frames`` frames: the joints open and close again and again, in random order.
 
     Every joint gets its turn before any comes again; those that are open close at their turn. Shares are 0.7 to 1.5
-    times as long as given, with pauses between some. The script ends wherever it is.
-
-    Args:
-        articulation: the object.
-        moved_joints: joints that move.
-        rng: what the script is drawn from.
-        frames: length of the script.
-        frames_per_joint: frames that a movement takes about.
-        style: how they move; its cycles do not count.
+    times as long as ``frames_per_joint``, with pauses between some. The script ends wherever it is. The cycles of the
+    style do not count.
 
     Raises:
         ConfigError: there is no joint, or ``frames_per_joint`` or ``frames`` leaves no time to move.

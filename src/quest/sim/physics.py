@@ -128,13 +128,8 @@ def play_physically(
 
     The first :data:`quest.sim.motion.HOLD_FRAMES` frames are the script's, and so is every joint until the script moves
     it. Then positions differ from the script's, but stay within the joint's limits (and 110 degrees from rest). PhysX
-    itself keeps to them but for rounding in single precision, which is cut off.
-
-    Args:
-        sim_object: the object.
-        script: joint positions that are wanted, radians or metres; nothing may move in its hold.
-        rng: what masses, friction, and the firmness of the pull are drawn from.
-        substeps: steps of physics per frame, at least 8.
+    itself keeps to them but for rounding in single precision, which is cut off. Masses, friction, and the firmness of
+    the pull are drawn from ``rng``; ``substeps`` are steps of physics per frame, at least 8.
 
     Raises:
         InputError: the script does not fit the object's joints, leaves their limits, or moves in the hold.

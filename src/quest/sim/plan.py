@@ -48,13 +48,8 @@ def plan_takes(
 ) -> list[TakeSpec]:
     """Takes of every object at every level, all objects once before any comes again.
 
-    Args:
-        objects: source and id of each.
-        levels: levels to make.
-        takes_per_object: takes per object and level, in each suite.
-        first_seed: seed of the first take of each object; the others count up.
-        settings: how ordinary takes are made; suites bring their own.
-        suites: the suites to make takes of, instead of ordinary ones.
+    Objects are given by source and id. There are ``takes_per_object`` of each at each level, in each suite; their seeds
+    count up. If there are suites, takes are theirs, with their settings, instead of ordinary ones.
     """
     chosen = list(objects)
     kinds = [(suite.settings, suite) for suite in suites] or [(settings, None)]

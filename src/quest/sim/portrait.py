@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from quest.errors import ConfigError
-from quest.sim.annotate import project_points, visible_entities
+from quest.sim.annotate import entity_points, see_entities
 from quest.sim.appearance import Light, Region, apply_appearance, sample_appearance
-from quest.sim.articulation import apply
 from quest.sim.cameras import sample_cameras
 from quest.sim.objects import SimObject
 from quest.sim.renderer import Renderer
@@ -55,8 +53,8 @@ def portray(sim_object: SimObject, renderer: Renderer, *, sides: int = 2, size_p
         )
     articulation = sim_object.articulation
     opened = articulation.rest + OPENED * np.array([j.opening() for j in articulation.joints])
-    moments = [articulation.poses(position) for position in (articulation.rest, opened)]
-    swept = np.concatenate([articulation.world_points(position) for position in (articulation.rest, opened)])
+    moments = (articulation.rest, opened)
+    swept = np.concatenate([articulation.world_points(position) for position in moments])
     cameras = sample_cameras(swept, sides, np.random.default_rng(_SIDES_SEED), width=size_px, height=size_px)
     procedural = sim_object.source == "procedural"
     look_rng = np.random.default_rng([zlib.crc32(b"portrait"), zlib.crc32(sim_object.object_id.encode())])
@@ -64,19 +62,14 @@ def portray(sim_object: SimObject, renderer: Renderer, *, sides: int = 2, size_p
         sample_appearance(look_rng, randomize_materials=procedural),
         ambient=(0.42, 0.42, 0.43), lights=(_SUN,), shadows=True, floor=_FLOOR, wall=None, distractors=(),
     )  # fmt: skip
-    region = Region.around(swept)
-
-    def dress(scene: Any, bodies: list[Any]) -> None:
-        apply_appearance(scene, appearance, region, bodies, procedural=procedural)
-
-    stage = renderer.stage(sim_object, cameras, dress)
-    carried_by = [e.body for e in sim_object.entities]
+    stage = renderer.stage(sim_object, cameras)
+    apply_appearance(stage.scene, appearance, Region.around(swept), stage.bodies, procedural=procedural)
     found = []
-    for poses, is_open in zip(moments, (False, True), strict=True):
-        points = np.stack([apply(poses[e.body], e.point) for e in sim_object.entities])
+    for position in moments:
+        poses = articulation.poses(position)
+        points = entity_points(sim_object.entities, poses)
         stage.pose(poses)
         for posed, picture in zip(cameras, stage.pictures(), strict=True):
-            uv, depth = project_points(points, posed)
-            visible = visible_entities(picture, uv, depth, carried_by, half_diagonal_m=sim_object.half_diagonal_m)
-            found.append(Portrait(is_open, picture.rgb, uv, visible))
+            seen = see_entities(sim_object, posed, picture, points)
+            found.append(Portrait(position is opened, picture.rgb, *seen))
     return found

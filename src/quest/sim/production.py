@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any
 
 from quest.data.provenance import code_commit, package_versions
 from quest.data.take_format import hash_take
@@ -64,31 +64,21 @@ Report = Callable[[Event], None]
 """Is told what happens, in the thread that called."""
 
 
-@runtime_checkable
-class Studio(Protocol):
-    """Makes takes, one after the other, in one thread."""
+class Studio:
+    """Makes takes, one after the other, in one thread.
 
-    def describe(self) -> dict[str, Any]:
-        """What takes depend on beside their specification: versions, renderer, commit."""
-        ...
+    It costs nothing until it is opened; pickled before, it can be opened on another machine.
 
-    def make(self, spec: TakeSpec) -> tuple[Take, tuple[str, ...]]:
-        """A take, and what was found wrong with its object.
+    Args:
+        objects_root: folder of PartNet-Mobility folders; None for the environment's ``QUEST_OBJECTS``.
+        command: the command that makes these takes, for their provenance.
+    """
 
-        Raises:
-            ConfigError: its suite cannot be made with its settings.
-            ObjectError: it cannot be made from this object.
-            RendererError: the renderer broke.
-        """
-        ...
+    def __init__(self, objects_root: Path | None = None, command: str = "") -> None:
+        self.objects_root, self.command = objects_root, command
 
-
-@runtime_checkable
-class StudioOpener(Protocol):
-    """Says how a studio is set up; pickled, it sets one up on another machine."""
-
-    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> Studio:
-        """A studio that can make these takes.
+    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> None:
+        """Set up what is costly, so that these takes can be made: a renderer, and a shelf of objects.
 
         ``complete``: it must have all their objects. Workers of a cluster must, or it would depend on who makes a take
         whether it can be made.
@@ -98,20 +88,6 @@ class StudioOpener(Protocol):
                 objects have none here.
             RendererError: nothing can render here.
         """
-        ...
-
-
-@dataclass(frozen=True)
-class StudioSettings:
-    """Studios that render."""
-
-    objects_root: Path | None = None
-    """Folder of PartNet-Mobility folders; None for the environment's ``QUEST_OBJECTS``."""
-    command: str = ""
-    """The command that makes these takes, for their provenance."""
-
-    def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> RenderingStudio:
-        """See :class:`StudioOpener`."""
         wanted = {spec.object_id for spec in specs if spec.source == "partnet"}
         if wanted:  # told before the renderer warms up
             missing = sorted(wanted - {folder.name for folder in find_objects(self.objects_root)})
@@ -123,43 +99,34 @@ class StudioSettings:
         if complete:
             for own in {spec.object_id for spec in specs if spec.source == "own"}:
                 find_urdf(Path(own))
-        return RenderingStudio(self)
-
-
-class RenderingStudio:
-    """What is costly to set up: a renderer and loaded objects."""
-
-    def __init__(self, settings: StudioSettings) -> None:
-        self._renderer = Renderer()
-        self._shelf = ObjectShelf(settings.objects_root)
-        self._provenance = {**self.describe(), "command": settings.command}
+        self._renderer, self._shelf = Renderer(), ObjectShelf(self.objects_root)
+        self._provenance = {**self.describe(), "command": self.command}
 
     def describe(self) -> dict[str, Any]:
-        """Commit, versions and renderer."""
+        """What takes depend on beside their specification: commit, versions and renderer."""
         return {"commit": code_commit(), "versions": package_versions(), "renderer": str(self._renderer.device)}
 
     def make(self, spec: TakeSpec) -> tuple[Take, tuple[str, ...]]:
-        """See :class:`Studio`."""
-        return make_take(spec, renderer=self._renderer, shelf=self._shelf, provenance=self._provenance)
+        """A take, and what was found wrong with its object.
 
-
-def make_take(
-    spec: TakeSpec, *, renderer: Renderer, shelf: ObjectShelf, provenance: dict[str, Any] | None = None
-) -> tuple[Take, tuple[str, ...]]:
-    """One take, and what was found wrong with its object; errors as those of :meth:`Studio.make`."""
-    sim_object = shelf.load(spec.source, spec.object_id)
-    if spec.source == "own":
-        provenance = {**(provenance or {}), "object": object_digest(Path(spec.object_id))}
-    take = generate_take(
-        sim_object,
-        spec.level,
-        spec.seed,
-        renderer=renderer,
-        settings=spec.settings,
-        suite=spec.suite,
-        provenance=provenance,
-    )
-    return take, sim_object.warnings
+        Raises:
+            ConfigError: its suite cannot be made with its settings.
+            ObjectError: it cannot be made from this object.
+            RendererError: the renderer broke.
+        """
+        sim_object, provenance = self._shelf.load(spec.source, spec.object_id), self._provenance
+        if spec.source == "own":
+            provenance = {**provenance, "object": object_digest(Path(spec.object_id))}
+        take = generate_take(
+            sim_object,
+            spec.level,
+            spec.seed,
+            renderer=self._renderer,
+            settings=spec.settings,
+            suite=spec.suite,
+            provenance=provenance,
+        )
+        return take, sim_object.warnings
 
 
 def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]:
@@ -194,16 +161,16 @@ def missing_takes(specs: Iterable[TakeSpec], store: TakeStore) -> list[TakeSpec]
     return [spec for name, spec in wanted.items() if name not in there]
 
 
-def produce(specs: Sequence[TakeSpec], store: TakeStore, opener: StudioOpener, *, report: Report) -> None:
+def produce(specs: Sequence[TakeSpec], store: TakeStore, studio: Studio, *, report: Report) -> None:
     """Makes takes one after the other in this process and writes them into a store.
 
     Interrupted, it finishes the take that is being written; the store never has a part of one.
 
     Raises:
-        ObjectError, RendererError: no studio can be opened here.
+        ObjectError, RendererError: the studio cannot be opened here.
         TakeError: the store cannot be written.
     """
-    studio = opener.open(specs)
+    studio.open(specs)
     writing: list[tuple[TakeMade, Future[None]]] = []
 
     def finish() -> None:

@@ -8,10 +8,10 @@ The first picture of a process compiles shaders, which takes about twenty second
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
@@ -25,14 +25,8 @@ from quest.sim.objects import SimObject
 from quest.sim.surfaces import ensure_uv
 from quest.sim.urdf import MeshData
 
-if TYPE_CHECKING:
-    import sapien
-
 # x forward, y left, z up (SAPIEN) seen from x right, y down, z forward (OpenCV).
 _CV_FROM_SAPIEN = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]], dtype=float)
-
-Dress = Callable[["sapien.Scene", list[Any]], None]
-"""Gives a scene its lights, surroundings and materials; gets the scene and the object's render bodies."""
 
 
 @dataclass(frozen=True)
@@ -57,8 +51,9 @@ class Renderer:
         MissingExtraError: SAPIEN is not installed.
     """
 
-    _latest: ClassVar[Stage | None] = None
-    """Kept alive until the next one exists, because SAPIEN drops its compiled shaders with the last camera."""
+    latest: ClassVar[Stage | None] = None
+    """The last stage that was made. Kept until the next one exists, because SAPIEN drops its compiled shaders with the
+    last camera."""
 
     def __init__(self) -> None:
         self.device = prepare_renderer()
@@ -66,20 +61,11 @@ class Renderer:
         sapien.render.set_log_level("error")
         self._sapien = sapien
 
-    def stage(self, sim_object: SimObject, cameras: Sequence[PosedCamera], dress: Dress | None = None) -> Stage:
-        """A scene with one object and its cameras.
-
-        Args:
-            sim_object: the object; body and entity indices in the pictures are its own.
-            cameras: where to look from, until :meth:`Stage.aim` says otherwise.
-            dress: gives the scene lights, surroundings and materials; without it the scene is dark until
-                :meth:`Stage.dress`, which is enough for depth and labels.
-        """
+    def stage(self, sim_object: SimObject, cameras: Sequence[PosedCamera]) -> Stage:
+        """A scene with one object and its cameras; dark, which is enough for depth and labels."""
         try:
-            with nullcontext() if Renderer._latest is not None else without_known_warnings():
-                stage = Renderer._latest = Stage(self._sapien, sim_object, cameras)
-            if dress is not None:
-                stage.dress(dress)
+            with nullcontext() if Renderer.latest is not None else without_known_warnings():
+                stage = Renderer.latest = Stage(self._sapien, sim_object, cameras)
             return stage
         except RuntimeError as error:
             raise RendererError(
@@ -88,82 +74,84 @@ class Renderer:
 
 
 class Stage:
-    """A scene with one object that can be posed and photographed; made by :meth:`Renderer.stage`."""
+    """A scene with one object that can be posed and photographed; made by :meth:`Renderer.stage`.
+
+    Body and entity indices in the pictures are the object's own.
+    """
 
     def __init__(self, sapien: Any, sim_object: SimObject, cameras: Sequence[PosedCamera]) -> None:
         self._sapien = sapien
-        self._scene = sapien.Scene([sapien.render.RenderSystem()])
-        self._bodies: list[list[Any]] = [[] for _ in sim_object.articulation.body_names]
+        self.scene = sapien.Scene([sapien.render.RenderSystem()])
+        """The ``sapien.Scene``, for what else shall be in it."""
+        self.bodies: list[Any] = []
+        """The object's ``RenderBodyComponent``s, always in the same order."""
+        self._actors: list[list[Any]] = [[] for _ in sim_object.articulation.body_names]
+        owner = {i: 1 + e for e, entity in enumerate(sim_object.entities) for i in entity.parts}
+        groups: dict[tuple[int, int], list[Part]] = {}
+        for i, part in enumerate(sim_object.articulation.parts):
+            groups.setdefault((part.body, owner.get(i, 0)), []).append(part)
         labels: dict[int, tuple[int, int]] = {}
-        self._render_bodies: list[Any] = []
-        for body, entity, parts in _groups(sim_object):
+        for (body, entity), parts in groups.items():
             component = sapien.render.RenderBodyComponent()
             for part in parts:
                 for shape in _shapes(sapien, part):
                     component.attach(shape)
-            actor = sapien.Entity()
-            actor.add_component(component)
-            self._scene.add_entity(actor)
-            self._bodies[body].append(actor)
-            labels[actor.per_scene_id] = (1 + body, 1 + entity)
-            self._render_bodies.append(component)
-        self._body_of_id = np.zeros(max(labels) + 2, dtype=np.uint8)
-        self._entity_of_id = np.zeros(max(labels) + 2, dtype=np.uint8)
-        for per_scene_id, (body, entity) in labels.items():
-            self._body_of_id[per_scene_id], self._entity_of_id[per_scene_id] = body, entity
-        self._posed: list[np.ndarray | None] = [None] * len(self._bodies)
-        self._cameras = [self._add_camera(posed) for posed in cameras]
-        self._aimed: list[PosedCamera | None] = [None] * len(self._cameras)
+            actor = self._add(component)
+            self._actors[body].append(actor)
+            self.bodies.append(component)
+            labels[actor.per_scene_id] = (1 + body, entity)
+        # Whatever is added after the object (props, surroundings) shares the last entry: background.
+        self._labels_of_id = np.zeros((2, max(labels) + 2), dtype=np.uint8)
+        for per_scene_id, label in labels.items():
+            self._labels_of_id[:, per_scene_id] = label
+        self._posed: list[np.ndarray | None] = [None] * len(self._actors)
+        self.cameras = [sapien.render.RenderCameraComponent(c.camera.width, c.camera.height) for c in cameras]
+        self._mounts = [self._add(camera) for camera in self.cameras]
+        self._aimed: list[PosedCamera | None] = [None] * len(self.cameras)
         self.aim(cameras)
 
-    def dress(self, dress: Dress) -> None:
-        """Gives the scene its lights, surroundings and materials."""
-        dress(self._scene, self._render_bodies)
-
-    def _add_camera(self, posed: PosedCamera) -> tuple[Any, Any]:
-        component = self._sapien.render.RenderCameraComponent(posed.camera.width, posed.camera.height)
-        mount = self._sapien.Entity()
-        mount.add_component(component)
-        self._scene.add_entity(mount)
-        return component, mount
+    def _add(self, component: Any) -> Any:
+        actor = self._sapien.Entity()
+        actor.add_component(component)
+        self.scene.add_entity(actor)
+        return actor
 
     def aim(self, cameras: Sequence[PosedCamera]) -> None:
         """Moves the cameras; their number and image sizes stay."""
-        for index, posed in enumerate(cameras):
-            last, (component, mount) = self._aimed[index], self._cameras[index]
-            if last is None or last.camera != posed.camera:
-                camera = posed.camera
-                near = 1e-2 * max(float(np.linalg.norm(posed.cam_from_world[:3, 3])), 1e-2)
-                component.set_perspective_parameters(near, 1e3, camera.fx, camera.fy, camera.cx, camera.cy, 0.0)
-            if last is None or not np.array_equal(last.cam_from_world, posed.cam_from_world):
-                mount.set_pose(self._sapien.Pose(np.linalg.inv(posed.cam_from_world) @ _CV_FROM_SAPIEN))
+        for index, (posed, last) in enumerate(zip(cameras, self._aimed, strict=True)):
+            camera, pose = posed.camera, posed.cam_from_world
+            if last is None or last.camera != camera:
+                near = 1e-2 * max(float(np.linalg.norm(pose[:3, 3])), 1e-2)
+                self.cameras[index].set_perspective_parameters(
+                    near, 1e3, camera.fx, camera.fy, camera.cx, camera.cy, 0.0
+                )
+            if last is None or not np.array_equal(last.cam_from_world, pose):
+                self._mounts[index].set_pose(self._sapien.Pose(np.linalg.inv(pose) @ _CV_FROM_SAPIEN))
             self._aimed[index] = posed
 
     def pose(self, world_from_body: Float[np.ndarray, "B 4 4"]) -> None:
         """Moves the bodies."""
-        for b, matrix in enumerate(world_from_body):
-            last = self._posed[b]
-            if last is not None and np.array_equal(last, matrix):
-                continue
-            pose = self._sapien.Pose(matrix)
-            for actor in self._bodies[b]:
-                actor.set_pose(pose)
-            self._posed[b] = matrix.copy()
+        for b, (matrix, last) in enumerate(zip(world_from_body, self._posed, strict=True)):
+            if last is None or not np.array_equal(last, matrix):
+                pose = self._sapien.Pose(matrix)
+                for actor in self._actors[b]:
+                    actor.set_pose(pose)
+                self._posed[b] = matrix.copy()
 
     def pictures(self) -> list[Picture]:
         """What every camera sees now."""
-        self.shoot()
-        return self.develop()
+        self.render()
+        return self.read_back()
 
-    def shoot(self) -> None:
+    def render(self) -> None:
         """Begins to draw what every camera sees now, and does not wait for it."""
-        self._scene.update_render()
-        for camera, _ in self._cameras:
+        self.scene.update_render()
+        for camera in self.cameras:
             camera.take_picture()
 
-    def develop(self) -> list[Picture]:
-        """The pictures of the last :meth:`shoot`, when they are drawn."""
-        return [self._picture(camera) for camera, _ in self._cameras]
+    def read_back(self) -> list[Picture]:
+        """The pictures of the last :meth:`render`, when they are drawn."""
+        return [self._picture(camera) for camera in self.cameras]
 
     def _picture(self, camera: Any) -> Picture:
         colour = camera.get_picture("Color")[..., :3] * np.float32(255)
@@ -171,19 +159,9 @@ class Stage:
         rgb = np.clip(colour, 0, 255, out=colour).astype(np.uint8)
         # Camera space with OpenGL axes: depth is -z, and 0 where nothing was drawn.
         depth = np.maximum(-camera.get_picture("Position")[..., 2], 0.0).astype(np.float32)
-        # Whatever was added after the object (props, surroundings) shares the last entry: background.
-        ids = np.minimum(camera.get_picture("Segmentation")[..., 1], len(self._body_of_id) - 1)
-        return Picture(rgb, depth, self._body_of_id.take(ids), self._entity_of_id.take(ids))
-
-
-def _groups(sim_object: SimObject) -> list[tuple[int, int, list[Part]]]:
-    """Body, entity (-1: none) and parts of every scene entity."""
-    parts = sim_object.articulation.parts
-    owner = {i: e for e, entity in enumerate(sim_object.entities) for i in entity.parts}
-    groups: dict[tuple[int, int], list[Part]] = {}
-    for i, part in enumerate(parts):
-        groups.setdefault((part.body, owner.get(i, -1)), []).append(part)
-    return [(body, entity, members) for (body, entity), members in groups.items()]
+        ids = np.minimum(camera.get_picture("Segmentation")[..., 1], self._labels_of_id.shape[1] - 1)
+        body, entity = self._labels_of_id
+        return Picture(rgb, depth, body.take(ids), entity.take(ids))
 
 
 def _shapes(sapien: Any, part: Part) -> list[Any]:
@@ -211,12 +189,17 @@ def _shapes(sapien: Any, part: Part) -> list[Any]:
 
 def _mesh_shape(sapien: Any, part: Part) -> Any:
     """A part's own mesh with its name, scale and pose."""
+    scale = np.array(part.scale, dtype=np.float32)
     if isinstance(part.mesh, MeshData):
         look = (*part.mesh.colour, 1.0), part.mesh.roughness
         shape = _triangles(sapien, part.mesh.corners, *look, specular=0.5)  # as SAPIEN gives to mesh files
-        shape.set_scale(np.array(part.scale, dtype=np.float32))
+        shape.set_scale(scale)
     else:
-        shape = sapien.render.RenderShapeTriangleMesh(str(part.mesh), np.array(part.scale, dtype=np.float32))
+        shape = sapien.render.RenderShapeTriangleMesh(str(part.mesh), scale)
+    return _in_place(sapien, shape, part)
+
+
+def _in_place(sapien: Any, shape: Any, part: Part) -> Any:
     shape.set_local_pose(sapien.Pose(part.body_from_part))
     shape.set_name(part.name)
     return shape
@@ -244,6 +227,4 @@ def _mirrored(sapien: Any, piece: Any, part: Part) -> Any:
     shape = sapien.render.RenderShapeTriangleMesh(
         piece.get_vertices() * scale, triangles, normals, piece.get_vertex_uv(), piece.material
     )
-    shape.set_local_pose(sapien.Pose(part.body_from_part))
-    shape.set_name(part.name)
-    return shape
+    return _in_place(sapien, shape, part)

@@ -19,12 +19,12 @@ from quest.data.split import object_split, part_of_object
 from quest.errors import ObjectError
 from quest.sim.appearance import ROOM, THINGS
 from quest.sim.articulation import Articulation, Part, apply
-from quest.sim.entities import SimEntity
 from quest.sim.objects import SimObject, find_things, load_thing
 from quest.sim.procedural.catalogue import make_object
 from quest.sim.procedural.clutter import things_on
 from quest.sim.procedural.model import Dice, Mesh, as_visual, box
 from quest.sim.procedural.model import Part as ModelPart
+from quest.sim.surfaces import triple
 
 _SMALLEST_M = 0.15
 """Half diagonal; what is smaller cannot be seen from where a room can."""
@@ -105,16 +105,21 @@ class _Room:
         self.pieces: list[_Piece] = []
         self.still: list[Part] = []
         self.things: list[Part] = []
-        self._back = -size[0] / 2
+        self._back, height = -size[0] / 2, 0.0
         on_top = bool((size <= _ON_TOP_M).all())
         if on_top:
             self._back -= rng.real(0.01, 0.1)
-            carrying = self._carrying(size)
+            carrying = self._made(rng.pick(_CARRYING))
+            while (carrying.articulation.extent_m[:2] < size[:2]).any():
+                carrying = self._made(rng.pick(_CARRYING))
             self.pieces.append(_Piece("below", carrying, self._beside(carrying, 0.0)))
-        height = self.pieces[0].size[2] if on_top else 0.0
+            height = self.pieces[0].size[2]
         self.own = _Piece("", sim_object, np.array([-size[0] / 2, -size[1] / 2, height]))
         first = self.pieces[0] if on_top else self.own
-        self._counter = self._counter_height(first)
+        self._counter = 0.0  # height that all low furniture is brought to, or 0 for none
+        if not rng.chance(0.4):
+            own = float(first.size[2])
+            self._counter = own if _COUNTER_M[0] <= own <= _COUNTER_M[1] else rng.real(0.86, 0.98)
         for side, name in ((-1, "right"), (1, "left")):
             self._row(first, side, name)
         standing = [self.own, *self.pieces]
@@ -125,10 +130,8 @@ class _Room:
 
     def view_m(self) -> Float[np.ndarray, "2 3"]:
         """The box that is filmed: around all that the object reaches, with more or less of the room beside it."""
-        alone = self.own.sim_object
-        articulation = alone.articulation
-        opened = articulation.rest + np.diag([j.opening() for j in articulation.joints])
-        points = np.concatenate([articulation.world_points(p) for p in (articulation.rest, *opened)])
+        alone, articulation = self.own.sim_object, self.own.sim_object.articulation
+        points = np.concatenate([articulation.world_points(position) for position in articulation.each_opened])
         low, high = np.stack((points.min(axis=0), points.max(axis=0))) + self.own.shift[:3, 3]
         room = 2.5 * alone.half_diagonal_m * self._rng.real(0, 1) ** 1.5 * np.array([0.2, 1.0, 0.6])
         low, high = low - room, high + room
@@ -138,22 +141,9 @@ class _Room:
         first, last = self._seeds
         return make_object(category, self._rng.whole(first, last + 1))
 
-    def _carrying(self, size: Float[np.ndarray, "3"]) -> SimObject:
-        while True:  # until one is large enough
-            found = self._made(self._rng.pick(_CARRYING))
-            if (found.articulation.extent_m[:2] >= size[:2]).all():
-                return found
-
     def _beside(self, sim_object: SimObject, y: float, z: float = 0.0) -> Float[np.ndarray, "3"]:
         """Low corner of something with its middle at ``y``."""
         return np.array([self._back, y - sim_object.articulation.extent_m[1] / 2, z])
-
-    def _counter_height(self, first: _Piece) -> float:
-        """Height that all low furniture is brought to, or 0 for none."""
-        if self._rng.chance(0.4):
-            return 0.0
-        own = float(first.size[2])
-        return own if _COUNTER_M[0] <= own <= _COUNTER_M[1] else self._rng.real(0.86, 0.98)
 
     def _row(self, first: _Piece, side: int, name: str) -> None:
         """Furniture from the object to one side."""
@@ -173,7 +163,7 @@ class _Room:
             if lift > 0.005:
                 low, high = piece.low.copy(), piece.high.copy()
                 low[2], high[2], high[0] = 0.0, lift, high[0] - min(0.05, 0.2 * piece.size[0])
-                self._add("plinth", box(_triple(low), _triple(high)))
+                self._add("plinth", box(triple(low), triple(high)))
             self.pieces.append(piece)
             edge += gap + width
 
@@ -206,16 +196,13 @@ class _Room:
         low, high = piece.low.copy(), piece.high.copy()
         if piece is not self.own and abs(high[2] - self._counter) < 1e-6:
             slab = np.array([high[0] + 0.02, high[1] + 0.004, high[2] + 0.035])
-            self._add("counter", box((low[0], low[1] - 0.004, high[2]), _triple(slab)))
+            self._add("counter", box((low[0], low[1] - 0.004, high[2]), triple(slab)))
             high[2] = slab[2]
-        if self._shelf:
-            self._put(low, high)
+        if not self._shelf:
+            for part in things_on(low, high, self._rng):
+                self._add(part.role, part.mesh, part.surface)
             return
-        for part in things_on(low, high, self._rng):
-            self._add(part.role, part.mesh, part.surface)
-
-    def _put(self, low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> None:
-        """None to four of the things of the shelf on top of a box, beside each other."""
+        # None to four of the things of the shelf, beside each other.
         rng, taken = self._rng, float(low[1])
         for _ in range(rng.whole(0, 5)):
             parts = load_thing(rng.pick(self._shelf))
@@ -265,14 +252,19 @@ def _joined(
         other = piece.sim_object.articulation
         base = from_world @ piece.shift @ other.world_from_root
         first_part, first_joint = len(parts), len(joints)
-        parts += [_part(part, piece.name, base, first_joint) for part in other.parts]
+        for part in other.parts:
+            named = replace(part, name=f"{piece.name}/{part.name}", visual=f"{piece.name}/{part.visual}")
+            parts.append(replace(named, body=part.body + first_joint) if part.body else _moved(named, base))
         for joint in other.joints:
             record = replace(joint.joint, name=f"{piece.name}/{joint.joint.name}")
             parent = joint.parent and joint.parent + first_joint
             pose = joint.parent_from_joint if parent else base @ joint.parent_from_joint
             joints.append(replace(joint, joint=record, parent=parent, parent_from_joint=pose))
         names += [f"{piece.name}/{name}" for name in other.body_names[1:]]
-        entities += [_entity(e, piece.name, base, first_joint, first_part) for e in piece.sim_object.entities]
+        for e in piece.sim_object.entities:
+            own_parts = tuple(i + first_part for i in e.parts)
+            point, joint = (apply(base, e.point), -1) if e.fixed else (e.point, e.joint + first_joint)
+            entities.append(replace(e, name=f"{piece.name}/{e.name}", joint=joint, point=point, parts=own_parts))
     return replace(
         own.sim_object,
         articulation=Articulation(tuple(names), tuple(parts), tuple(joints), root),
@@ -282,30 +274,5 @@ def _joined(
     )
 
 
-def _part(part: Part, piece: str, base: Float[np.ndarray, "4 4"], first_joint: int) -> Part:
-    named = replace(part, name=f"{piece}/{part.name}", visual=f"{piece}/{part.visual}")
-    if part.body:
-        return replace(named, body=part.body + first_joint)
-    return _moved(named, base)
-
-
 def _moved(part: Part, pose: Float[np.ndarray, "4 4"]) -> Part:
     return replace(part, body_from_part=pose @ part.body_from_part, surface=part.surface.copy().apply_transform(pose))
-
-
-def _entity(
-    entity: SimEntity, piece: str, base: Float[np.ndarray, "4 4"], first_joint: int, first_part: int
-) -> SimEntity:
-    fixed = entity.joint < 0
-    return replace(
-        entity,
-        name=f"{piece}/{entity.name}",
-        joint=-1 if fixed else entity.joint + first_joint,
-        point=apply(base, entity.point) if fixed else entity.point,
-        parts=tuple(i + first_part for i in entity.parts),
-    )
-
-
-def _triple(values: Float[np.ndarray, "3"]) -> tuple[float, float, float]:
-    x, y, z = values.tolist()
-    return x, y, z

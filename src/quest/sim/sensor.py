@@ -175,14 +175,8 @@ def sense(
     """A rendered clip as a sensor would have recorded it.
 
     A frame's result depends on the clip's seed, on the frame and on its number, not on other frames. What a sensor
-    does not change comes back as the array that went in.
-
-    Args:
-        rgb: colours.
-        depth_m: depth along +z, metres; 0 where missing.
-        model: the sensor.
-        rng: what noise is drawn from; always advanced by the same amount.
-        camera: intrinsics of the frames.
+    does not change comes back as the array that went in. Depth is along +z, 0 where missing. ``rng`` is always advanced
+    by the same amount.
 
     Raises:
         InputError: colours, depth and camera are not of one size, or depth is negative or not finite.

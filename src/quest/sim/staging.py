@@ -1,4 +1,9 @@
-"""What is played in a take, and from where it is seen, before anything is drawn for good."""
+"""What is played in a take, from where it is seen and what hides it, before anything is drawn for good.
+
+In a take with hidden entities every joint has its share of the script. It starts to move in full view, the occluder
+comes while it moves, the joint moves on and stops while its entity is hidden, and the occluder leaves. The occluder
+stands still as long as it hides: it covers the whole hidden path, so that its motion tells nothing of the entity's.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +12,53 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.spatial import ConvexHull
 from trimesh.bounds import corners
 
 from quest.errors import ObjectError
-from quest.sim.annotate import project_points, visible_entities
-from quest.sim.articulation import apply
+from quest.sim.annotate import entity_points, see_entities
+from quest.sim.articulation import Articulation, apply
 from quest.sim.cameras import CameraPath, PosedCamera, bump, sample_camera_paths
+from quest.sim.entities import MOVES_AT_LEAST
 from quest.sim.gripper import plan_gripper
 from quest.sim.hand import plan_hand
-from quest.sim.motion import FRAMES_PER_S, MotionStyle, long_script, motion_script
+from quest.sim.motion import (
+    FRAMES_PER_S,
+    HOLD_FRAMES,
+    long_script,
+    minimum_jerk,
+    motion_script,
+    sample_opening,
+)
 from quest.sim.objects import SimObject
 from quest.sim.physics import play_physically
-from quest.sim.props import Prop, change_light, disturbed_at
-from quest.sim.pull import Puller
-from quest.sim.renderer import Picture, Renderer, Stage
+from quest.sim.props import (
+    Occluder,
+    Prop,
+    Shape,
+    change_light,
+    disturbed_at,
+    fit_shape,
+    sample_occluder_surface,
+    slide_in,
+)
+from quest.sim.pull import Task
+from quest.sim.renderer import Renderer, Stage
 from quest.sim.settings import TakeSettings
+from quest.sim.suites import HIDDEN_FRAMES, Hiding
 
 PULL_MARGIN = (20, 12)
 """Frames of a joint's share in which a gripper or a hand comes, and goes."""
+SURROUNDINGS = 0.09
+"""Radius of what is hidden around an entity, as a share of the image's width: 20 pixels of 224."""
 
 _CAMERA_ATTEMPTS = 12
+_HIDING_ATTEMPTS = 24
+_AMPLITUDE = (0.75, 1.0)
+_MOVES_HIDDEN = (0.4, 0.7)
+_SEEN_AT_LEAST = 14
+_SLIDE_FRAMES = (2, 3)
 
 
 @dataclass(frozen=True)
@@ -52,9 +83,14 @@ class Playback:
         """Plays every n-th frame of a script."""
         kept = np.arange(0, len(script), every)
         poses = sim_object.articulation.poses(script[kept])
-        points = np.stack([[apply(p[e.body], e.point) for e in sim_object.entities] for p in poses])
+        points = entity_points(sim_object.entities, poses)
         velocity = (np.gradient(script, axis=0) * FRAMES_PER_S)[kept]
-        return cls(kept, script[kept], velocity, poses, points, _swept(sim_object, poses))
+        return cls(kept, script[kept], velocity, poses, points, sim_object.articulation.swept(poses))
+
+    def shows(self, first: int, end: int) -> tuple[int, int]:
+        """Frames of the take that show a range of frames of the script: the first one, and one past the last."""
+        low, high = np.searchsorted(self.kept, [first, end])
+        return int(low), int(high)
 
 
 @dataclass(frozen=True)
@@ -91,65 +127,40 @@ def stage_plain(
             a hand finds nothing to grasp.
     """
     joints = choose_joints(sim_object, level, motion_rng)
-    script = _script(sim_object, joints, motion_rng, settings)
+    style = settings.motion
+    if settings.pulled and style.margin == (0, 0):
+        style = replace(style, margin=PULL_MARGIN)
+    timing = {"frames_per_joint": settings.frames_per_joint, "style": style}
+    if settings.frames is None:
+        script = motion_script(sim_object.articulation, joints, motion_rng, **timing)
+    else:
+        script = long_script(sim_object.articulation, joints, motion_rng, frames=settings.frames, **timing)
+    if settings.physics:
+        script = play_physically(sim_object, script, motion_rng)
     playback = Playback.of(sim_object, script, settings.every)
     if settings.fixed_scene:
-        playback = replace(playback, swept=_reach(sim_object))
+        articulation = sim_object.articulation
+        # Whatever moves: points that bound the object with each of its joints open by itself.
+        playback = replace(playback, swept=articulation.swept(articulation.poses(articulation.each_opened)))
     cameras, stage = _cameras(sim_object, playback, len(script), camera_rng, renderer, settings)
     props: list[Prop] = []
     about: dict[str, Any] = {}
-    puller = _puller(sim_object, script, joints, cameras, props_rng, settings)
-    if puller is not None:
-        props.append(puller)
-        about["grasped"] = [[name, *played_frames(playback.kept, first, end)] for name, first, end in puller.grasps]
+    if settings.pulled:
+        task = Task(sim_object, script, joints, style.margin, settings.frames_per_joint)
+        if settings.gripper:
+            puller = plan_gripper(task, props_rng)
+        else:
+            eyes = np.concatenate([np.linalg.inv(path.cam_from_world[::8])[:, :3, 3] for path in cameras])
+            puller = plan_hand(task, props_rng, eyes)
+        props += puller.parts
+        about["grasped"] = [[name, *playback.shows(first, end)] for name, first, end in puller.grasps]
     if settings.disturbance == "light":
         props.append(change_light(len(script), props_rng))
     if settings.disturbance == "bump":
         at = disturbed_at(len(script), props_rng)
         cameras = tuple(bump(path, at, props_rng) for path in cameras)
-        about["bumped"] = played_frames(playback.kept, at, len(script))[0]
+        about["bumped"] = playback.shows(at, len(script))[0]
     return Staging(joints, playback, cameras, stage, tuple(props), about)
-
-
-def _puller(
-    sim_object: SimObject,
-    script: Float[np.ndarray, "S J"],
-    joints: tuple[int, ...],
-    cameras: tuple[CameraPath, ...],
-    rng: np.random.Generator,
-    settings: TakeSettings,
-) -> Puller | None:
-    """The gripper or the hand that pulls, if the settings say so."""
-    timing = {"margin": _motion_style(settings).margin, "frames_per_joint": settings.frames_per_joint}
-    if settings.gripper:
-        return plan_gripper(sim_object, script, joints, **timing, rng=rng)
-    if settings.hand:
-        seen_from = np.concatenate([np.linalg.inv(path.cam_from_world[::8])[:, :3, 3] for path in cameras])
-        return plan_hand(sim_object, script, joints, **timing, eyes=seen_from, rng=rng)
-    return None
-
-
-def _motion_style(settings: TakeSettings) -> MotionStyle:
-    wanted = settings.motion
-    return replace(wanted, margin=PULL_MARGIN) if settings.pulled and wanted.margin == (0, 0) else wanted
-
-
-def _script(
-    sim_object: SimObject, joints: tuple[int, ...], rng: np.random.Generator, settings: TakeSettings
-) -> Float[np.ndarray, "S J"]:
-    articulation, style = sim_object.articulation, _motion_style(settings)
-    share = settings.frames_per_joint
-    if settings.frames is None:
-        script = motion_script(articulation, joints, rng, frames_per_joint=share, style=style)
-    else:
-        script = long_script(articulation, joints, rng, frames=settings.frames, frames_per_joint=share, style=style)
-    return play_physically(sim_object, script, rng) if settings.physics else script
-
-
-def played_frames(kept: Int[np.ndarray, " T"], first: int, end: int) -> tuple[int, int]:
-    """Frames of the take that show a range of frames of the script: the first one, and one past the last."""
-    low, high = np.searchsorted(kept, [first, end])
-    return int(low), int(high)
 
 
 def choose_joints(
@@ -175,27 +186,12 @@ def choose_joints(
     return tuple(sorted(order, key=lambda j: j not in seen)[:level])
 
 
-def see_entities(
-    sim_object: SimObject, posed: PosedCamera, picture: Picture, points: Float[np.ndarray, "E 3"]
-) -> tuple[Float[np.ndarray, "E 2"], Bool[np.ndarray, " E"]]:
-    """Pixel of every entity in a picture, and which of them are seen."""
-    uv, depth = project_points(points, posed)
-    bodies = [e.body for e in sim_object.entities]
-    return uv, visible_entities(picture, uv, depth, bodies, half_diagonal_m=sim_object.half_diagonal_m)
-
-
-def _swept(sim_object: SimObject, poses: Float[np.ndarray, "T B 4 4"]) -> Float[np.ndarray, "N 3"]:
-    moments = poses[np.unique(np.linspace(0, len(poses) - 1, 16).astype(int))]
-    hulls = sim_object.articulation.body_hulls
-    return np.concatenate([apply(pose[b], hull) for b, hull in enumerate(hulls) if len(hull) for pose in moments])
-
-
-def _reach(sim_object: SimObject) -> Float[np.ndarray, "N 3"]:
-    """World points that bound the object with each of its joints open by itself."""
-    joints = sim_object.articulation.joints
-    rest = sim_object.articulation.rest
-    opened = rest + np.diag([j.opening() for j in joints])
-    return _swept(sim_object, sim_object.articulation.poses(np.stack((rest, *opened))))
+def _paths(
+    points: Float[np.ndarray, "N 3"], frames: int, rng: np.random.Generator, settings: TakeSettings
+) -> tuple[CameraPath, ...]:
+    """Cameras that see some points, as the settings want them."""
+    style, width, height = settings.cameras, settings.width, settings.height
+    return tuple(sample_camera_paths(points, settings.views, frames, rng, style=style, width=width, height=height))
 
 
 def _cameras(
@@ -208,34 +204,220 @@ def _cameras(
 ) -> tuple[tuple[CameraPath, ...], Stage]:
     """Cameras that see an entity at rest in every view, or the best of a few draws; and the object before them."""
     followed = [i for i, e in enumerate(sim_object.entities) if e.label != "hinge"]
-    best: tuple[tuple[int, int], list[CameraPath]] | None = None
+    points = playback.swept if sim_object.view_m is None else corners(sim_object.view_m)
+    drawn: list[tuple[tuple[int, int], tuple[CameraPath, ...]]] = []
     stage: Stage | None = None
-    for _ in range(_CAMERA_ATTEMPTS):
-        paths = sample_camera_paths(
-            playback.swept if sim_object.view_m is None else corners(sim_object.view_m),
-            settings.views,
-            frames,
-            rng,
-            style=settings.cameras,
-            width=settings.width,
-            height=settings.height,
-        )
+    while len(drawn) < _CAMERA_ATTEMPTS and not (drawn and drawn[-1][0][0] == settings.views):
+        paths = _paths(points, frames, rng, settings)
         cameras = [path.at(0) for path in paths]
-        if stage is None:
-            stage = renderer.stage(sim_object, cameras)  # only geometry matters here: it stays dark
-            stage.pose(playback.poses[0])
+        stage = stage or renderer.stage(sim_object, cameras)  # only geometry matters here: it stays dark
+        stage.pose(playback.poses[0])
         stage.aim(cameras)
-        seen = np.stack(
-            [
-                see_entities(sim_object, camera, picture, playback.points[0])[1][followed]
-                for camera, picture in zip(cameras, stage.pictures(), strict=True)
-            ]
-        )
-        score = (int(seen.any(axis=1).sum()), int(seen.any(axis=0).sum()))
-        if best is None or score > best[0]:
-            best = (score, paths)
-        if score[0] == len(cameras):
-            break
-    assert best is not None
+        looks = zip(cameras, stage.pictures(), strict=True)
+        seen = np.stack([see_entities(sim_object, *look, playback.points[0])[1][followed] for look in looks])
+        drawn.append(((int(seen.any(axis=1).sum()), int(seen.any(axis=0).sum())), paths))
     assert stage is not None
-    return tuple(best[1]), stage
+    return max(drawn, key=lambda draw: draw[0])[1], stage
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One joint's share of the script; ends are one past the last frame."""
+
+    joint: int
+    start: int
+    moves: int
+    """First frame at which the joint is elsewhere."""
+    hidden: int
+    """First frame at which its entity is hidden."""
+    stops: int
+    """First frame at which the joint has stopped."""
+    shown: int
+    """End of the hidden frames."""
+    end: int
+    """End of the share."""
+    slide: int
+    """Frames that the occluder takes to come, and to go."""
+
+    def away(self, frames: int) -> Float[np.ndarray, " T"]:
+        """How far the occluder is at every frame of the script: 0 while it hides, 1 while it is out of the image."""
+        t = np.arange(frames)
+        gap = np.maximum(np.maximum(self.hidden - t, t - self.shown + 1), 0)
+        return np.minimum(gap / (self.slide + 1), 1.0)
+
+
+@dataclass(frozen=True)
+class _Hidden:
+    """An entity, the episode in which it is hidden, and what hides it."""
+
+    entity: int
+    episode: Episode
+    shape: Shape
+
+
+def stage_occlusion(
+    sim_object: SimObject,
+    level: int,
+    motion_rng: np.random.Generator,
+    camera_rng: np.random.Generator,
+    occluder_rng: np.random.Generator,
+    *,
+    hiding: Hiding,
+    renderer: Renderer,
+    settings: TakeSettings,
+) -> Staging:
+    """A take in which entities are hidden, seen by one camera that stands still.
+
+    Of up to 24 draws of joints, motion and camera the first is taken in which every joint's entity can be hidden: it is
+    seen before and after, and look-alikes are in view or not, as wanted. With several joints, a draw in which
+    two of them can be hidden is kept in reserve.
+
+    Raises:
+        ConfigError: more than one view is wanted, or what cannot be had together with hidden entities.
+        ObjectError: the object has too few joints, or no draw is good enough.
+    """
+    hiding.check(settings)
+    among = _joints_with_look_alikes(sim_object) if hiding.look_alike else sim_object.movable
+    hidden = hiding.frames or int(occluder_rng.integers(HIDDEN_FRAMES[0], HIDDEN_FRAMES[1] + 1))
+    stage: Stage | None = None
+    best: tuple[tuple[int, ...], Float[np.ndarray, "S J"], CameraPath] | None = None
+    found: list[_Hidden] = []
+    for _ in range(_HIDING_ATTEMPTS):
+        joints = choose_joints(sim_object, level, motion_rng, among=among)
+        script, episodes = occlusion_script(sim_object.articulation, joints, hiding, hidden, motion_rng)
+        playback = Playback.of(sim_object, script)
+        (path,) = _paths(playback.swept, len(script), camera_rng, settings)
+        camera = path.at(0)
+        stage = stage or renderer.stage(sim_object, [camera])  # geometry matters, not light
+        stage.aim([camera])
+        now = [_hide(sim_object, playback, e, camera, hiding, occluder_rng, stage) for e in episodes]
+        now = [h for h in now if h is not None]
+        if len(now) >= min(level, 2) and len(now) > len(found):
+            best, found = (joints, script, path), now
+        if len(now) == level:
+            break
+    if best is None or stage is None:
+        beside = "beside a look-alike that stays in view" if hiding.look_alike else "with no look-alike in view"
+        raise ObjectError(
+            f"{sim_object.object_id}: expected a view in which a moving entity is seen before and after, and can be "
+            f"hidden {beside}, found none in {_HIDING_ATTEMPTS} draws; use another seed or another object"
+        )
+    joints, script, path = best
+    occluders = []
+    for h in found:
+        surface = sample_occluder_surface(occluder_rng)
+        poses = slide_in(h.shape, path.at(0), h.episode.away(len(script)), occluder_rng)
+        occluders.append(Occluder(h.shape, surface, poses))
+    playback = Playback.of(sim_object, script, settings.every)
+    frames = [[sim_object.entities[h.entity].name, *playback.shows(h.episode.hidden, h.episode.shown)] for h in found]
+    about = {"look_alike": hiding.look_alike, "hidden": frames}
+    return Staging(joints, playback, (path,), stage, tuple(occluders), about)
+
+
+def occlusion_script(
+    articulation: Articulation, joints: tuple[int, ...], hiding: Hiding, hidden: int, rng: np.random.Generator
+) -> tuple[Float[np.ndarray, "S J"], list[Episode]]:
+    """Joint positions at every frame, and what happens when.
+
+    Every joint has one share, in which its entity is hidden for ``hidden`` frames.
+    """
+    episodes: list[Episode] = []
+    movements: list[Float[np.ndarray, " N"]] = []
+    start = 0
+    for joint in joints:
+        before, after = (int(rng.integers(low, high + 1)) for low, high in (hiding.before, hiding.after))
+        # The joint stops well before it is shown again; at least half of its way is seen before it is hidden.
+        unseen = max(1, round(rng.uniform(*_MOVES_HIDDEN) * hidden))
+        room = before - (HOLD_FRAMES if start == 0 else 0)
+        seen = min(max(_SEEN_AT_LEAST, round(1.5 * unseen)), room)
+        unseen = min(unseen, seen)
+        at = start + before
+        slide = int(rng.integers(_SLIDE_FRAMES[0], _SLIDE_FRAMES[1] + 1))
+        end = at + hidden + after
+        episodes.append(Episode(joint, start, at - seen, at, at + unseen, at + hidden, end, slide))
+        way = minimum_jerk(np.arange(1, seen + unseen + 1) / (seen + unseen))
+        movements.append(rng.uniform(*_AMPLITUDE) * sample_opening(articulation, joint, rng) * way)
+        start = end
+    position = np.tile(articulation.rest, (start, 1))
+    for e, movement in zip(episodes, movements, strict=True):
+        position[e.moves : e.stops, e.joint] += movement
+        position[e.stops :, e.joint] += movement[-1]
+    return position, episodes
+
+
+def _joints_with_look_alikes(sim_object: SimObject) -> tuple[int, ...]:
+    """Movable joints with an entity whose label an entity on another joint bears too."""
+    followed = [e for e in sim_object.entities if e.label != "hinge"]
+    alike = {a.joint for a in followed for b in followed if a.label == b.label and a.joint != b.joint}
+    joints = tuple(j for j in sim_object.movable if j in alike)
+    if not joints:
+        raise ObjectError(
+            f"{sim_object.object_id}: expected moving joints with entities of the same label, found none; use an "
+            "object with several doors or drawers, or hide entities alone"
+        )
+    return joints
+
+
+def _hide(
+    sim_object: SimObject,
+    playback: Playback,
+    episode: Episode,
+    posed: PosedCamera,
+    hiding: Hiding,
+    rng: np.random.Generator,
+    stage: Stage,
+) -> _Hidden | None:
+    """What can be hidden of an episode's entities as wanted, from one camera."""
+    looks = []
+    for t in (
+        max(episode.start - 1, 0),
+        (episode.moves + episode.hidden) // 2,
+        episode.hidden - episode.slide - 1,
+        (episode.hidden + episode.stops) // 2,
+        episode.end - 1,
+    ):
+        stage.pose(playback.poses[t])
+        (picture,) = stage.pictures()
+        looks.append(see_entities(sim_object, posed, picture, playback.points[t]))
+    uv, visible = (np.stack(each) for each in zip(*looks, strict=True))
+    # The first entity of the moving joint that is seen at rest, on its way, before it is hidden and at the end.
+    seen = np.logical_and.reduce(visible[[0, 1, 2, 4]], axis=0)
+    own = [i for i, e in enumerate(sim_object.entities) if e.joint == episode.joint and e.label != "hinge" and seen[i]]
+    if not own:
+        return None
+    entity, label = own[0], sim_object.entities[own[0]].label
+    # What moves less in view tells nothing of its joint.
+    moved_m = np.linalg.norm(playback.points[episode.hidden - 1, entity] - playback.points[episode.start, entity])
+    alike = [i for i, e in enumerate(sim_object.entities) if e.label == label and i != entity]
+    if moved_m < MOVES_AT_LEAST * sim_object.half_diagonal_m or (not hiding.look_alike and visible[:, alike].any()):
+        return None
+    slopes = slopes_to_hide(sim_object, playback, entity, episode, posed)
+    nearest_m = float(apply(posed.cam_from_world, playback.swept)[:, 2].min())
+    shape = fit_shape(slopes, posed, nearest_m, rng) if nearest_m > 0 else None
+    if shape is None:
+        return None
+    if hiding.look_alike:
+        camera = posed.camera
+        slope = (uv[2:] - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
+        beside = [i for i in alike if sim_object.entities[i].joint != episode.joint and visible[2:, i].all()]
+        if all(shape.hides(slope[:, i]).any() for i in beside):
+            return None
+    return _Hidden(entity, episode, shape)
+
+
+def slopes_to_hide(
+    sim_object: SimObject, playback: Playback, entity: int, episode: Episode, posed: PosedCamera
+) -> Float[np.ndarray, "N 2"]:
+    """Rays, as x / z and y / z, that bound an entity and its surroundings on its whole hidden path."""
+    e, camera = sim_object.entities[entity], posed.camera
+    angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+    disc = np.stack((np.cos(angle), np.sin(angle)), axis=-1) * SURROUNDINGS * camera.width / [camera.fx, camera.fy]
+    parts = [np.asarray(sim_object.articulation.parts[i].surface.vertices) for i in e.parts]
+    mesh = np.concatenate([e.point[None], *parts])
+    slopes = []
+    for t in range(episode.hidden, episode.stops + 1):
+        points = apply(posed.cam_from_world, apply(playback.poses[t, e.body], mesh))
+        rays = points[:, :2] / points[:, 2:]
+        slopes += [rays, rays[:1] + disc]
+    rays = np.concatenate(slopes)
+    return rays[ConvexHull(rays).vertices]

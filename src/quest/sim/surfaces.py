@@ -6,7 +6,7 @@ others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -56,8 +56,9 @@ def paint(texture: Texture, *, size: int = 128) -> UInt8[np.ndarray, "S S 4"]:
 _Field = Float[np.ndarray, "S S"]
 
 
-def _noise(rng: np.random.Generator, size: int, *, falloff: float, stretch: float = 1.0) -> _Field:
+def _noise(rng: np.random.Generator, u: _Field, falloff: float, stretch: float = 1.0) -> _Field:
     """Periodic noise of zero mean and unit spread; ``stretch`` > 1 draws it out along x."""
+    size = len(u)
     fy, fx = np.meshgrid(np.fft.fftfreq(size) * size, np.fft.rfftfreq(size) * size, indexing="ij")
     radius = np.hypot(fx * stretch, fy)
     radius[0, 0] = 1.0
@@ -67,34 +68,14 @@ def _noise(rng: np.random.Generator, size: int, *, falloff: float, stretch: floa
     return field / field.std()
 
 
-def _cell_values(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> _Field:
-    values = rng.standard_normal((n, n))
-    return values[(v * n).astype(int) % n, (u * n).astype(int) % n]
-
-
-def _draw_noise(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    field = _noise(rng, len(u), falloff=1.6)
-    return 0.5 + 0.25 * field, 0.03 * _noise(rng, len(u), falloff=0.3)
-
-
-def _draw_stripes(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    share = rng.uniform(0.2, 0.6)
-    return ((v * 2 * n) % 1 < share).astype(float), 0.03 * _noise(rng, len(u), falloff=1.0)
-
-
-def _draw_checker(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    odd = ((u * 2 * n).astype(int) + (v * 2 * n).astype(int)) % 2
-    return odd.astype(float), 0.03 * _noise(rng, len(u), falloff=1.0)
-
-
 def _grain(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    warp = 0.12 * _noise(rng, len(u), falloff=2.0, stretch=3.0)
+    warp = 0.12 * _noise(rng, u, 2.0, stretch=3.0)
     rings = 0.5 + 0.5 * np.sin(2 * np.pi * (2 * n * v + 3 * warp))
-    fine = _noise(rng, len(u), falloff=0.5, stretch=12.0)
+    fine = _noise(rng, u, 0.5, stretch=12.0)
     return 0.55 * rings**2 + 0.12 * fine, 0.03 * fine
 
 
-def _draw_planks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+def _planks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
     mix, shade = _grain(rng, u, v, 2 * n)
     rows = 2 * n
     row = (v * rows).astype(int) % rows
@@ -104,52 +85,44 @@ def _draw_planks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tupl
     return 0.7 * mix, shade + tone - 0.45 * joint
 
 
-def _draw_tiles(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    width = rng.uniform(0.03, 0.08)
-    grout = (((u * 2 * n) % 1) < width) | (((v * 2 * n) % 1) < width)
-    return grout.astype(float), 0.07 * _cell_values(rng, u, v, 2 * n) * ~grout + 0.02 * _noise(rng, len(u), falloff=1.0)
+def _tiles(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    n, width = 2 * n, rng.uniform(0.03, 0.08)
+    grout = (((u * n) % 1) < width) | (((v * n) % 1) < width)
+    tone = rng.standard_normal((n, n))[(v * n).astype(int) % n, (u * n).astype(int) % n]
+    return grout.astype(float), 0.07 * tone * ~grout + 0.02 * _noise(rng, u, 1.0)
 
 
-def _draw_speckle(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    grains = _noise(rng, len(u), falloff=0.4) > rng.uniform(0.6, 1.4)
-    return grains.astype(float), 0.05 * _noise(rng, len(u), falloff=0.8)
-
-
-def _draw_brushed(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    return 0.5 + 0.2 * _noise(rng, len(u), falloff=0.4, stretch=25.0), np.zeros_like(u)
-
-
-def _draw_marble(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+def _marble(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
     # Veins run where a slow field crosses zero; some are broad and faint, others thin and dark.
-    broad = np.exp(-(np.abs(_noise(rng, len(u), falloff=1.7)) / 0.22))
-    thin = np.exp(-(np.abs(_noise(rng, len(u), falloff=1.5)) / 0.05))
-    return 0.45 * broad + 0.55 * thin * rng.uniform(0.5, 1.0), 0.05 * _noise(rng, len(u), falloff=1.6)
+    broad = np.exp(-(np.abs(_noise(rng, u, 1.7)) / 0.22))
+    thin = np.exp(-(np.abs(_noise(rng, u, 1.5)) / 0.05))
+    return 0.45 * broad + 0.55 * thin * rng.uniform(0.5, 1.0), 0.05 * _noise(rng, u, 1.6)
 
 
-def _draw_bricks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+def _bricks(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
     rows, across = 4 * n, 2 * n
     row = (v * rows).astype(int) % rows
     x = (u + 0.5 / across * (row % 2)) % 1
     width = rng.uniform(0.05, 0.12)
     mortar = ((v * rows) % 1 < width) | ((x * across) % 1 < 0.5 * width)
     tone = rng.standard_normal((rows, across))[row, (x * across).astype(int) % across]
-    return mortar.astype(float), 0.09 * tone * ~mortar + 0.05 * _noise(rng, len(u), falloff=0.8)
+    return mortar.astype(float), 0.09 * tone * ~mortar + 0.05 * _noise(rng, u, 0.8)
 
 
-def _draw_concrete(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    pores = _noise(rng, len(u), falloff=0.7) > 2.2
-    return 0.25 + 0.08 * _noise(rng, len(u), falloff=1.5), 0.03 * _noise(rng, len(u), falloff=0.4) - 0.2 * pores
+def _concrete(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    pores = _noise(rng, u, 0.7) > 2.2
+    return 0.25 + 0.08 * _noise(rng, u, 1.5), 0.03 * _noise(rng, u, 0.4) - 0.2 * pores
 
 
-def _draw_weave(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+def _weave(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
     threads = 16 * n
     warp, weft = np.abs(np.sin(np.pi * threads * u)), np.abs(np.sin(np.pi * threads * v))
     over = ((u * threads).astype(int) + (v * threads).astype(int)) % 2 == 0
     shade = 0.25 * (np.where(over, warp, weft) - 0.7)
-    return np.where(over, 0.0, rng.uniform(0.4, 1.0)), shade + 0.03 * _noise(rng, len(u), falloff=0.5)
+    return np.where(over, 0.0, rng.uniform(0.4, 1.0)), shade + 0.03 * _noise(rng, u, 0.5)
 
 
-def _draw_scratched(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+def _scratched(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
     marks = np.zeros_like(u)
     for _ in range(int(rng.integers(8, 24)) * n):
         x, y, turn = rng.random(), rng.random(), rng.uniform(0, np.pi)
@@ -157,11 +130,11 @@ def _draw_scratched(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> t
         along, across = du * np.cos(turn) + dv * np.sin(turn), dv * np.cos(turn) - du * np.sin(turn)
         inside = (np.abs(along) < rng.uniform(0.03, 0.2)) & (np.abs(across) < rng.uniform(0.003, 0.006))
         marks = np.maximum(marks, inside * rng.uniform(0.4, 1.0))
-    return marks, 0.03 * _noise(rng, len(u), falloff=1.2)
+    return marks, 0.03 * _noise(rng, u, 1.2)
 
 
-def _draw_stickers(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
-    mix, shade = np.zeros_like(u), 0.02 * _noise(rng, len(u), falloff=1.0)
+def _stickers(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tuple[_Field, _Field]:
+    mix, shade = np.zeros_like(u), 0.02 * _noise(rng, u, 1.0)
     for _ in range(int(rng.integers(2, 5)) * n):
         x, y, size = rng.random(), rng.random(), rng.uniform(0.04, 0.1)
         du, dv = (u - x + 0.5) % 1 - 0.5, (v - y + 0.5) % 1 - 0.5
@@ -174,22 +147,32 @@ def _draw_stickers(rng: np.random.Generator, u: _Field, v: _Field, n: int) -> tu
     return mix, shade
 
 
-_PATTERNS = {
-    "noise": _draw_noise,
-    "stripes": _draw_stripes,
-    "checker": _draw_checker,
+_PATTERNS: dict[str, Callable[[np.random.Generator, _Field, _Field, int], tuple[_Field, _Field]]] = {
+    "noise": lambda rng, u, v, n: (0.5 + 0.25 * _noise(rng, u, 1.6), 0.03 * _noise(rng, u, 0.3)),
+    "stripes": lambda rng, u, v, n: (
+        ((v * 2 * n) % 1 < rng.uniform(0.2, 0.6)).astype(float),
+        0.03 * _noise(rng, u, 1.0),
+    ),
+    "checker": lambda rng, u, v, n: (
+        (((u * 2 * n).astype(int) + (v * 2 * n).astype(int)) % 2).astype(float),
+        0.03 * _noise(rng, u, 1.0),
+    ),
     "wood": _grain,
-    "planks": _draw_planks,
-    "tiles": _draw_tiles,
-    "speckle": _draw_speckle,
-    "brushed": _draw_brushed,
-    "marble": _draw_marble,
-    "bricks": _draw_bricks,
-    "concrete": _draw_concrete,
-    "weave": _draw_weave,
-    "scratched": _draw_scratched,
-    "stickers": _draw_stickers,
+    "planks": _planks,
+    "tiles": _tiles,
+    "speckle": lambda rng, u, v, n: (
+        (_noise(rng, u, 0.4) > rng.uniform(0.6, 1.4)).astype(float),
+        0.05 * _noise(rng, u, 0.8),
+    ),
+    "brushed": lambda rng, u, v, n: (0.5 + 0.2 * _noise(rng, u, 0.4, stretch=25.0), np.zeros_like(u)),
+    "marble": _marble,
+    "bricks": _bricks,
+    "concrete": _concrete,
+    "weave": _weave,
+    "scratched": _scratched,
+    "stickers": _stickers,
 }
+"""Share of the second colour, and shade, over an image; from horizontal and vertical places in [0, 1) and repeats."""
 
 
 TILE_M = 0.5
@@ -212,21 +195,26 @@ class Surface:
     """Colours instead of ``colour``, or None."""
 
 
+_COLOURS = (
+    ((0.04, 0.12), (0.2, 0.75), (0.2, 0.9)),  # wood
+    ((0.0, 1.0), (0.0, 0.1), (0.35, 0.97)),  # white to grey
+    ((0.0, 1.0), (0.1, 0.7), (0.3, 0.9)),  # paint
+    ((0.0, 1.0), (0.0, 0.3), (0.12, 0.28)),  # nearly black
+)
+"""Hue, saturation and value of the colours that furniture and rooms have."""
+_HANDLES = (
+    ((1.0, 1.0, 1.0), (0.6, 0.9), (0.25, 0.5), (0.4, 0.85), 0.5),  # steel
+    ((1.0, 1.0, 1.0), (0.03, 0.15), (0.3, 0.9), 0.0, 0.4),  # black
+    ((1.0, 0.8, 0.45), (0.55, 0.9), (0.25, 0.5), (0.4, 0.8), 0.5),  # brass
+    ((0.93, 0.93, 0.91), 1.0, (0.3, 0.7), 0.0, 0.4),  # white
+)
+"""Tint, brightness, roughness, metallic and specular of handles: numbers, or ranges that they are drawn from."""
+
+
 def sample_colour(rng: np.random.Generator) -> Colour:
     """Draw a colour that furniture and rooms have: wood, white to grey, paint, nearly black."""
-    family = rng.choice(4, p=[0.35, 0.32, 0.26, 0.07])
-    if family == 0:  # wood
-        hue, saturation, value = rng.uniform(0.04, 0.12), rng.uniform(0.2, 0.75), rng.uniform(0.2, 0.9)
-    elif family == 1:  # white to grey
-        hue, saturation, value = rng.random(), rng.uniform(0.0, 0.1), rng.uniform(0.35, 0.97)
-    elif family == 2:  # paint
-        hue, saturation, value = rng.random(), rng.uniform(0.1, 0.7), rng.uniform(0.3, 0.9)
-    else:  # nearly black
-        hue, saturation, value = rng.random(), rng.uniform(0.0, 0.3), rng.uniform(0.12, 0.28)
-    return _from_hsv(float(hue), float(saturation), float(value))
-
-
-def _from_hsv(hue: float, saturation: float, value: float) -> Colour:
+    family = _COLOURS[int(rng.choice(4, p=[0.35, 0.32, 0.26, 0.07]))]
+    hue, saturation, value = (float(rng.uniform(*channel)) for channel in family)
     rgb = np.clip(np.abs((hue * 6 + np.array([0.0, 4.0, 2.0])) % 6 - 3) - 1, 0, 1)
     return triple(value * (1 - saturation * (1 - rgb)))
 
@@ -250,20 +238,12 @@ def sample_surface(
 
 def sample_handle_surface(rng: np.random.Generator) -> Surface:
     """Draw a material for handles: steel, black, brass, white, or anything."""
-    kind = rng.choice(5, p=[0.4, 0.2, 0.15, 0.1, 0.15])
-    if kind == 0:  # steel
-        grey = float(rng.uniform(0.6, 0.9))
-        return Surface((grey, grey, grey), float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.4, 0.85)), 0.5)
-    if kind == 1:  # black
-        grey = float(rng.uniform(0.03, 0.15))
-        return Surface((grey, grey, grey), float(rng.uniform(0.3, 0.9)), 0.0, 0.4)
-    if kind == 2:  # brass
-        value = float(rng.uniform(0.55, 0.9))
-        colour = (value, 0.8 * value, 0.45 * value)
-        return Surface(colour, float(rng.uniform(0.25, 0.5)), float(rng.uniform(0.4, 0.8)), 0.5)
-    if kind == 3:  # white
-        return Surface((0.93, 0.93, 0.91), float(rng.uniform(0.3, 0.7)), 0.0, 0.4)
-    return sample_surface(rng, kinds=("wood", "noise"), textured=0.3)
+    kind = int(rng.choice(5, p=[0.4, 0.2, 0.15, 0.1, 0.15]))
+    if kind == len(_HANDLES):
+        return sample_surface(rng, kinds=("wood", "noise"), textured=0.3)
+    tint, *rest = _HANDLES[kind]
+    value, roughness, metallic, specular = (float(rng.uniform(*x)) if isinstance(x, tuple) else x for x in rest)
+    return Surface(triple(value * np.array(tint)), roughness, metallic, specular)
 
 
 def sample_glass_surface(rng: np.random.Generator) -> Surface:
