@@ -47,7 +47,7 @@ from quest.sim.hand_pose import (
     pose_hand,
 )
 from quest.sim.objects import SimObject
-from quest.sim.procedural.model import Mesh, join
+from quest.sim.procedural.shapes import Mesh, join
 from quest.sim.pull import Pull, Puller, plan_pull
 from quest.sim.surfaces import Surface, make_material, sample_colour, sample_surface, triple
 

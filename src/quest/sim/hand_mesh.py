@@ -10,7 +10,7 @@ from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
 from quest.sim.hand_pose import UPPER_ARM_M
-from quest.sim.procedural.model import Mesh
+from quest.sim.procedural.shapes import Mesh
 from quest.sim.surfaces import TILE_M
 
 _SIDES = 28

@@ -23,8 +23,9 @@ from quest.sim.entities import SimEntity
 from quest.sim.objects import SimObject, find_things, load_thing
 from quest.sim.procedural.catalogue import make_object
 from quest.sim.procedural.clutter import things_on
-from quest.sim.procedural.model import Dice, Mesh, as_visual, box
+from quest.sim.procedural.model import Dice, as_visual
 from quest.sim.procedural.model import Part as ModelPart
+from quest.sim.procedural.shapes import Mesh, box
 
 _SMALLEST_M = 0.15
 """Half diagonal; what is smaller cannot be seen from where a room can."""

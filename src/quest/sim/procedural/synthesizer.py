@@ -12,7 +12,8 @@ from jaxtyping import Float
 from quest.errors import MissingExtraError
 from quest.extras import install_command
 from quest.sim.procedural.handles import HandleStyle, handle_part, sample_style
-from quest.sim.procedural.model import Dice, Link, Mesh, ObjectModel, Part, box, join, polygon_flat
+from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
+from quest.sim.procedural.shapes import Mesh, box, join, polygon_flat
 
 _OWN_HANDLE_SHARE = 0.5
 _BARE_SHARE = 0.06
