@@ -16,7 +16,6 @@ from numpy.random import Generator
 
 from quest.sim.procedural.shapes import Mesh
 from quest.sim.urdf import MeshData, Urdf, UrdfJoint, UrdfVisual, pose_matrix
-from quest.types import GRIPS
 
 _T = TypeVar("_T")
 
@@ -84,11 +83,6 @@ class Link:
     """Unit direction of the joint in the object's frame."""
     upper: float
     """Upper limit in radians or metres; the lower one is 0, which is closed."""
-
-    @property
-    def has_handle(self) -> bool:
-        """Whether a handle or a knob is among the parts."""
-        return any(part.role in GRIPS for part in self.parts)
 
 
 @dataclass(frozen=True)
