@@ -111,6 +111,13 @@ def write_cabinet(folder: Path) -> Path:
     return write_object(folder, CARCASS, DRAWER, DOOR)
 
 
+def edit(folder: Path, old: str, new: str) -> Path:
+    """Replaces some text of an object's URDF."""
+    urdf = folder / "mobility.urdf"
+    urdf.write_text(urdf.read_text().replace(old, new))
+    return urdf
+
+
 def articulation(*joints: tuple[str, float, float]) -> Articulation:
     """Joints of a kind with limits, without any geometry, all on the base."""
     records = tuple(
