@@ -142,7 +142,7 @@ def test_no_picture_comes_from_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(picture())
     text = LOOKS.replace("bark oak.png", str(tmp_path / "secret.png"))
     files = {"lib/cupboard/cupboard.obj": CUPBOARD.encode(), "lib/cupboard/it.mtl": text.encode()}
-    (made,) = run(write_library(tmp_path / "a.sh3f", {}, **files), tmp_path / "out")
+    (made,) = run(write_library(tmp_path / "a.sh3f", {}, PROPERTIES, **files), tmp_path / "out")
     assert "secret.png' is missing" in made.warnings[0]
     assert not list((tmp_path / "out").rglob("*.png"))
 

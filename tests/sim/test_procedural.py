@@ -79,7 +79,8 @@ def test_models_are_always_the_same_and_their_meshes_are_sound(category: str) ->
     model, other = (build_model(category, seed) for seed in (0, 1))
     for old, new in zip(all_parts(model), all_parts(catalogue.build_model(category, 0)), strict=True):
         np.testing.assert_array_equal(old.mesh.vertices, new.mesh.vertices)
-    assert not np.array_equal(*(join([part.mesh for part in each.body]).vertices for each in (model, other)))
+    first, second = (join([part.mesh for part in each.body]).vertices for each in (model, other))
+    assert not np.array_equal(first, second)
     for part in (*all_parts(model), *all_parts(other)):
         a, b, c = triangles(part.mesh)
         assert is_closed(part.mesh), part.role
