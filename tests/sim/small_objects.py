@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from quest.sim.articulation import ArticulatedJoint, Articulation
+from quest.sim.articulation import ArticulatedJoint, Articulation, apply
+from quest.sim.entities import SimEntity
+from quest.sim.objects import SimObject
 from quest.types import Joint
 
 
@@ -116,6 +118,11 @@ def edit(folder: Path, old: str, new: str) -> Path:
     urdf = folder / "mobility.urdf"
     urdf.write_text(urdf.read_text().replace(old, new))
     return urdf
+
+
+def in_world(thing: SimObject, entity: SimEntity) -> np.ndarray:
+    """Where an entity is at rest."""
+    return apply(thing.articulation.poses(thing.articulation.rest)[entity.body], entity.point)
 
 
 def articulation(*joints: tuple[str, float, float]) -> Articulation:

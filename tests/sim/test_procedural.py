@@ -18,7 +18,6 @@ pytest.importorskip("scene_synthesizer", reason="scene-synthesizer is not instal
 
 build_model = cache(catalogue.build_model)
 
-HANDLES = ("handle", "knob")
 THINGS = ("eyeglasses", "sunglasses", "stapler", "bucket", "pot")
 """What is no furniture: small, turned in other ways, or held by what is not on a front."""
 FURNITURE = [category for category in CATEGORIES if category not in THINGS]
@@ -46,23 +45,13 @@ def is_closed(mesh: Mesh) -> bool:
     return bool(np.array_equal(np.sort(edges @ [count, 1]), np.sort(edges @ [1, count])))
 
 
-def has_handle(link: Link) -> bool:
-    return any(part.role in HANDLES for part in link.parts)
-
-
 def moving(category: str, model: ObjectModel) -> list[Link]:
     """Links that are more than a dial, where a category has dials."""
-    dials = category.startswith("dial_")
-    return [link for link in model.links if not dials or any(part.role not in HANDLES for part in link.parts)]
+    return [link for link in model.links if link.rest or not category.startswith("dial_")]
 
 
 def all_parts(model: ObjectModel) -> list:
     return [*model.body, *(part for link in model.links for part in link.parts)]
-
-
-def rest_of(link: Link) -> Mesh:
-    """All of a link but its handles."""
-    return join([part.mesh for part in link.parts if part.role not in HANDLES])
 
 
 def in_object(link: Link, mesh: Mesh, position: float = 0.0) -> np.ndarray:
@@ -106,8 +95,8 @@ def test_furniture_has_real_sizes_opens_to_the_front_and_its_handles_stand_out_o
             assert opened[:, 1].min() < front - 0.05 or opened[:, 2].max() > top + 0.1
             if category in ("room_door", "toolbox", "washing_machine"):
                 continue  # both faces, a lid, and a round door
-            board = rest_of(link).bounds
-            for low, high in (part.mesh.bounds for part in link.parts if part.role in HANDLES):
+            board = join([part.mesh for part in link.rest]).bounds
+            for low, high in (part.mesh.bounds for part in link.grips):
                 assert low[1] < board[0, 1] - 0.01  # out of the foremost face
                 assert high[1] > board[0, 1] - 0.004  # no gap behind its foot
                 assert high[1] < board[0, 1] + 0.06  # not sunk
@@ -129,7 +118,7 @@ def test_closed_fronts_do_not_overlap(category: str) -> None:
 @pytest.mark.parametrize(("category", "seed"), [("lockers", 5), *(("locker_bank", seed) for seed in range(3))])
 def test_lockers_are_identical(category: str, seed: int) -> None:
     first, *others = build_model(category, seed).links
-    assert category != "locker_bank" or (len(others) == 15 and has_handle(first))
+    assert category != "locker_bank" or (len(others) == 15 and first.grips)
     for link in others:
         for a, b in zip(first.parts, link.parts, strict=True):
             np.testing.assert_allclose(a.mesh.vertices, b.mesh.vertices, atol=1e-9)
@@ -138,8 +127,9 @@ def test_lockers_are_identical(category: str, seed: int) -> None:
 @pytest.mark.slow
 def test_half_of_the_mix_has_four_handled_joints() -> None:
     models = [build_model(category_for_seed(seed), seed) for seed in range(60)]
-    assert np.mean([sum(map(has_handle, model.links)) >= 4 for model in models]) >= 0.5
-    assert 0.6 < np.mean([has_handle(link) for model in models for link in model.links]) < 0.98  # some are bare
+    handled = [[bool(link.grips) for link in model.links] for model in models]
+    assert np.mean([sum(links) >= 4 for links in handled]) >= 0.5
+    assert 0.6 < np.mean([grips for links in handled for grips in links]) < 0.98  # some are bare on purpose
 
 
 FIRST_SIX = ["refrigerator", "cabinet", "dishwasher", "cabinet", "wall_cabinet", "wall_unit"]
@@ -158,7 +148,7 @@ def test_mixes_know_their_categories_and_are_stable() -> None:
 def test_bare_furniture_has_no_handles(category: str) -> None:
     for model in (build_model(category, seed) for seed in range(3)):
         assert model.links
-        assert not any(map(has_handle, model.links))
+        assert not any(link.grips for link in model.links)
 
 
 def test_drawers_of_apron_tables_are_flat_and_between_the_legs() -> None:
@@ -174,12 +164,12 @@ def test_drawers_of_apron_tables_are_flat_and_between_the_legs() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("category", starting("long_"))
 def test_long_handles_run_along_their_fronts(category: str) -> None:
-    links = [link for seed in range(4) for link in build_model(category, seed).links if has_handle(link)]
+    links = [link for seed in range(4) for link in build_model(category, seed).links if link.grips]
     assert len(links) >= 4
     for link in links:
-        (handle,) = [part.mesh.bounds for part in link.parts if part.role in HANDLES]
+        (handle,) = (part.mesh.bounds for part in link.grips)
         along = 2 if link.kind == "revolute" and abs(link.axis[2]) > 0.5 else 0
-        low, high = rest_of(link).bounds[:, along]
+        low, high = join([part.mesh for part in link.rest]).bounds[:, along]
         if high - low < 0.12:
             continue  # a strip may keep its own
         assert 0.4 < np.ptp(handle[:, along]) / (high - low) < 1.0
@@ -199,7 +189,7 @@ def test_clutter_adds_nothing_to_take_hold_of(category: str) -> None:
             assert (link.kind, link.axis, link.upper) == (other.kind, other.axis, other.upper)
             np.testing.assert_allclose(np.asarray(other.origin) - link.origin, (0, 0, raised), atol=1e-9)
             assert other.parts[: len(link.parts)] == link.parts
-            grips = [part.mesh.bounds[:, [0, 2]] for part in link.parts if part.role in HANDLES]
+            grips = [part.mesh.bounds[:, [0, 2]] for part in link.grips]
             for part in other.parts[len(link.parts) :]:
                 added.add(part.role)
                 low, high = part.mesh.bounds[:, [0, 2]]
@@ -219,7 +209,7 @@ def test_dials_turn_in_place_on_a_panel_that_is_free(category: str) -> None:
         panel = [part.mesh.bounds[:, 0] for part in model.body if part.role == "control_panel"][-1]
         dials = model.links[len(plain.links) :]
         assert 1 <= len(dials) <= 7
-        closed = [in_object(link, part.mesh) for link in plain.links for part in link.parts if part.role not in HANDLES]
+        closed = [in_object(link, part.mesh) for link in plain.links for part in link.rest]
         for dial in dials:
             assert (dial.kind, dial.parts[0].role) == ("revolute", "knob")
             shown, turned = (in_object(dial, dial.parts[0].mesh, angle) for angle in (0.0, dial.upper))
@@ -243,7 +233,7 @@ def test_dials_turn_in_place_on_a_panel_that_is_free(category: str) -> None:
 def test_pieces_of_many_joints(category: str, least: int, most: int) -> None:
     for links in (build_model(category, seed).links for seed in range(8)):
         assert least <= len(links) <= most
-        assert all(map(has_handle, links))
+        assert all(link.grips for link in links)
         assert category != "rack_dishwasher" or [k.kind for k in links] == ["revolute", "prismatic", "prismatic"]
 
 

@@ -16,7 +16,6 @@ from jaxtyping import Float
 from quest.sim.procedural.handles import SUNK_M, HandleKind, HandleStyle, handle_part, sample_any_style
 from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
 from quest.sim.procedural.shapes import Mesh, box, boxes, copies, join, lathe, prism_between, walls
-from quest.types import GRIPS
 
 _MARGIN_M = 0.004
 _NARROWEST_M = 0.05
@@ -76,9 +75,8 @@ def with_dials(model: ObjectModel, rng: Dice) -> ObjectModel:
 def _free_panels(model: ObjectModel, rng: Dice) -> list[_Panel]:
     """Where the front has room for a panel, and one on top at the back."""
     low, high = join([part.mesh for part in model.body]).bounds.tolist()
-    near, far = join([
-        part.mesh.moved(link.origin) for link in model.links for part in link.parts if part.role not in GRIPS
-    ]).bounds.tolist()  # fmt: skip
+    fronts = [part.mesh.moved(link.origin) for link in model.links for part in link.rest]
+    near, far = join(fronts).bounds.tolist()
     front, width = min(low[1], near[1]) - rng.real(0.001, 0.015), high[0] - low[0]
     middle = (low[0] + high[0]) / 2
     tall = rng.real(0.08, 0.22)

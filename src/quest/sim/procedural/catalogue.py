@@ -17,13 +17,11 @@ from quest.sim.procedural.clutter import with_clutter
 from quest.sim.procedural.handles import with_long_handles
 from quest.sim.procedural.model import Dice, ObjectModel, as_urdf
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
-from quest.types import GRIPS
 
 
 def _without_handles(model: ObjectModel, rng: Dice) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
-    links = [replace(link, parts=tuple(p for p in link.parts if p.role not in GRIPS)) for link in model.links]
-    return replace(model, links=tuple(links))
+    return replace(model, links=tuple(replace(link, parts=link.rest) for link in model.links))
 
 
 _BUILDERS: dict[str, Callable[[Dice], ObjectModel]] = {

@@ -13,7 +13,6 @@ from jaxtyping import Float
 
 from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
 from quest.sim.procedural.shapes import Mesh, box, boxes, copies, join, lathe, walls
-from quest.types import GRIPS
 
 _SUNK_M = 0.001
 _MARGIN_M = 0.02
@@ -44,11 +43,11 @@ def with_clutter(model: ObjectModel, rng: Dice) -> ObjectModel:
 
 def _decorated(link: Link, rng: Dice) -> Link:
     """The link with none to three things on its front, away from its handles."""
-    fronts = [part.mesh.bounds for part in link.parts if part.role not in GRIPS]
-    if not fronts:
+    if not link.rest:
         return link
-    low, high = max(fronts, key=lambda bounds: np.prod(np.ptp(bounds, axis=0)[[0, 2]]))
-    taken = [_rect(part.mesh) for part in link.parts if part.role in GRIPS]
+    bounds = [part.mesh.bounds for part in link.rest]
+    low, high = max(bounds, key=lambda each: np.prod(np.ptp(each, axis=0)[[0, 2]]))
+    taken = [_rect(part.mesh) for part in link.grips]
     added: list[Part] = []
     for _ in range(rng.whole(0, 4)):
         width, height = (high - low)[[0, 2]]

@@ -15,7 +15,6 @@ import numpy as np
 
 from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
 from quest.sim.procedural.shapes import Mesh, box, boxes, centred_box, join, lathe, prism_between, tube
-from quest.types import GRIPS
 
 SUNK_M = 0.001
 """How deep feet reach into the front, so that no gap shows between them."""
@@ -266,23 +265,20 @@ def with_long_handles(model: ObjectModel, rng: Dice) -> ObjectModel:
     share = rng.real(0.45, 0.98)
 
     def with_long(link: Link) -> Link:
-        old = [part for part in link.parts if part.role in GRIPS]
-        others = tuple(part for part in link.parts if part.role not in GRIPS)
-        if not (old and others):
+        if not (link.grips and link.rest):
             return link
-        bounds = np.stack([part.mesh.bounds for part in others])
-        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-        at, foot = old[0].mesh.bounds.mean(axis=0), float(old[0].mesh.bounds[1, 1])
+        low, high = join([part.mesh for part in link.rest]).bounds
+        old = link.grips[0].mesh.bounds
         vertical = link.kind == "revolute" and abs(link.axis[2]) > 0.5
         along = 2 if vertical else 0
-        at[along] = (low[along] + high[along]) / 2
         length = share * float(high[along] - low[along])
         if length < 0.05:
             return link
+        x, foot, z = old.mean(axis=0)[0], float(old[1, 1]), old.mean(axis=0)[2]
+        middle = (low[along] + high[along]) / 2
+        at, room = ((x, foot, middle), (0.1, length / 0.8)) if vertical else ((middle, foot, z), (length / 0.8, 0.1))
         # A bowed door is foremost elsewhere.
-        reach = style.reach_m + max(0.0, foot - float(low[1]))
-        place, room = (float(at[0]), foot, float(at[2])), (0.1, length / 0.8) if vertical else (length / 0.8, 0.1)
-        own = replace(style, length_m=length, reach_m=reach)
-        return replace(link, parts=(*others, handle_part(own, at=place, vertical=vertical, room_m=room)))
+        own = replace(style, length_m=length, reach_m=style.reach_m + max(0.0, foot - float(low[1])))
+        return replace(link, parts=(*link.rest, handle_part(own, at=at, vertical=vertical, room_m=room)))
 
     return replace(model, links=tuple(with_long(link) for link in model.links))

@@ -16,6 +16,7 @@ from numpy.random import Generator
 
 from quest.sim.procedural.shapes import Mesh
 from quest.sim.urdf import MeshData, Urdf, UrdfJoint, UrdfVisual, pose_matrix
+from quest.types import GRIPS
 
 _T = TypeVar("_T")
 
@@ -83,6 +84,16 @@ class Link:
     """Unit direction of the joint in the object's frame."""
     upper: float
     """Upper limit in radians or metres; the lower one is 0, which is closed."""
+
+    @property
+    def grips(self) -> tuple[Part, ...]:
+        """Its handles and knobs."""
+        return tuple(part for part in self.parts if part.role in GRIPS)
+
+    @property
+    def rest(self) -> tuple[Part, ...]:
+        """All else."""
+        return tuple(part for part in self.parts if part.role not in GRIPS)
 
 
 @dataclass(frozen=True)
