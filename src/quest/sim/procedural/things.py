@@ -74,7 +74,8 @@ def eyeglasses(rng: Dice) -> ObjectModel:
     x = np.linspace(-bridge / 2 - frame, bridge / 2 + frame, 5)
     nose = tube(np.stack([x, 0 * x - 0.5 * thick], axis=1), radius_m=0.45 * thick, flatness=rng.real(1.0, 1.6))
     lugs = boxes(*(
-        ((low, -thick, hinge_z - 0.004), (low + 0.006, 0.006, hinge_z + 0.004)) for low in (-half - 0.006, half)
+        ((low, -thick, hinge_z - 0.004), (high, 0.006, hinge_z + 0.004))
+        for low, high in ((-half - 0.006, -half), (half, half + 0.006))
     ))  # fmt: skip
     rings, panes = (copies(each, [(side * middle, 0, 0) for side in (-1, 1)]) for each in (ring, pane))
     front = join([rings, nose.moved((0, 0, 0.15 * lens_h)), lugs])
