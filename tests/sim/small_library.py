@@ -21,7 +21,7 @@ width#1=60
 depth#1=40
 height#1=80
 """
-MATERIALS = "newmtl wood\nKd 0.8 0.6 0.4\nmap_Kd bark oak.png\nnewmtl steel\nKd 1 1 1\n"
+LOOKS = "newmtl wood\nKd 0.8 0.6 0.4\nmap_Kd bark oak.png\nnewmtl steel\nKd 1 1 1\n"
 SIZES = "width#{0}=60\ndepth#{0}=40\nheight#{0}=80\n"
 
 
@@ -64,7 +64,7 @@ def write_library(path: Path, models: dict[str, str], properties: str = PROPERTI
         archive.writestr("PluginFurnitureCatalog.properties", properties.encode("latin-1"))
         for name, text in models.items():
             archive.writestr(f"lib/{name}/{name}.obj", text)
-            archive.writestr(f"lib/{name}/it.mtl", MATERIALS)
+            archive.writestr(f"lib/{name}/it.mtl", LOOKS)
             archive.writestr(f"lib/{name}/bark oak.png", picture())
         for name, data in more.items():
             archive.writestr(name, data)

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from quest.sim.articulation import ArticulatedJoint, Articulation
+from quest.sim.articulation import ArticulatedJoint, Articulation, apply
+from quest.sim.entities import SimEntity
+from quest.sim.objects import SimObject
 from quest.types import Joint
 
 
@@ -109,6 +111,18 @@ def write_object(folder: Path, *links: Link, category: str | None = "StorageFurn
 def write_cabinet(folder: Path) -> Path:
     """The cabinet described above."""
     return write_object(folder, CARCASS, DRAWER, DOOR)
+
+
+def edit(folder: Path, old: str, new: str) -> Path:
+    """Replaces some text of an object's URDF."""
+    urdf = folder / "mobility.urdf"
+    urdf.write_text(urdf.read_text().replace(old, new))
+    return urdf
+
+
+def in_world(thing: SimObject, entity: SimEntity) -> np.ndarray:
+    """Where an entity is at rest."""
+    return apply(thing.articulation.poses(thing.articulation.rest)[entity.body], entity.point)
 
 
 def articulation(*joints: tuple[str, float, float]) -> Articulation:

@@ -13,11 +13,10 @@ import trimesh
 
 from quest.data.split import split_of
 from quest.errors import ObjectError
-from quest.sim.articulation import apply
 from quest.sim.description import read_description
 from quest.sim.objects import SimObject, find_objects, find_urdf, load_object
 from quest.types import Joint, TakeInfo
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Box, Link, write_cabinet, write_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Box, Link, edit, in_world, write_cabinet, write_object
 
 NAMELESS = replace(DRAWER, boxes=(DRAWER.boxes[0], replace(DRAWER.boxes[1], name="grip_a")))
 
@@ -79,15 +78,9 @@ def test_implausible_size_is_flagged(tmp_path: Path) -> None:
 
 
 def test_description_names_size_front_and_visuals(tmp_path: Path) -> None:
-    thing = load_object(
-        described(
-            tmp_path / "mine",
-            category="Sideboard",
-            height_m=0.6,
-            front="+y",
-            entities=[{"visual": "grip*", "label": "handle"}],
-        )
-    )
+    grips = [{"visual": "grip*", "label": "handle"}]
+    said = described(tmp_path / "mine", category="Sideboard", height_m=0.6, front="+y", entities=grips)
+    thing = load_object(said)
     assert (thing.source, thing.category) == ("own", "Sideboard")
     assert thing.articulation.extent_m[2] == pytest.approx(0.6)
     assert thing.articulation.extent_m[0] == pytest.approx(0.6 * 0.6)  # what looked along +y looks along +x
@@ -116,8 +109,7 @@ def test_lid_tells_where_the_front_is(tmp_path: Path) -> None:
     case = Link("case", (Box("case-2", (0.4, 0.3, 0.2), (0, 0, 0.1)),))
     thing = load_object(described(tmp_path / "mine", case, lid))
     (rim,) = (e for e in thing.entities if e.label == "rim")
-    world = apply(thing.articulation.poses(thing.articulation.rest)[1], rim.point)
-    assert world[0] == pytest.approx(0.15, abs=0.01)
+    assert in_world(thing, rim)[0] == pytest.approx(0.15, abs=0.01)
 
 
 def test_point_lies_on_the_surface_of_its_link_and_scales(tmp_path: Path) -> None:
@@ -139,8 +131,7 @@ def test_entity_fixed_in_the_base_is_for_lifting(tmp_path: Path) -> None:
     assert thing.movable == (0, 1)
     labels = [e.label for e in thing.entities]
     assert labels == ["front", "rim", "rim", "hinge"]  # moving ones, then what is fixed, then hinges
-    world = apply(thing.articulation.poses(thing.articulation.rest)[0], rim.point)
-    assert world[2] == pytest.approx(0.99, abs=0.02)
+    assert in_world(thing, rim)[2] == pytest.approx(0.99, abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -187,13 +178,11 @@ def test_mimic_joints_move_on_their_own_and_say_so(tmp_path: Path) -> None:
 
 def test_package_paths_are_found_beside_and_above(tmp_path: Path) -> None:
     folder = write_cabinet(tmp_path / "my_cabinet" / "urdf")
-    urdf = renamed(folder, "cabinet.urdf")
-    text = urdf.read_text().replace('filename="textured_objs/', 'filename="package://my_cabinet/meshes/')
-    urdf.write_text(text)
     (folder / "textured_objs").rename(tmp_path / "my_cabinet" / "meshes")
-    assert load_object(urdf).warnings == ()
-    urdf.write_text(text.replace("package://my_cabinet", "package://other_name"))
-    assert load_object(urdf).warnings == ()
+    edit(folder, 'filename="textured_objs/', 'filename="package://my_cabinet/meshes/')
+    assert load_object(folder).warnings == ()
+    edit(folder, "package://my_cabinet", "package://other_name")
+    assert load_object(folder).warnings == ()
 
 
 def test_own_objects_are_in_no_part_of_the_split() -> None:

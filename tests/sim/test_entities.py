@@ -10,15 +10,11 @@ import trimesh
 from quest.sim.articulation import apply
 from quest.sim.entities import SimEntity, part_label
 from quest.sim.objects import SimObject, load_object
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, TRAY, Box, Link, write_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, TRAY, Box, Link, in_world, write_object
 
 
 def entity(thing: SimObject, name: str) -> SimEntity:
     return next(e for e in thing.entities if e.name == name)
-
-
-def in_world(thing: SimObject, e: SimEntity) -> np.ndarray:
-    return apply(thing.articulation.poses(thing.articulation.rest)[e.body], e.point)
 
 
 def bounds(thing: SimObject, part: str) -> tuple[np.ndarray, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +18,27 @@ from quest.sim.sweethome import Imported, import_library, joints
 from quest.sim.sweethome.folder import CREDITS, THINGS
 from quest.sim.sweethome.joints import LinkNote, Note, Pick
 from quest.sim.sweethome.wavefront import read_materials, read_wavefront
-from tests.sim.small_library import (
-    BODY,
-    CHEST,
-    CUPBOARD,
-    MATERIALS,
-    PROPERTIES,
-    SIZES,
-    picture,
-    wavefront,
-    write_library,
-)
+from tests.sim.small_library import BODY, CHEST, CUPBOARD, LOOKS, PROPERTIES, SIZES, picture, wavefront, write_library
 
 
 def run(path: Path, out: Path) -> list[Imported]:
     return list(import_library(path, out))
+
+
+Import = Callable[..., tuple[Imported, Path]]
+
+
+@pytest.fixture
+def imported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Import:
+    """Imports a library of one model, of which something may be noted; also gives its folder."""
+
+    def run_one(model: str, properties: str = PROPERTIES, *, note: Note | None = None) -> tuple[Imported, Path]:
+        if note is not None:
+            monkeypatch.setattr("quest.sim.sweethome.folder.notes", lambda: {"lib/cupboard/cupboard.obj": note})
+        (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": model}, properties), tmp_path / "out")
+        return made, made.folder or Path("none")
+
+    return run_one
 
 
 def opened(thing: SimObject, index: int = 0) -> np.ndarray:
@@ -43,34 +50,28 @@ def opened(thing: SimObject, index: int = 0) -> np.ndarray:
     return (places[1] - places[0])[:3]
 
 
-def test_a_tagged_door_opens_to_the_front(tmp_path: Path) -> None:
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD}), tmp_path / "out")
-    assert made.opens
-    assert made.folder is not None
-    assert made.warnings == ()
-    assert made.folder == tmp_path / "out" / "cupboard"
-    cupboard = load_object(made.folder)
+def test_a_tagged_door_opens_to_the_front(tmp_path: Path, imported: Import) -> None:
+    made, folder = imported(CUPBOARD)
+    assert (made.opens, made.warnings, folder) == (True, (), tmp_path / "out" / "cupboard")
+    cupboard = load_object(folder)
     assert (cupboard.source, cupboard.warnings) == ("own", ())
     np.testing.assert_allclose(cupboard.articulation.extent_m, (0.4, 0.6, 0.8), atol=1e-6)
     assert [e.name for e in cupboard.entities] == ["part_1/handle", "part_1/hinge"]
-    joint = cupboard.articulation.joints[0]
-    assert joint.joint.kind == "revolute"
-    assert joint.joint.upper == pytest.approx(np.pi / 2, abs=1e-3)
+    joint = cupboard.articulation.joints[0].joint
+    assert (joint.kind, joint.upper) == ("revolute", pytest.approx(np.pi / 2, abs=1e-3))
     step = opened(cupboard)
     assert step[0] > 0.4  # the free edge comes out to the front
     assert step[1] < -0.4  # and goes to the left, where the hinge is
-    text = (made.folder / "meshes" / "materials.mtl").read_text()
-    assert "map_Kd picture0.png" in text
-    assert (made.folder / "meshes" / "picture0.png").read_bytes() == picture()
+    assert "map_Kd picture0.png" in (folder / "meshes" / "materials.mtl").read_text()
+    assert (folder / "meshes" / "picture0.png").read_bytes() == picture()
+    credits = (tmp_path / "out" / CREDITS).read_text(encoding="utf-8").splitlines()
+    assert "| cupboard | A \\| cupboard | Müller | CC-BY | a.sh3f |" in credits  # on one line
 
 
-def test_a_noted_drawer_slides_and_has_its_knob_and_a_tray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_noted_drawer_slides_and_has_its_knob_and_a_tray(imported: Import) -> None:
     drawer = LinkNote("drawer", "slide", (Pick(box=(0.9, 0, 0, 1, 1, 0.6)),), by=0.25, tray=True)
     note = Note(category="StorageFurniture", links=(drawer,), knobs=(Pick(group="knobs"),))
-    monkeypatch.setattr("quest.sim.sweethome.folder.notes", lambda: {"lib/cupboard/cupboard.obj": note})
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CHEST}), tmp_path / "out")
-    assert made.folder is not None
-    chest = load_object(made.folder)
+    chest = load_object(imported(CHEST, note=note)[1])
     assert chest.category == "StorageFurniture"
     assert [e.name for e in chest.entities] == ["drawer/knob"]
     np.testing.assert_allclose(opened(chest), (0.25, 0, 0), atol=1e-6)
@@ -81,73 +82,48 @@ def test_a_noted_drawer_slides_and_has_its_knob_and_a_tray(tmp_path: Path, monke
     ("opens", "towards"),
     [("left", (0.5, -0.5, 0)), ("right", (0.5, 0.5, 0)), ("bottom", (0.3, 0, -0.3)), ("top", (0.3, 0, 0.3))],
 )
-def test_doors_turn_on_the_edge_that_is_noted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, opens, towards: tuple
-) -> None:
-    note = Note(links=(LinkNote("door", opens, (Pick(group="fronts"),)),))
-    monkeypatch.setattr("quest.sim.sweethome.folder.notes", lambda: {"lib/cupboard/cupboard.obj": note})
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CHEST}), tmp_path / "out")
-    assert made.folder is not None
-    door = load_object(made.folder)
+def test_doors_turn_on_the_edge_that_is_noted(imported: Import, opens, towards: tuple) -> None:
+    door = load_object(imported(CHEST, note=Note(links=(LinkNote("door", opens, (Pick(group="fronts"),)),)))[1])
     assert door.entities[0].label == "rim"
-    step = opened(door)
-    assert [np.sign(np.round(s, 1)) for s in step] == [np.sign(t) for t in towards]
+    assert [np.sign(np.round(s, 1)) for s in opened(door)] == [np.sign(t) for t in towards]
 
 
-def test_a_lid_that_is_modelled_open_is_shut(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lid_that_is_modelled_open_is_shut(imported: Import) -> None:
     model = wavefront(("base", (0, 0, 0), (6, 0.2, 4)), ("screen", (0, 0.2, 0), (6, 4.2, 0.2)))
     note = Note("Laptop", links=(LinkNote("lid", "lid", (Pick(group="screen"),), 100, 90, axis=(0, 0.5, 0.09)),))
-    monkeypatch.setattr("quest.sim.sweethome.folder.notes", lambda: {"lib/cupboard/cupboard.obj": note})
-    size = PROPERTIES.replace("height#1=80", "height#1=42")
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": model}, size), tmp_path / "out")
-    assert made.folder is not None
-    laptop = load_object(made.folder)
+    laptop = load_object(imported(model, PROPERTIES.replace("height#1=80", "height#1=42"), note=note)[1])
     assert laptop.articulation.extent_m[2] < 0.05
     assert opened(laptop)[2] > 0.35
 
 
-def test_things_do_not_move_and_stand_below_things(tmp_path: Path) -> None:
-    turned = PROPERTIES + "modelRotation#1=1 0 0 0 0 1 0 -1 0\n"
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": wavefront(BODY)}, turned), tmp_path / "out")
-    assert not made.opens
-    assert made.folder is not None
-    assert made.folder == tmp_path / "out" / THINGS / "cupboard"
-    assert (made.folder / "cupboard.urdf").read_text().count("<link") == 1
-    read = read_wavefront((made.folder / "meshes" / "base-body.obj").read_text())
+def test_things_do_not_move_and_stand_below_things(tmp_path: Path, imported: Import) -> None:
+    made, folder = imported(wavefront(BODY), PROPERTIES + "modelRotation#1=1 0 0 0 0 1 0 -1 0\n")
+    assert (made.opens, folder) == (False, tmp_path / "out" / THINGS / "cupboard")
+    assert (folder / "cupboard.urdf").read_text().count("<link") == 1
+    read = read_wavefront((folder / "meshes" / "base-body.obj").read_text())
     np.testing.assert_allclose(read.vertices.min(axis=0), (-0.2, -0.3, 0), atol=1e-6)
     np.testing.assert_allclose(read.vertices.max(axis=0), (0.2, 0.3, 0.8), atol=1e-6)
     with pytest.raises(ObjectError):
         find_objects(tmp_path / "out")
 
 
-def test_credits_name_whose_model_it_is_on_one_line(tmp_path: Path) -> None:
-    run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD}), tmp_path / "out")
-    text = (tmp_path / "out" / CREDITS).read_text(encoding="utf-8")
-    assert "| cupboard | A \\| cupboard | Müller | CC-BY | a.sh3f |" in text.splitlines()
-
-
-def test_finished_folders_are_kept_and_a_changed_library_is_told(tmp_path: Path) -> None:
-    path, out = tmp_path / "a.sh3f", tmp_path / "out"
-    (made,) = run(write_library(path, {"cupboard": CUPBOARD}), out)
-    assert made.folder is not None
-    (made.folder / "mine.txt").write_text("kept")
-    (out / ".partial" / "left-over").mkdir(parents=True)
-    (again,) = run(path, out)
-    assert again.kept
-    assert again.warnings == ()
-    assert (made.folder / "mine.txt").is_file()
-    assert not (out / ".partial").exists()
-    (changed,) = run(write_library(path, {"cupboard": CHEST}), out)
+def test_finished_folders_are_kept_and_a_changed_library_is_told(tmp_path: Path, imported: Import) -> None:
+    _, folder = imported(CUPBOARD)
+    (folder / "mine.txt").write_text("kept")
+    (tmp_path / "out" / ".partial" / "left-over").mkdir(parents=True)
+    again, _ = imported(CUPBOARD)
+    assert (again.kept, again.warnings) == (True, ())
+    assert (folder / "mine.txt").is_file()
+    assert not (tmp_path / "out" / ".partial").exists()
+    changed, _ = imported(CHEST)
     assert changed.kept
     assert "the library has changed" in changed.warnings[0]
 
 
-def test_a_name_that_another_model_has_gets_its_library_in_front(tmp_path: Path) -> None:
-    run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD}), tmp_path / "out")
-    other = tmp_path / "b.sh3f"
-    with zipfile.ZipFile(other, "w") as archive:
-        archive.writestr("PluginFurnitureCatalog.properties", PROPERTIES.replace("/lib/", "/Their Lib/"))
-        archive.writestr("Their Lib/cupboard/cupboard.obj", CUPBOARD)
+def test_a_name_that_another_model_has_gets_its_library_in_front(tmp_path: Path, imported: Import) -> None:
+    imported(CUPBOARD)
+    files = {"Their Lib/cupboard/cupboard.obj": CUPBOARD.encode()}
+    other = write_library(tmp_path / "b.sh3f", {}, PROPERTIES.replace("/lib/", "/Their Lib/"), **files)
     (made,) = run(other, tmp_path / "out")
     assert made.folder == tmp_path / "out" / "their-lib-cupboard"
     assert "it.mtl" in made.warnings[0]
@@ -164,13 +140,9 @@ def test_no_path_leads_out_of_the_library(tmp_path: Path, name: str) -> None:
 
 def test_no_picture_comes_from_elsewhere(tmp_path: Path) -> None:
     (tmp_path / "secret.png").write_bytes(picture())
-    text = MATERIALS.replace("bark oak.png", str(tmp_path / "secret.png"))
-    path = tmp_path / "a.sh3f"
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("PluginFurnitureCatalog.properties", PROPERTIES)
-        archive.writestr("lib/cupboard/cupboard.obj", CUPBOARD)
-        archive.writestr("lib/cupboard/it.mtl", text)
-    (made,) = run(path, tmp_path / "out")
+    text = LOOKS.replace("bark oak.png", str(tmp_path / "secret.png"))
+    files = {"lib/cupboard/cupboard.obj": CUPBOARD.encode(), "lib/cupboard/it.mtl": text.encode()}
+    (made,) = run(write_library(tmp_path / "a.sh3f", {}, PROPERTIES, **files), tmp_path / "out")
     assert "secret.png' is missing" in made.warnings[0]
     assert not list((tmp_path / "out").rglob("*.png"))
 
@@ -220,9 +192,9 @@ def test_a_broken_entry_is_left_out_and_the_rest_goes_on(tmp_path: Path, old: st
         ("sweethome3d_hinge_1\n", "sweethome3d_hinge_7\n"),
     ],
 )
-def test_a_broken_model_is_left_out_by_name(tmp_path: Path, old: str, new: str) -> None:
+def test_a_broken_model_is_left_out_by_name(tmp_path: Path, imported: Import, old: str, new: str) -> None:
     assert old in CUPBOARD
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD.replace(old, new)}), tmp_path / "out")
+    made, _ = imported(CUPBOARD.replace(old, new))
     assert made.folder is None
     assert "lib/cupboard/cupboard.obj" in made.warnings[0]
     assert not [p for p in (tmp_path / "out").iterdir() if p.name != CREDITS]
@@ -281,16 +253,15 @@ def test_damaged_notes_are_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         joints.notes.__wrapped__()
 
 
-def test_the_split_knows_imported_objects_by_name_and_model(tmp_path: Path) -> None:
-    (made,) = run(write_library(tmp_path / "a.sh3f", {"cupboard": CUPBOARD}), tmp_path / "out")
-    assert made.folder is not None
-    credit = made.folder / "credit.json"
+def test_the_split_knows_imported_objects_by_name_and_model(imported: Import) -> None:
+    _, folder = imported(CUPBOARD)
+    credit = folder / "credit.json"
     part = object_split().sweethome3d["validation"]
     named = json.loads(credit.read_text())
     assert named["model"] != part["cupboard"]  # that of another library
-    assert load_object(made.folder).source == "own"
+    assert load_object(folder).source == "own"
     credit.write_text(json.dumps(named | {"model": part["cupboard"]}))
-    cupboard = load_object(made.folder)
+    cupboard = load_object(folder)
     assert cupboard.source == "sweethome3d"
     assert part_of_object(cupboard.source, cupboard.object_id) == "validation"
     np.testing.assert_allclose(cupboard.articulation.extent_m, (0.4, 0.6, 0.8), atol=1e-6)  # metres, as its file says

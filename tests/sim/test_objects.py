@@ -1,6 +1,8 @@
 """Object folders: what is read from them, and what is said about bad ones."""
 
 import json
+import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import trimesh
 from quest.errors import ObjectError
 from quest.sim.articulation import MAX_TURN_RAD
 from quest.sim.objects import find_objects, load_object
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, write_cabinet, write_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, HANDLE, Box, Link, edit, write_cabinet, write_object
 
 
 def test_cabinet(tmp_path: Path) -> None:
@@ -32,12 +34,8 @@ def test_cabinet(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("yaw", [0.0, np.pi / 2, np.pi, -np.pi / 2])
 def test_front_looks_towards_plus_x_however_the_object_was_modelled(tmp_path: Path, yaw: float) -> None:
-    turned = [
-        Link("turn", (), yaw=yaw),
-        *(replace(link, parent="turn") for link in (CARCASS, DRAWER, DOOR)),
-    ]
-    cabinet = load_object(write_object(tmp_path / "cabinet", *turned))
-    articulation = cabinet.articulation
+    turned = [Link("turn", (), yaw=yaw), *(replace(link, parent="turn") for link in (CARCASS, DRAWER, DOOR))]
+    articulation = load_object(write_object(tmp_path / "cabinet", *turned)).articulation
     axes = articulation.axes(articulation.poses(articulation.rest))
     np.testing.assert_allclose(axes[0, 3:], [1, 0, 0], atol=1e-9)
 
@@ -81,12 +79,11 @@ def test_door_modelled_half_open_is_closed(tmp_path: Path) -> None:
 def test_origins_left_in_old_units_are_mended(tmp_path: Path) -> None:
     """Meshes scaled by 0.1 about a joint origin that was not: the bucket of PartNet-Mobility."""
     folder = write_cabinet(tmp_path / "cabinet")
-    text = (folder / "mobility.urdf").read_text().replace('.obj"/>', '.obj" scale="0.1 0.1 0.1"/>')
+    edit(folder, '.obj"/>', '.obj" scale="0.1 0.1 0.1"/>')
     for link in (DRAWER, DOOR):  # meshes of one common frame: the visual takes the joint's origin back
-        back = '<visual name="{}"><origin xyz="{} {} {}"/>'
+        back = '<origin xyz="{} {} {}"/>'.format(*(-x for x in link.origin))
         for box in link.boxes:
-            text = text.replace(f'<visual name="{box.name}">', back.format(box.name, *(-x for x in link.origin)))
-    (folder / "mobility.urdf").write_text(text)
+            edit(folder, f'<visual name="{box.name}">', f'<visual name="{box.name}">{back}')
     cabinet = load_object(folder)
     assert any("scaled" in warning for warning in cabinet.warnings)
     axes = cabinet.articulation.axes(cabinet.articulation.poses(cabinet.articulation.rest))
@@ -140,8 +137,7 @@ def test_missing_and_empty_meshes_are_left_out_and_flagged(tmp_path: Path) -> No
 def test_meshes_that_no_reader_reads_are_left_out_too(tmp_path: Path, name: str) -> None:
     folder = write_cabinet(tmp_path / "cabinet")
     (folder / "textured_objs" / name).write_bytes(b"<a/>")
-    urdf = folder / "mobility.urdf"
-    urdf.write_text(urdf.read_text().replace("body-0.obj", name))
+    edit(folder, "body-0.obj", name)
     (warning,) = load_object(folder).warnings
     assert name in warning
 
@@ -152,76 +148,52 @@ def test_collada_files_tell_their_unit(tmp_path: Path, unit: str) -> None:
     mesh = folder / "textured_objs" / "body-0.dae"
     trimesh.creation.box((0.02, 0.6, 5.0)).export(mesh)
     mesh.write_text(mesh.read_text().replace("</asset>", f"{unit}</asset>", 1))
-    urdf = folder / "mobility.urdf"
-    urdf.write_text(urdf.read_text().replace("body-0.obj", "body-0.dae"))
-    back = load_object(urdf.rename(folder / "own.urdf")).articulation.parts[0]
+    urdf = edit(folder, "body-0.obj", "body-0.dae").rename(folder / "own.urdf")
+    back = load_object(urdf).articulation.parts[0]
     assert np.ptp(back.surface.vertices[:, 2]) == pytest.approx(0.05 if unit else 5.0)
 
 
 def test_mirrored_meshes_still_look_outwards(tmp_path: Path) -> None:
     folder = write_cabinet(tmp_path / "cabinet")
-    urdf = folder / "mobility.urdf"
-    urdf.write_text(urdf.read_text().replace('door-0.obj"/>', 'door-0.obj" scale="1 -1 1"/>'))
+    edit(folder, 'door-0.obj"/>', 'door-0.obj" scale="1 -1 1"/>')
     (door,) = [part for part in load_object(folder).articulation.parts if part.name.startswith("door_panel")]
     assert door.surface.volume > 0
 
 
-def bad_folder(folder: Path, what: str) -> Path:
-    """A folder that is spoilt in one way."""
-    if what == "no folder":
-        return folder
-    links: tuple[Link, ...] = (CARCASS, DRAWER)
-    if what == "no meshes":
-        links = tuple(replace(link, boxes=tuple(replace(b, missing=True) for b in link.boxes)) for link in links)
-    elif what == "nothing moves":
-        links = (CARCASS, replace(DRAWER, kind="fixed", limits=None))
-    elif what == "no travel":
-        links = (CARCASS, replace(DRAWER, limits=(0, 0)))
-    elif what == "nothing to follow":
-        links = (CARCASS, replace(DRAWER, boxes=()))
-    elif what == "limits":
-        links = (CARCASS, replace(DRAWER, limits=(0, float("nan"))))
-    elif what == "axis":
-        links = (CARCASS, replace(DRAWER, axis=(0, 0, 0)))
-    elif what == "unknown parent":
-        links = (CARCASS, replace(DRAWER, parent="nobody"))
-    elif what == "cycle":
-        links = (CARCASS, replace(DRAWER, parent="door"), replace(DOOR, parent="drawer"))
-    write_object(folder, *links)
-    urdf = folder / "mobility.urdf"
-    if what == "no urdf":
-        urdf.unlink()
-    elif what == "torn urdf":
-        urdf.write_text(urdf.read_text()[:300])
-    elif what == "not xml":
-        urdf.write_bytes(b"\x00\xff\x00")
-    elif what == "no geometry":
-        urdf.write_text(urdf.read_text().replace("geometry>", "shape>"))
-    return folder
+def without_meshes(*links: Link) -> tuple[Link, ...]:
+    return tuple(replace(link, boxes=tuple(replace(box, missing=True) for box in link.boxes)) for link in links)
+
+
+CYCLE = (CARCASS, replace(DRAWER, parent="door"), replace(DOOR, parent="drawer"))
 
 
 @pytest.mark.parametrize(
-    ("what", "named"),
+    ("links", "spoil", "named"),
     [
-        ("no folder", "expected an object folder"),
-        ("no urdf", "expected a URDF file"),
-        ("torn urdf", "not a readable URDF"),
-        ("not xml", "not a readable URDF"),
-        ("no geometry", "no geometry"),
-        ("limits", "got 'nan'"),
-        ("axis", "axis of length zero"),
-        ("unknown parent", "nobody"),
-        ("cycle", "cycle"),
-        ("no meshes", "expected meshes"),
-        ("nothing moves", "expected a joint that moves"),
-        ("no travel", "expected a joint that moves"),
-        ("nothing to follow", "expected a moving link"),
+        ((), lambda urdf: shutil.rmtree(urdf.parent), "expected an object folder"),
+        ((), Path.unlink, "expected a URDF file"),
+        ((), lambda urdf: urdf.write_text(urdf.read_text()[:300]), "not a readable URDF"),
+        ((), lambda urdf: urdf.write_bytes(b"\x00\xff\x00"), "not a readable URDF"),
+        ((), lambda urdf: edit(urdf.parent, "geometry>", "shape>"), "no geometry"),
+        ((CARCASS, replace(DRAWER, limits=(0, float("nan")))), None, "got 'nan'"),
+        ((CARCASS, replace(DRAWER, axis=(0, 0, 0))), None, "axis of length zero"),
+        ((CARCASS, replace(DRAWER, parent="nobody")), None, "nobody"),
+        (CYCLE, None, "cycle"),
+        (without_meshes(CARCASS, DRAWER), None, "expected meshes"),
+        ((CARCASS, replace(DRAWER, kind="fixed", limits=None)), None, "expected a joint that moves"),
+        ((CARCASS, replace(DRAWER, limits=(0, 0))), None, "expected a joint that moves"),
+        ((CARCASS, replace(DRAWER, boxes=())), None, "expected a moving link"),
     ],
 )
-def test_bad_folders_are_told_with_name_and_remedy(tmp_path: Path, what: str, named: str) -> None:
+def test_bad_folders_are_told_with_name_and_remedy(
+    tmp_path: Path, links: tuple[Link, ...], spoil: Callable[[Path], object] | None, named: str
+) -> None:
+    folder = write_object(tmp_path / "cabinet", *(links or (CARCASS, DRAWER)))
+    if spoil is not None:
+        spoil(folder / "mobility.urdf")
     with pytest.raises(ObjectError, match=named) as error:
-        load_object(bad_folder(tmp_path / "cabinet", what))
-    assert str(tmp_path / "cabinet") in str(error.value)
+        load_object(folder)
+    assert str(folder) in str(error.value)
     assert any(word in str(error.value) for word in ("restore", "check", "copy", "use another", "name a folder"))
 
 
@@ -241,21 +213,29 @@ def test_folder_of_objects(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.partnet
 @pytest.mark.parametrize(
-    ("object_id", "labels"),
+    ("object_id", "labels", "names"),
     [
-        ("44817", {"handle"}),
-        ("7320", None),  # names meshes that do not exist
-        ("kettle_dh", {"knob", "handle"}),  # its meshes, but not its joint limits, carry a scale
-        ("bucket_dh", {"handle", "hinge"}),  # its origins lack the scale of its meshes
+        ("44817", {"handle"}, None),
+        ("7320", None, None),  # names meshes that do not exist
+        ("kettle_dh", {"knob", "handle"}, {"base/handle"}),  # its meshes, but not its joint limits, carry a scale
+        ("bucket_dh", {"handle", "hinge"}, None),  # its origins lack the scale of its meshes
+        ("01909", None, {"link_0/handle"}),  # its door's bar is called a door
+        ("door_dh", None, {"link_1/handle", "link_1/handle_2", "link_2/handle", "link_2/handle_2"}),
+        ("10495", None, {"link_0/handle", "base/handle"}),
+        ("101284", None, {"link_0/rim", "link_1/rim"}),
+        ("103104", None, {"link_0/rim", "link_1/rim"}),
     ],
 )
-def test_real_objects_have_plausible_sizes_and_travels(partnet_root: Path, object_id: str, labels: set | None) -> None:
+def test_real_objects_have_plausible_sizes_and_travels_and_the_entities_of_their_category(
+    partnet_root: Path, object_id: str, labels: set[str] | None, names: set[str] | None
+) -> None:
     folder = partnet_root / object_id
     if not folder.is_dir():
         pytest.skip(f"no object {object_id}")
     thing = load_object(folder)
     assert thing.movable
     assert labels is None or {e.label for e in thing.entities} == labels
+    assert names is None or {e.name for e in thing.entities if e.label not in ("hinge", "knob")} == names
     points = thing.articulation.world_points(thing.articulation.rest)
     for line in thing.articulation.axes(thing.articulation.poses(thing.articulation.rest)):
         assert (line[:3] > points.min(axis=0) - thing.half_diagonal_m).all()
@@ -264,26 +244,7 @@ def test_real_objects_have_plausible_sizes_and_travels(partnet_root: Path, objec
     if object_id == "kettle_dh":  # its lid lifts off by a few centimetres
         lid, handle = thing.entities
         assert 0.02 < lid.travel_m < 0.1
-        assert (handle.name, handle.fixed, handle.travel_m) == ("base/handle", True, 0.0)
-
-
-@pytest.mark.partnet
-@pytest.mark.parametrize(
-    ("object_id", "names"),
-    [
-        ("01909", {"link_0/handle"}),  # its door's bar is called a door
-        ("door_dh", {"link_1/handle", "link_1/handle_2", "link_2/handle", "link_2/handle_2"}),
-        ("10495", {"link_0/handle", "base/handle"}),
-        ("101284", {"link_0/rim", "link_1/rim"}),
-        ("103104", {"link_0/rim", "link_1/rim"}),
-    ],
-)
-def test_real_objects_have_the_entities_of_their_category(partnet_root: Path, object_id: str, names: set[str]) -> None:
-    folder = partnet_root / object_id
-    if not folder.is_dir():
-        pytest.skip(f"no object {object_id}")
-    found = {e.name for e in load_object(folder).entities if e.label not in ("hinge", "knob")}
-    assert found == names
+        assert (handle.fixed, handle.travel_m) == (True, 0.0)
 
 
 def test_refrigerator_that_would_be_too_deep_is_a_small_one(tmp_path: Path) -> None:

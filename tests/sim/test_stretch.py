@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from quest.errors import ConfigError, ObjectError
+from quest.sim.articulation import apply
 from quest.sim.generate import generate_take
 from quest.sim.objects import SimObject, load_object
 from quest.sim.renderer import Renderer
 from quest.sim.settings import TakeSettings
 from quest.sim.stretch import draw_stretch, stretched
-from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Link, write_object
+from tests.sim.small_objects import CARCASS, DOOR, DRAWER, Link, in_world, write_object
 
 FACTORS = np.array([0.8, 1.5, 1.1])
 
@@ -36,10 +37,7 @@ def test_what_turns_stays_rigid_and_keeps_its_hinge(cabinet: SimObject) -> None:
     after = stretched(cabinet, FACTORS).articulation
     closed, opened = (after.poses(np.array([0.0, q]))[2] for q in (0.0, 1.2))
     points = after.body_points[2]
-    distances = [
-        np.linalg.norm(p[:, None] - p[None], axis=-1)
-        for p in ((points @ m[:3, :3].T + m[:3, 3]) for m in (closed, opened))
-    ]
+    distances = [np.linalg.norm(p[:, None] - p[None], axis=-1) for p in (apply(m, points) for m in (closed, opened))]
     np.testing.assert_allclose(*distances, atol=1e-9)
     old = cabinet.articulation
     hinge, new = (a.axes(a.poses(a.rest))[1] for a in (old, after))
@@ -48,10 +46,8 @@ def test_what_turns_stays_rigid_and_keeps_its_hinge(cabinet: SimObject) -> None:
 
 def test_entities_and_sizes_go_with_the_object(cabinet: SimObject) -> None:
     after = stretched(cabinet, FACTORS)
-    poses, new_poses = (o.articulation.poses(o.articulation.rest) for o in (cabinet, after))
     for old, new in zip(cabinet.entities, after.entities, strict=True):
-        was, now = ((p[e.body] @ [*e.point, 1])[:3] for p, e in ((poses, old), (new_poses, new)))
-        np.testing.assert_allclose(now, FACTORS * was, atol=1e-9)
+        np.testing.assert_allclose(in_world(after, new), FACTORS * in_world(cabinet, old), atol=1e-9)
         assert (new.name, new.parts) == (old.name, old.parts)
     assert after.entities[0].travel_m == pytest.approx(FACTORS[0] * cabinet.entities[0].travel_m)
     assert after.half_diagonal_m == pytest.approx(np.linalg.norm(FACTORS * cabinet.articulation.extent_m) / 2)
@@ -60,9 +56,8 @@ def test_entities_and_sizes_go_with_the_object(cabinet: SimObject) -> None:
 def test_meshes_are_drawn_with_the_scale_that_their_surface_has(cabinet: SimObject) -> None:
     for old, new in zip(cabinet.articulation.parts, stretched(cabinet, FACTORS).articulation.parts, strict=True):
         assert new.mesh is not None
-        inverse = np.linalg.inv(old.body_from_part)
-        raw = (old.surface.vertices @ inverse[:3, :3].T + inverse[:3, 3]) / old.scale
-        drawn = (raw * new.scale) @ new.body_from_part[:3, :3].T + new.body_from_part[:3, 3]
+        raw = apply(np.linalg.inv(old.body_from_part), old.surface.vertices) / old.scale
+        drawn = apply(new.body_from_part, raw * new.scale)
         np.testing.assert_allclose(drawn, new.surface.vertices, atol=1e-9)
 
 

@@ -25,7 +25,7 @@ from quest.errors import ObjectError
 from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.entities import PlacedEntity
 from quest.types import GRIPS, LABELS
-from quest.untrusted import read_json
+from quest.untrusted import build, read_json
 
 DESCRIPTION_NAME = "entities.json"
 """Name of the file beside the URDF."""
@@ -133,16 +133,12 @@ def _described(raw: Any, where: str) -> DescribedEntity:
         return DescribedEntity(where, label, link, visual, None)
     if visual is not None:
         raise ObjectError(f"{where}: got a visual and a point, expected one of them; leave one out")
-    if (
-        not isinstance(point, list)
-        or len(point) != 3
-        or not all(isinstance(x, int | float) and not isinstance(x, bool) and np.isfinite(x) for x in point)
-    ):
+    try:
+        return DescribedEntity(where, label, link, None, build(tuple[float, float, float], point))
+    except ValueError as error:
         raise ObjectError(
             f"{where}: point is {point!r}, expected [x, y, z] in the frame of its link; give three numbers"
-        )
-    x, y, z = (float(value) for value in point)
-    return DescribedEntity(where, label, link, None, (x, y, z))
+        ) from error
 
 
 def place(
@@ -163,8 +159,9 @@ def place(
     return tuple(_placed(entry, articulation, body_of_link, scale) for entry in description.entities)
 
 
-def _file_name(part: Part) -> str:
-    return part.mesh.stem if isinstance(part.mesh, Path) else ""
+def _names(part: Part) -> tuple[str, str, str]:
+    """What a part may be called: by the URDF, by an annotation, by its mesh file."""
+    return part.visual, part.name, part.mesh.stem if isinstance(part.mesh, Path) else ""
 
 
 def _placed(
@@ -184,11 +181,10 @@ def _placed(
         parts = tuple(
             i
             for i, part in enumerate(articulation.parts)
-            if (body is None or part.body == body)
-            and any(fnmatchcase(name, entry.visual) for name in (part.name, part.visual, _file_name(part)))
+            if (body is None or part.body == body) and any(fnmatchcase(name, entry.visual) for name in _names(part))
         )
         if not parts:
-            names = sorted({p.visual or p.name or _file_name(p) or p.shape for p in articulation.parts})
+            names = sorted({next(filter(None, (*_names(part), part.shape))) for part in articulation.parts})
             raise ObjectError(
                 f"{entry.where}: no visual is called {entry.visual!r}; expected a name or pattern out of "
                 f"{', '.join(names[:12])}{' ...' if len(names) > 12 else ''}"

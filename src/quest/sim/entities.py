@@ -13,12 +13,15 @@ that the body moves towards (front).
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
@@ -150,30 +153,26 @@ def find_entities(
 
 
 def _with_unique_names(entities: list[SimEntity]) -> tuple[SimEntity, ...]:
-    named, count = [], {}
+    named, count = [], Counter()
     for e in entities:
-        count[e.name] = count.get(e.name, 0) + 1
-        name = e.name if count[e.name] == 1 else f"{e.name}_{count[e.name]}"
-        named.append(replace(e, name=name))
+        count[e.name] += 1
+        named.append(e if count[e.name] == 1 else replace(e, name=f"{e.name}_{count[e.name]}"))
     return tuple(named)
 
 
 def _near_groups(meshes: list[trimesh.Trimesh], gap: float) -> list[list[int]]:
     """Groups of meshes that are connected by gaps below ``gap``."""
-    if not meshes:
-        return []
-    points = [_sample(m, 300)[0] for m in meshes]
+    points = [_sample(m, 300) for m in meshes]
     trees = [KDTree(p) for p in points]
     near = np.eye(len(meshes), dtype=bool)
-    for a in range(len(meshes)):
-        for b in range(a):
-            near[a, b] = near[b, a] = trees[a].query(points[b])[0].min() < gap
-    count, group = connected_components(near, directed=False)
+    for a, b in combinations(range(len(meshes)), 2):
+        near[b, a] = trees[b].query(points[a])[0].min() < gap
+    count, group = connected_components(near, directed=False) if meshes else (0, np.zeros(0))
     return [np.flatnonzero(group == g).tolist() for g in range(count)]
 
 
-def _sample(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, "N 3"]]:
-    """Area-weighted surface samples (with the vertices of very small meshes) and their normals; always the same."""
+def _sample(mesh: trimesh.Trimesh, count: int) -> Float[np.ndarray, "N 3"]:
+    """Area-weighted surface samples; always the same."""
     rng = np.random.default_rng(0)
     area = np.asarray(mesh.area_faces)
     weights = area / area.sum() if area.sum() > 0 else np.full(len(area), 1 / len(area))
@@ -182,14 +181,7 @@ def _sample(mesh: trimesh.Trimesh, count: int) -> tuple[Float[np.ndarray, "N 3"]
     flip = u + v > 1
     u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
     corner = np.asarray(mesh.triangles)[face]
-    points = corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
-    return points, np.asarray(mesh.face_normals)[face]
-
-
-def _joined(meshes: list[trimesh.Trimesh]) -> trimesh.Trimesh:
-    joined = trimesh.util.concatenate(meshes)
-    assert isinstance(joined, trimesh.Trimesh)
-    return joined
+    return corner[:, 0] + u * (corner[:, 1] - corner[:, 0]) + v * (corner[:, 2] - corner[:, 0])
 
 
 class _Finder:
@@ -200,12 +192,9 @@ class _Finder:
         self._half_diagonal_m = half_diagonal_m
         self._poses = articulation.poses(articulation.rest)
         self._world = [p.surface.copy().apply_transform(self._poses[p.body]) for p in articulation.parts]
-        self._scene = _joined(self._world)
-        angles = np.deg2rad(_SEEN_FROM_DEG)
-        azimuth, elevation = angles[:, 0], angles[:, 1]
-        self._towards = np.stack(
-            (np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)), axis=-1
-        )
+        azimuth, elevation = np.deg2rad(_SEEN_FROM_DEG).T
+        self._scene, level = trimesh.util.concatenate(self._world), np.cos(elevation)
+        self._towards = np.stack((np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)), axis=-1)
 
     def entity(
         self, joint: int, label: str, point: Float[np.ndarray, "3"], inside: bool, parts: tuple[int, ...]
@@ -220,25 +209,22 @@ class _Finder:
             return self.handles(-1)
         thing = self._articulation
         parts = thing.body_parts(0)
-        area = {
-            j: sum(thing.parts[i].surface.area for i in thing.body_parts(1 + j))
-            for j, joint in enumerate(thing.joints)
-            if joint.joint.kind == "revolute" and joint.parent == 0
-        }
-        if category not in _LIFTED_BY_RIM or not parts or not area:
+        lids = [j for j, joint in enumerate(thing.joints) if joint.joint.kind == "revolute" and joint.parent == 0]
+        if category not in _LIFTED_BY_RIM or not parts or not lids:
             return []
-        lid = max(area, key=lambda j: area[j])
-        point, inside = self.outer_point(parts, self.base_rim_target(lid), samples=_THIN_SAMPLES)
-        return [self.entity(-1, "rim", point, inside, ())]
+        lid = max(lids, key=lambda j: sum(thing.parts[i].surface.area for i in thing.body_parts(1 + j)))
+        # The middle of the base's edge farthest from the lid's axis.
+        joint, pose = thing.joints[lid], thing.joints[lid].parent_from_joint
+        target = self._far_edge(self._body_samples(-1) - pose[:3, 3], pose[:3, :3] @ joint.axis) + pose[:3, 3]
+        return [self.entity(-1, "rim", *self.outer_point(parts, target, samples=_THIN_SAMPLES), ())]
 
     def placed(self, place: PlacedEntity) -> list[SimEntity]:
         """What somebody has pointed out."""
         if place.parts:
-            body_of = {i: self._articulation.parts[i].body for i in place.parts}
-            bodies = sorted(set(body_of.values()))
-            return [
-                e for b in bodies for e in self._of_parts(b - 1, place.label, [i for i in body_of if body_of[i] == b])
-            ]
+            by_body: dict[int, list[int]] = {}
+            for i in place.parts:
+                by_body.setdefault(self._articulation.parts[i].body, []).append(i)
+            return [e for body, parts in sorted(by_body.items()) for e in self._of_parts(body - 1, place.label, parts)]
         parts, joint = self._articulation.body_parts(place.body), place.body - 1
         if not parts:
             raise ObjectError(f"{place.where}: its link has no visual that could be seen; use a link with meshes")
@@ -282,25 +268,21 @@ class _Finder:
         body = self._articulation.parts[parts[0]].body
         area = np.array([max(self._world[i].area, 1e-12) for i in parts])
         counts = np.maximum(20, np.ceil(samples * area / area.sum())).astype(int)
-        points = np.concatenate([_sample(self._world[i], int(n))[0] for i, n in zip(parts, counts, strict=True)])
+        points = np.concatenate([_sample(self._world[i], int(n)) for i, n in zip(parts, counts, strict=True)])
         goal = apply(self._poses[body], target)
         # Rays are cast for the samples nearest to the target only: they decide.
         points = points[np.argsort(np.linalg.norm(points - goal, axis=1), kind="stable")[:_SAMPLES]]
-        outer, inside = self._outer(points, body)
-        points = points[outer]
+        seen = self._seen_share(points, self._scene)
+        inside = bool(seen.max() == 0)
+        if inside:  # the closed object: judge the body alone, as it will look when pulled out
+            own = [self._world[i] for i in self._articulation.body_parts(body)]
+            seen = self._seen_share(points, trimesh.util.concatenate(own))
+        points = points[seen >= 0.5 * seen.max()]
         nearest = points[np.argmin(np.linalg.norm(points - goal, axis=1))]
         return apply(np.linalg.inv(self._poses[body]), nearest), inside
 
-    def _outer(self, points: Float[np.ndarray, "N 3"], body: int) -> tuple[Bool[np.ndarray, " N"], bool]:
-        seen = self._seen_share(points, self._scene)
-        inside = bool(seen.max() == 0)
-        if inside:
-            # Inside the closed object: judge the body alone, as it will look when pulled out.
-            own = [self._world[i] for i in self._articulation.body_parts(body)]
-            seen = self._seen_share(points, _joined(own))
-        return seen >= 0.5 * seen.max(), inside
-
-    def _seen_share(self, points: Float[np.ndarray, "N 3"], mesh: trimesh.Trimesh) -> Float[np.ndarray, " N"]:
+    def _seen_share(self, points: Float[np.ndarray, "N 3"], mesh: Any) -> Float[np.ndarray, " N"]:
+        """From which share of the directions towards the cameras nothing of a mesh is in front of each point."""
         origin = points[:, None] + 2e-3 * self._half_diagonal_m * self._towards
         direction = np.broadcast_to(self._towards, origin.shape)
         hit = mesh.ray.intersects_any(origin.reshape(-1, 3), direction.reshape(-1, 3))
@@ -309,17 +291,11 @@ class _Finder:
     def _body_samples(self, joint: int) -> Float[np.ndarray, "N 3"]:
         parts = self._articulation.body_parts(1 + joint)
         vertices = self._articulation.body_points[1 + joint]
-        return np.concatenate([vertices, *(_sample(self._articulation.parts[i].surface, 200)[0] for i in parts)])
+        return np.concatenate([vertices, *(_sample(self._articulation.parts[i].surface, 200) for i in parts)])
 
     def rim_target(self, joint: int) -> Float[np.ndarray, "3"]:
         """Middle of the edge farthest from the axis, in the body's frame (whose origin lies on the axis)."""
         return self._far_edge(self._body_samples(joint), self._articulation.joints[joint].axis)
-
-    def base_rim_target(self, joint: int) -> Float[np.ndarray, "3"]:
-        """Middle of the base's edge farthest from a joint's axis, in the base's frame."""
-        pose = self._articulation.joints[joint].parent_from_joint
-        axis = pose[:3, :3] @ self._articulation.joints[joint].axis
-        return self._far_edge(self._body_samples(-1) - pose[:3, 3], axis) + pose[:3, 3]
 
     def _far_edge(self, points: Float[np.ndarray, "N 3"], axis: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
         """Middle of the edge of points that is farthest from an axis through the origin."""
@@ -333,8 +309,8 @@ class _Finder:
     def front_target(self, joint: int) -> Float[np.ndarray, "3"]:
         """Middle of the face that the body moves towards, in the body's frame."""
         points = self._body_samples(joint)
-        sign = 1.0 if self._articulation.joints[joint].opening() >= 0 else -1.0
-        towards = sign * self._articulation.joints[joint].axis
+        moving = self._articulation.joints[joint]
+        towards = moving.axis if moving.opening() >= 0 else -moving.axis
         along = points @ towards
         face = points[along >= along.max() - 0.05 * self._half_diagonal_m]
         middle = (face.min(axis=0) + face.max(axis=0)) / 2

@@ -42,7 +42,7 @@ from quest.sim.hand_shape import (
     unit_rows,
     upper_sleeve_sections,
 )
-from quest.sim.procedural.model import Mesh, join
+from quest.sim.procedural.shapes import Mesh, join
 from quest.sim.pull import CLEARANCE_M, Boxes, Grasp, Pull, Puller, Task, Tool, plan_pull
 from quest.sim.surfaces import Surface, make_material, sample_colour, sample_surface, triple
 

@@ -24,7 +24,7 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import ConvexHull
 
-from quest.sim.procedural.model import Mesh
+from quest.sim.procedural.shapes import Mesh
 from quest.sim.pull import CLEARANCE_M
 from quest.sim.surfaces import TILE_M
 

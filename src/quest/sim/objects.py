@@ -196,34 +196,22 @@ def load_object(path: Path) -> SimObject:
             moves.
     """
     with reading(path, ObjectError, "use another object"):
-        return _load(Path(path))
-
-
-def _load(path: Path) -> SimObject:
-    urdf_path = find_urdf(path)
-    folder = urdf_path.parent
-    warnings: list[str] = []
-    urdf = read_urdf(urdf_path)
-    meta = _read_json(folder / "meta.json", warnings)
-    described = folder / DESCRIPTION_NAME
-    description = read_description(described) if described.is_file() else NOTHING_SAID
-    own = described.is_file() or urdf_path.name != "mobility.urdf"
-    if not own:
-        urdf = with_scaled_origins(urdf, warnings)
-        description = CORRECTIONS.get(folder.name, description)
-    model_cat = meta.get("model_cat") if isinstance(meta, dict) else None
-    category = str(description.category or model_cat or _category_of_base(folder))
-    object_id = object_id_of(path)
-    return object_from_urdf(
-        urdf,
-        object_id,
-        category,
-        source=_source_of(folder, object_id, warnings) if own else "partnet-mobility",
-        where=urdf_path,
-        description=description,
-        part_names=_names_of_meshes(folder, warnings),
-        warnings=warnings,
-    )
+        urdf_path, object_id = find_urdf(Path(path)), object_id_of(Path(path))
+        folder, warnings = urdf_path.parent, []
+        urdf = read_urdf(urdf_path)
+        meta = _read_json(folder / "meta.json", warnings)
+        described = folder / DESCRIPTION_NAME
+        description = read_description(described) if described.is_file() else NOTHING_SAID
+        own = described.is_file() or urdf_path.name != "mobility.urdf"
+        if not own:
+            urdf = with_scaled_origins(urdf, warnings)
+            description = CORRECTIONS.get(folder.name, description)
+        model_cat = meta.get("model_cat") if isinstance(meta, dict) else None
+        category = str(description.category or model_cat or _category_of_base(folder))
+        return object_from_urdf(
+            urdf, object_id, category, source=_source_of(folder, object_id, warnings) if own else "partnet-mobility",
+            where=urdf_path, description=description, part_names=_names_of_meshes(folder, warnings), warnings=warnings,
+        )  # fmt: skip
 
 
 def _source_of(folder: Path, object_id: str, warnings: list[str]) -> Source:
@@ -337,6 +325,12 @@ def _scale(
     return 1.0
 
 
+def _category_of_base(folder: Path) -> str:
+    path = folder / "semantics.txt"
+    words = path.read_text(encoding="utf-8", errors="replace").split() if path.exists() else []
+    return next((_CATEGORY_OF_BASE[w] for w in words if w in _CATEGORY_OF_BASE), "Unknown")
+
+
 def _read_json(path: Path, warnings: list[str]) -> Any:
     if not path.exists():
         return None
@@ -345,12 +339,6 @@ def _read_json(path: Path, warnings: list[str]) -> Any:
     except ObjectError as error:
         warnings.append(f"left out: {error}")
         return None
-
-
-def _category_of_base(folder: Path) -> str:
-    path = folder / "semantics.txt"
-    words = path.read_text(encoding="utf-8", errors="replace").split() if path.exists() else []
-    return next((_CATEGORY_OF_BASE[w] for w in words if w in _CATEGORY_OF_BASE), "Unknown")
 
 
 def _articulation(
@@ -405,12 +393,8 @@ def _parts(
             name, (body, body_from_link) = _part_name(visual, link, part_names), body_of_link[link]
             body_from_part = body_from_link @ visual.link_from_visual
             in_body = surface.copy().apply_transform(body_from_part)
-            parts.append(
-                Part(
-                    name=name, visual=visual.name, body=body, body_from_part=body_from_part, mesh=visual.mesh,
-                    scale=visual.scale, uv_scale=visual.scale, shape=visual.shape, rgba=visual.rgba, surface=in_body,
-                )
-            )  # fmt: skip
+            looks = visual.mesh, visual.scale, visual.scale, visual.shape, visual.rgba
+            parts.append(Part(name, visual.name, body, body_from_part, *looks, in_body))
     if not parts:
         raise ObjectError(
             f"{where}: expected meshes beside it, found none of the {len(missing)} that it names "

@@ -130,30 +130,29 @@ def fit_shape(
     low, high = turned.min(axis=0), turned.max(axis=0)
     a, b = (high - low) / 2
     rotation = _turn(2, roll) @ _turn(0, float(tilt[0])) @ _turn(1, float(tilt[1]))
+    kind: Literal["box", "cylinder"] = "cylinder" if form in ("column", "disc") else "box"
+    half = [a, b, thick * min(a, b)]
     if form == "column":  # along its longer side
-        kind, half, rotation = ("cylinder", [a, b, b], rotation) if a > b else ("cylinder", [b, a, a], rotation @ _UP)
+        half, rotation = ([a, b, b], rotation) if a > b else ([b, a, a], rotation @ _UP)
     elif form == "disc":
-        kind, half, rotation = "cylinder", [thick * max(a, b), max(a, b), max(a, b)], rotation @ _TOWARDS
-    else:
-        kind, half = "box", [a, b, thick * min(a, b)]
+        half, rotation = [thick * max(a, b), max(a, b), max(a, b)], rotation @ _TOWARDS
     pose = np.eye(4)
     pose[:3, :3] = rotation
     pose[:2, 3], pose[2, 3] = _turn(2, roll)[:2, :2] @ ((low + high) / 2), 1.0
     camera = posed.camera
     image = camera.width / camera.fx * camera.height / camera.fy
-    shape = Shape("box" if kind == "box" else "cylinder", room * np.array(half), pose)
+    shape = Shape(kind, room * np.array(half), pose)
     # The sides of what is thick or tilted do not all look at the camera: grow until everything is hidden.
     while not _fits(shape, slopes):
-        shape = Shape(shape.kind, shape.half_m * _GROWTH, pose)
+        shape = Shape(kind, shape.half_m * _GROWTH, pose)
         if shape.vertices[:, 2].min() < 0.2 or shape.outline.volume > _LARGEST * image:
             return None
     if shape.outline.volume > _LARGEST * image:
         return None
     # Shrunk towards the camera's centre it hides just the same.
     scale = place * nearest_m / shape.vertices[:, 2].max()
-    pose = pose.copy()
     pose[:3, 3] *= scale
-    return Shape(shape.kind, shape.half_m * scale, pose)
+    return Shape(kind, shape.half_m * scale, pose)
 
 
 def _fits(shape: Shape, slopes: Float[np.ndarray, "N 2"]) -> bool:

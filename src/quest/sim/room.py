@@ -22,8 +22,9 @@ from quest.sim.articulation import Articulation, Part, apply
 from quest.sim.objects import SimObject, find_things, load_thing
 from quest.sim.procedural.catalogue import make_object
 from quest.sim.procedural.clutter import things_on
-from quest.sim.procedural.model import Dice, Mesh, as_visual, box
+from quest.sim.procedural.model import Dice, as_visual
 from quest.sim.procedural.model import Part as ModelPart
+from quest.sim.procedural.shapes import Mesh, box
 from quest.sim.surfaces import triple
 
 _SMALLEST_M = 0.15

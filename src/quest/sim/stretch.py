@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.errors import ObjectError
-from quest.sim.articulation import Articulation, Part
+from quest.sim.articulation import ArticulatedJoint, Articulation, Part
 from quest.sim.objects import SimObject
 
 
@@ -39,18 +39,16 @@ def stretched(sim_object: SimObject, factors: Float[np.ndarray, "3"]) -> SimObje
     stretch = rotation.swapaxes(1, 2) @ (factors[:, None] * rotation)  # in the axes of each body
     root = before.world_from_root.copy()
     root[:3, 3] *= factors
-    after = Articulation(
-        before.body_names, tuple(_part(part, stretch[part.body]) for part in before.parts), before.joints, root
+    parts = tuple(_part(part, stretch[part.body]) for part in before.parts)
+    joints = tuple(_joint(joint, poses[joint.parent], factors, sim_object.object_id) for joint in before.joints)
+    after = Articulation(before.body_names, parts, joints, root)
+    points = [stretch[e.body] @ e.point for e in sim_object.entities]
+    entities = tuple(
+        replace(e, point=point, travel_m=after.travel_m(e.joint, point))
+        for e, point in zip(sim_object.entities, points, strict=True)
     )
-    after = _with_joints(after, poses, factors, sim_object.object_id)
-    extent = after.extent_m
-    entities = []
-    for e in sim_object.entities:
-        point = stretch[e.body] @ e.point
-        entities.append(replace(e, point=point, travel_m=after.travel_m(e.joint, point)))
-    return replace(
-        sim_object, articulation=after, entities=tuple(entities), half_diagonal_m=float(np.linalg.norm(extent)) / 2
-    )
+    half_diagonal_m = float(np.linalg.norm(after.extent_m)) / 2
+    return replace(sim_object, articulation=after, entities=entities, half_diagonal_m=half_diagonal_m)
 
 
 def _part(part: Part, stretch: Float[np.ndarray, "3 3"]) -> Part:
@@ -70,29 +68,22 @@ def _part(part: Part, stretch: Float[np.ndarray, "3 3"]) -> Part:
     )
 
 
-def _with_joints(
-    after: Articulation,
-    poses: Float[np.ndarray, "B 4 4"],
-    factors: Float[np.ndarray, "3"],
-    object_id: str,
-) -> Articulation:
-    """The object with joints between bodies that stand where stretching put them."""
-    joints = []
-    for joint in after.joints:
-        world_from_parent = poses[joint.parent]
-        world_from_joint = world_from_parent @ joint.parent_from_joint
-        axis = world_from_joint[:3, :3].T @ (factors * (world_from_joint[:3, :3] @ joint.axis))
-        length = float(np.linalg.norm(axis))
-        record, rest = joint.joint, joint.rest
-        if record.kind == "prismatic":
-            record, rest = replace(record, lower=record.lower * length, upper=record.upper * length), rest * length
-        elif rest != 0 and not np.allclose(axis / length, joint.axis, atol=1e-6):
-            raise ObjectError(
-                f"object {object_id}: joint {record.name} turns about an oblique axis and is at {rest:.3g} rad when "
-                "closed; it cannot be stretched, make it without --stretch"
-            )
-        parent_from_joint = joint.parent_from_joint.copy()
-        between = factors * (world_from_joint[:3, 3] - world_from_parent[:3, 3])
-        parent_from_joint[:3, 3] = world_from_parent[:3, :3].T @ between
-        joints.append(replace(joint, joint=record, rest=rest, axis=axis / length, parent_from_joint=parent_from_joint))
-    return replace(after, joints=tuple(joints))
+def _joint(
+    joint: ArticulatedJoint, world_from_parent: Float[np.ndarray, "4 4"], factors: Float[np.ndarray, "3"], of: str
+) -> ArticulatedJoint:
+    """A joint of an object called ``of``, between bodies that stand where stretching put them."""
+    world_from_joint = world_from_parent @ joint.parent_from_joint
+    axis = world_from_joint[:3, :3].T @ (factors * (world_from_joint[:3, :3] @ joint.axis))
+    length = float(np.linalg.norm(axis))
+    record, rest = joint.joint, joint.rest
+    if record.kind == "prismatic":
+        record, rest = replace(record, lower=record.lower * length, upper=record.upper * length), rest * length
+    elif rest != 0 and not np.allclose(axis / length, joint.axis, atol=1e-6):
+        raise ObjectError(
+            f"object {of}: joint {record.name} turns about an oblique axis and is at {rest:.3g} rad when closed; "
+            "it cannot be stretched, make it without --stretch"
+        )
+    parent_from_joint = joint.parent_from_joint.copy()
+    between = factors * (world_from_joint[:3, 3] - world_from_parent[:3, 3])
+    parent_from_joint[:3, 3] = world_from_parent[:3, :3].T @ between
+    return replace(joint, joint=record, rest=rest, axis=axis / length, parent_from_joint=parent_from_joint)

@@ -22,7 +22,9 @@ _MOST = 1e6
 CONTINUOUS_RANGE_RAD = np.pi / 2
 """How far a joint without limits is taken to turn."""
 
-_JOINT_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": "fixed"}
+_JOINT_TYPES = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
+"""What has more than one degree of freedom is rare in articulated objects, and stays fixed."""
+_SIZES = {"cylinder": ("radius", "length"), "sphere": ("radius",)}
 
 
 @dataclass(frozen=True)
@@ -161,29 +163,21 @@ def _visual(element: ElementTree.Element, folder: Path, colours: dict) -> UrdfVi
     shape = None if geometry is None else next(iter(geometry), None)
     if shape is None:
         raise ValueError(f"visual {element.get('name')!r} has no geometry")
-    mesh, scale, size = None, np.ones(3), np.zeros(0)
+    mesh, scale, size = None, np.ones(3), []
     if shape.tag == "mesh":
-        mesh = _mesh_path(shape.attrib["filename"], folder)
-        scale_text = shape.get("scale")
-        scale = (
-            _numbers(scale_text, (1, 1, 1))
-            if len((scale_text or "1 1 1").split()) == 3
-            else np.full(3, _number(scale_text or "1"))
-        )
+        mesh, text = _mesh_path(shape.attrib["filename"], folder), shape.get("scale")
+        each = len((text or "1 1 1").split()) == 3
+        scale = _numbers(text, (1, 1, 1)) if each else np.full(3, _number(text or "1"))
     elif shape.tag == "box":
-        size = _numbers(shape.attrib["size"], (0, 0, 0))
-    elif shape.tag == "cylinder":
-        size = np.array([_number(shape.attrib["radius"]), _number(shape.attrib["length"])])
-    elif shape.tag == "sphere":
-        size = np.array([_number(shape.attrib["radius"])])
+        size = _numbers(shape.attrib["size"], (0, 0, 0)).tolist()
+    elif shape.tag in _SIZES:
+        size = [_number(shape.attrib[key]) for key in _SIZES[shape.tag]]
     else:
         raise ValueError(f"unknown geometry {shape.tag!r}")
     material = element.find("material")
     rgba = None if material is None else _rgba(material) or colours.get(material.get("name"))
     sx, sy, sz = scale.tolist()
-    return UrdfVisual(
-        element.get("name") or "", _origin(element), mesh, (sx, sy, sz), shape.tag, tuple(size.tolist()), rgba
-    )
+    return UrdfVisual(element.get("name") or "", _origin(element), mesh, (sx, sy, sz), shape.tag, tuple(size), rgba)
 
 
 def _mesh_path(filename: str, folder: Path) -> Path:
@@ -204,21 +198,15 @@ def _joint(element: ElementTree.Element) -> UrdfJoint:
     parent, child = element.find("parent"), element.find("child")
     if parent is None or child is None:
         raise ValueError(f"joint {element.get('name')!r} lacks a parent or child")
-    urdf_type = element.attrib["type"]
-    # Joint types with more than one degree of freedom are rare in articulated objects and stay fixed.
-    kind = _JOINT_TYPES.get(urdf_type, "fixed")
-    axis_element = element.find("axis")
-    axis = _numbers(None if axis_element is None else axis_element.get("xyz"), (1, 0, 0))
+    kind = _JOINT_TYPES.get(element.attrib["type"], "fixed")
+    limit, mimic, towards = (element.find(tag) for tag in ("limit", "mimic", "axis"))
+    axis = _numbers(None if towards is None else towards.get("xyz"), (1, 0, 0))
     norm = float(np.linalg.norm(axis))
     if kind != "fixed" and norm < 1e-9:
         raise ValueError(f"joint {element.get('name')!r} has an axis of length zero")
-    limit, mimic = element.find("limit"), element.find("mimic")
-    lower, upper = 0.0, 0.0
-    if kind != "fixed":
-        if urdf_type == "continuous" or limit is None:
-            lower, upper = 0.0, CONTINUOUS_RANGE_RAD if kind == "revolute" else 0.0
-        else:
-            lower, upper = sorted((_number(limit.get("lower", "0")), _number(limit.get("upper", "0"))))
+    lower, upper = 0.0, CONTINUOUS_RANGE_RAD if kind == "revolute" else 0.0
+    if kind != "fixed" and element.attrib["type"] != "continuous" and limit is not None:
+        lower, upper = sorted((_number(limit.get("lower", "0")), _number(limit.get("upper", "0"))))
     return UrdfJoint(
         element.attrib["name"], kind, parent.attrib["link"], child.attrib["link"], _origin(element),
         axis / max(norm, 1e-9), lower, upper, None if mimic is None else mimic.get("joint"),
@@ -229,10 +217,11 @@ def _ordered(joints: list[UrdfJoint], links: dict, path: Path) -> tuple[UrdfJoin
     """Joints from the root to the leaves; file order among those that are equally deep."""
     children = [j.child for j in joints]
     unknown = sorted({n for j in joints for n in (j.parent, j.child)} - set(links))
-    if unknown or len(set(children)) < len(children) or not links:
+    twice = len(children) - len(set(children))
+    if unknown or twice or not links:
         raise ObjectError(
-            f"{path}: expected links that form a tree; unknown links {unknown}, "
-            f"{len(children) - len(set(children))} links with two parents; restore the file from its source"
+            f"{path}: expected links that form a tree; unknown links {unknown}, {twice} links with two parents; "
+            "restore the file from its source"
         )
     reached, remaining, order = set(links) - set(children), list(joints), []
     while remaining:

@@ -6,7 +6,6 @@ on the panels of cookers, ovens, microwaves and washing machines.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal
@@ -15,21 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from quest.sim.procedural.handles import SUNK_M, HandleKind, HandleStyle, handle_part, sample_any_style
-from quest.sim.procedural.model import (
-    FRONT,
-    UP,
-    Dice,
-    Link,
-    Mesh,
-    ObjectModel,
-    Part,
-    box,
-    join,
-    lathe,
-    prism_between,
-    turn_x,
-)  # fmt: skip
-from quest.types import GRIPS
+from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
+from quest.sim.procedural.shapes import Mesh, box, boxes, copies, join, lathe, prism_between, walls
 
 _MARGIN_M = 0.004
 _NARROWEST_M = 0.05
@@ -54,19 +40,10 @@ class _Panel:
     depth: float = 0.05
     """How thick it is, metres."""
 
-    def turned(self, mesh: Mesh) -> Mesh:
-        """What is drawn for an upright panel, leant back with this one."""
-        return mesh.rotated(turn_x(-self.tilt))
-
     def at(self, across: float, up: float) -> tuple[float, float, float]:
         """A point of its face in the object's frame; ``across`` from its middle, ``up`` from its foot, metres."""
         x, y, z = self.foot
         return (x + across, y + up * float(np.sin(self.tilt)), z + up * float(np.cos(self.tilt)))
-
-    @property
-    def out(self) -> tuple[float, float, float]:
-        """Unit direction away from its face."""
-        return (0.0, -float(np.cos(self.tilt)), float(np.sin(self.tilt)))
 
 
 def with_dials(model: ObjectModel, rng: Dice) -> ObjectModel:
@@ -79,7 +56,7 @@ def with_dials(model: ObjectModel, rng: Dice) -> ObjectModel:
     panels = _free_panels(model, rng)
     panel = rng.pick(panels)
     face = box((-panel.width / 2, 0.0, 0.0), (panel.width / 2, panel.depth, panel.height))
-    body = [Part("control_panel", panel.turned(face).moved(panel.foot), rng.pick(_DIAL_SURFACES))]
+    body = [Part("control_panel", face.tilted(-panel.tilt).moved(panel.foot), rng.pick(_DIAL_SURFACES))]
     row = panel.width >= panel.height
     long, short = (panel.width, panel.height) if row else (panel.height, panel.width)
     radius = min(rng.real(0.013, 0.034), 0.36 * short)
@@ -88,40 +65,31 @@ def with_dials(model: ObjectModel, rng: Dice) -> ObjectModel:
     if rng.chance(0.5):
         body += _displays(panel, offsets, radius, row=row)
     mesh, surface = _dial(radius, rng), rng.pick(_DIAL_SURFACES)
-    links = list(model.links)
-    for offset in offsets:
-        across, up = (offset, level) if row else (level - short / 2, offset + long / 2)
-        part = Part("knob", panel.turned(mesh), surface)
-        links.append(Link((part,), "revolute", panel.at(across, up), panel.out, rng.angle(90, 300)))
-    return ObjectModel(model.model_cat, (*model.body, *body), tuple(links))
+    part = Part("knob", mesh.tilted(-panel.tilt), surface)
+    out = (0.0, -float(np.cos(panel.tilt)), float(np.sin(panel.tilt)))
+    places = [(offset, level) if row else (level - short / 2, offset + long / 2) for offset in offsets]
+    dials = [Link((part,), "revolute", panel.at(*place), out, rng.angle(90, 300)) for place in places]
+    return ObjectModel(model.model_cat, (*model.body, *body), (*model.links, *dials))
 
 
 def _free_panels(model: ObjectModel, rng: Dice) -> list[_Panel]:
     """Where the front has room for a panel, and one on top at the back."""
-    body = np.concatenate([part.mesh.vertices for part in model.body])
-    low, high = body.min(axis=0), body.max(axis=0)
-    fronts = np.concatenate([
-        part.mesh.vertices + link.origin for link in model.links for part in link.parts if part.role not in GRIPS
-    ])  # fmt: skip
-    near, far = fronts.min(axis=0), fronts.max(axis=0)
-    front = min(float(low[1]), float(near[1])) - rng.real(0.001, 0.015)
-    middle = float(low[0] + high[0]) / 2
-    panels = [
-        _Panel(
-            float(high[0] - low[0]), rng.real(0.08, 0.22),
-            (middle, float(high[1]) - rng.real(0.06, 0.12), float(high[2]) - _MARGIN_M),
-            tilt=max(0.0, rng.real(-0.3, 0.6)),
-        )
-    ]  # fmt: skip
-    above = float(high[2] - far[2]) - 2 * _MARGIN_M
+    low, high = join([part.mesh for part in model.body]).bounds.tolist()
+    fronts = [part.mesh.moved(link.origin) for link in model.links for part in link.rest]
+    near, far = join(fronts).bounds.tolist()
+    front, width = min(low[1], near[1]) - rng.real(0.001, 0.015), high[0] - low[0]
+    middle = (low[0] + high[0]) / 2
+    tall = rng.real(0.08, 0.22)
+    foot = (middle, high[1] - rng.real(0.06, 0.12), high[2] - _MARGIN_M)
+    panels = [_Panel(width, tall, foot, tilt=max(0.0, rng.real(-0.3, 0.6)))]
+    above = high[2] - far[2] - 2 * _MARGIN_M
     if above > _NARROWEST_M:
-        foot = (middle, front, float(far[2]) + _MARGIN_M)
-        panels.append(_Panel(float(high[0] - low[0]) - 2 * _MARGIN_M, above, foot))
+        panels.append(_Panel(width - 2 * _MARGIN_M, above, (middle, front, far[2] + _MARGIN_M)))
     for inner, outer in ((far[0], high[0]), (near[0], low[0])):
-        beside = abs(float(outer - inner)) - 2 * _MARGIN_M
+        beside = abs(outer - inner) - 2 * _MARGIN_M
         if beside > _NARROWEST_M:
-            foot = (float(inner + outer) / 2, front, float(low[2]) + _MARGIN_M)
-            panels.append(_Panel(beside, float(high[2] - low[2]) - 2 * _MARGIN_M, foot))
+            foot = ((inner + outer) / 2, front, low[2] + _MARGIN_M)
+            panels.append(_Panel(beside, high[2] - low[2] - 2 * _MARGIN_M, foot))
     return panels
 
 
@@ -133,12 +101,12 @@ def _places(long: float, radius: float, rng: Dice) -> list[float]:
     free = max(0.0, long - 2.4 * radius - (count - 1) * gap)
     way = rng.pick(["spread", "tight", "groups"])
     if count > 1 and way == "spread":
-        return [float(x) for x in np.linspace(-0.5, 0.5, count) * (long - 3 * radius)]
+        return (np.linspace(-0.5, 0.5, count) * (long - 3 * radius)).tolist()
     steps = np.arange(count) * gap
     if count > 2 and way == "groups":
         steps[count // 2 :] += rng.real(0.3, 1.0) * free
     shift = rng.real(-0.5, 0.5) * max(0.0, long - 2.4 * radius - float(steps[-1]))
-    return [float(x) for x in steps - steps[-1] / 2 + shift]
+    return (steps - steps[-1] / 2 + shift).tolist()
 
 
 def _displays(panel: _Panel, offsets: list[float], radius: float, *, row: bool) -> list[Part]:
@@ -151,7 +119,7 @@ def _displays(panel: _Panel, offsets: list[float], radius: float, *, row: bool) 
     half, middle, tall = wide / 2 - 2 * radius, start + wide / 2, 0.25 * short
     size = (half, tall) if row else (tall, half)
     across, up = (middle, short / 2) if row else (0.0, middle + long / 2)
-    mesh = panel.turned(box((-size[0], -0.002, -size[1]), (size[0], SUNK_M, size[1])))
+    mesh = box((-size[0], -0.002, -size[1]), (size[0], SUNK_M, size[1])).tilted(-panel.tilt)
     return [Part("display", mesh.moved(panel.at(across, up)), "dark")]
 
 
@@ -160,8 +128,7 @@ def _dial(radius: float, rng: Dice) -> Mesh:
     reach = rng.real(0.6, 1.3) * radius
     kind = rng.pick(_SHAPES)
     if kind == "cylinder":
-        profile = [[1.0, -SUNK_M], [rng.real(0.8, 1.0), 0.9 * reach], [0.8, reach]]
-        return lathe([[radius * r, h] for r, h in profile])
+        return lathe([[radius, -SUNK_M], [radius * rng.real(0.8, 1.0), 0.9 * reach], [radius * 0.8, reach]])
     if kind == "turned":
         foot = lathe([[radius, -SUNK_M], [radius, 0.25 * reach], [0.9 * radius, 0.4 * reach]])
         half = radius * rng.real(0.15, 0.3)
@@ -170,7 +137,7 @@ def _dial(radius: float, rng: Dice) -> Mesh:
         cos, sin = np.cos(angle), np.sin(angle)
         return join([foot, bar.rotated(np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]]))])
     style = HandleStyle(kind, radius, radius, reach, 1.0, "dark")
-    return handle_part(style, at=(0.0, 0.0, 0.0), vertical=False, room_m=(4 * radius, 4 * radius)).mesh
+    return handle_part(style, at=(0, 0, 0), vertical=False, room_m=(4 * radius, 4 * radius)).mesh
 
 
 _WASHER_GRIPS: tuple[HandleKind, ...] = ("bow", "d_pull", "arched")
@@ -187,17 +154,12 @@ def _handle(rng: Dice, scale: float) -> HandleStyle:
 
 def _shell(width: float, depth: float, low: float, high: float, wall: float) -> Mesh:
     """A box that is open at the front, y = 0."""
-    return join([
-        box((0, 0, low), (wall, depth, high)), box((width - wall, 0, low), (width, depth, high)),
-        box((wall, 0, low), (width - wall, depth, low + wall)),
-        box((wall, 0, high - wall), (width - wall, depth, high)),
-        box((wall, depth - wall, low + wall), (width - wall, depth, high - wall)),
-    ])  # fmt: skip
+    return walls((0, 0, low), (width, depth, high), wall, "-x +x -z +z +y")
 
 
 def _tray(width: float, depth: float, height: float) -> Mesh:
     """A box that is open above, from (0, 0, 0)."""
-    return _shell(width, height, 0.0, depth, 0.006).rotated(UP).moved((0, 0, height))
+    return _shell(width, height, 0.0, depth, 0.006).turned("up").moved((0, 0, height))
 
 
 def _flap(width: float, height: float, thick: float, window: float, surface: str) -> list[Part]:
@@ -213,14 +175,7 @@ def _flap(width: float, height: float, thick: float, window: float, surface: str
 def _rack(rng: Dice, width: float, depth: float, height: float) -> Mesh:
     """A basket of wires from (0, 0, 0), its front at y = 0."""
     wire, gap = 0.004, rng.real(0.035, 0.06)
-    rods = []
-    for z in (0.0, height):
-        rods += [
-            box((0, 0, z), (width, 2 * wire, z + 2 * wire)),
-            box((0, depth - 2 * wire, z), (width, depth, z + 2 * wire)),
-            box((0, 2 * wire, z), (2 * wire, depth - 2 * wire, z + 2 * wire)),
-            box((width - 2 * wire, 2 * wire, z), (width, depth - 2 * wire, z + 2 * wire)),
-        ]  # fmt: skip
+    rods = [walls((0, 0, z), (width, depth, z + 2 * wire), 2 * wire, "-y +y -x +x") for z in (0.0, height)]
     for x in np.arange(gap, width - gap / 2, gap):
         rods.append(box((x, 2 * wire, 0), (x + wire, depth - 2 * wire, wire)))
         rods += [box((x, y, 2 * wire), (x + wire, y + wire, height)) for y in (wire / 2, depth - 1.5 * wire)]
@@ -229,7 +184,7 @@ def _rack(rng: Dice, width: float, depth: float, height: float) -> Mesh:
     return join(rods)
 
 
-def _rack_dishwasher(rng: Dice) -> ObjectModel:
+def rack_dishwasher(rng: Dice) -> ObjectModel:
     """A dishwasher whose door folds down, and two racks behind it that slide out."""
     width, height, depth = rng.real(0.45, 0.62), rng.real(0.8, 0.88), rng.real(0.55, 0.62)
     plinth, thick, wall = rng.real(0.08, 0.14), rng.real(0.03, 0.05), 0.03
@@ -242,30 +197,27 @@ def _rack_dishwasher(rng: Dice) -> ObjectModel:
         Part("frame", _shell(width, depth, plinth, height, wall), surface),
         Part("base", box((0.01, 0.06, 0), (width - 0.01, depth - 0.01, plinth)), "dark"),
     ]
-    rails = [box((x, 0.03, z - 0.012), (x + 0.006, deep, z)) for x in (wall, width - wall - 0.006) for z in (low, high)]
-    body.append(Part("rail", join(rails), "metal"))
+    corners = [(x, z) for x in (wall, width - wall - 0.006) for z in (low, high)]
+    rails = boxes(*(((x, 0.03, z - 0.012), (x + 0.006, deep, z)) for x, z in corners))
+    body.append(Part("rail", rails, "metal"))
     door_h = height - plinth - 0.01
     parts = _flap(width - 0.006, door_h, thick, 0.0, surface)
-    style = _handle(rng, 1.6)
-    edge = rng.real(0.05, 0.09)
+    style, edge = _handle(rng, 1.6), rng.real(0.05, 0.09)
+    at, room = (width / 2, 0.0, door_h - 0.04 - edge / 2), (0.95 * width, 2 * edge)
+    parts.append(handle_part(style, at=at, vertical=False, room_m=room))
     panel = box((0.004, -0.001, door_h - 0.035), (width - 0.01, 0.001, door_h - 0.004))
-    room = (0.95 * width, 2 * edge)
-    parts += [
-        handle_part(style, at=(width / 2, 0.0, door_h - 0.04 - edge / 2), vertical=False, room_m=room),
-        Part("decal", panel, "dark"),
-    ]
+    parts.append(Part("decal", panel, "dark"))
     hinge = (0.003, -thick - 0.001, plinth + 0.005)
     links = [Link(tuple(parts), "revolute", hinge, (1.0, 0.0, 0.0), rng.angle(82, 91))]
     for z in (low, high):
-        rack = [Part("rack", _rack(rng, rack_w, rack_d, rack_h), "metal")]
+        rack = Part("rack", _rack(rng, rack_w, rack_d, rack_h), "metal")
         bar = box((0.3 * rack_w, -0.014, rack_h - 0.012), (0.7 * rack_w, 0.0, rack_h + 0.006))
-        rack.append(Part("handle", bar, rng.pick(["dark", "white"])))
-        origin = (wall + 0.01, 0.03, z)
-        links.append(Link(tuple(rack), "prismatic", origin, (0.0, -1.0, 0.0), 0.8 * rack_d))
+        handle = Part("handle", bar, rng.pick(["dark", "white"]))
+        links.append(Link((rack, handle), "prismatic", (wall + 0.01, 0.03, z), (0.0, -1.0, 0.0), 0.8 * rack_d))
     return ObjectModel("Dishwasher", tuple(body), tuple(links)).centred(width, depth)
 
 
-def _drawer_oven(rng: Dice) -> ObjectModel:
+def drawer_oven(rng: Dice) -> ObjectModel:
     """A cooker: a hob and dials above an oven's door that folds down, above a drawer."""
     width, height, depth = rng.real(0.5, 0.76), rng.real(0.84, 0.94), rng.real(0.56, 0.66)
     wall, thick = 0.035, rng.real(0.03, 0.05)
@@ -280,15 +232,15 @@ def _drawer_oven(rng: Dice) -> ObjectModel:
         Part("base", box((0.02, 0.05, 0), (width - 0.02, depth - 0.02, foot)), "dark"),
     ]  # fmt: skip
     plates = [
-        lathe([[r, -0.001], [r, 0.008], [0.6 * r, 0.01]], sides=24).rotated(UP).moved((x, y, height))
+        lathe([[r, -0.001], [r, 0.008], [0.6 * r, 0.01]], sides=24).turned("up").moved((x, y, height))
         for x, r in ((0.27 * width, 0.075), (0.73 * width, 0.095)) for y in (0.27 * depth, 0.72 * depth)
     ]  # fmt: skip
     body.append(Part("hob", join(plates), "dark"))
     dial = lathe([[0.02, -0.001], [0.02, 0.012], [0.014, 0.014], [0.013, 0.026]])
     places = np.linspace(0.15, 0.85, rng.whole(4, 7)) * width
-    body.append(Part("dial", join([dial.moved((x, -thick, roof + dials / 2)) for x in places]), "metal"))
-    racks = [_rack(rng, width - 2 * wall, depth - 2 * wall, 0.01).moved((wall, wall, foot + store + 0.2))]
-    body.append(Part("shelf", join(racks), "metal"))
+    body.append(Part("dial", copies(dial, [(x, -thick, roof + dials / 2) for x in places]), "metal"))
+    rack = _rack(rng, width - 2 * wall, depth - 2 * wall, 0.01).moved((wall, wall, foot + store + 0.2))
+    body.append(Part("shelf", rack, "metal"))
     style, gap = _handle(rng, 1.7), 0.006
     door_w, door_h = width - gap, roof - foot - store - gap
     parts = _flap(door_w, door_h, thick, rng.real(0.5, 0.72), surface)
@@ -305,19 +257,15 @@ def _drawer_oven(rng: Dice) -> ObjectModel:
 
 
 def _round_door(
-    rng: Dice,
-    style: HandleStyle,
-    circle: Float[np.ndarray, "P 2"],
-    radius: float,
-    middle: tuple[float, float],
+    rng: Dice, style: HandleStyle, circle: Float[np.ndarray, "P 2"], radius: float, middle: tuple[float, float],
     surface: str,
-) -> Link:
+) -> Link:  # fmt: skip
     """A round door of glass around a point (x, z) of the front, hinged at either side, with a grip at the other."""
     sign = -1.0 if rng.chance(0.7) else 1.0
     # In the frame of its hinge, the door's middle lies at (-sign * reach, 0).
     reach = radius + 0.012
     shift = (-sign * reach, 0.0, 0.0)
-    ring = prism_between(circle * radius, circle * 0.72 * radius, 0.0, 0.035, closed=True).rotated(FRONT)
+    ring = prism_between(circle * radius, circle * 0.72 * radius, 0.0, 0.035, closed=True).turned("front")
     r = 0.74 * radius
     glass = lathe([[r, -0.02], [r, 0.012], [0.85 * r, 0.022], [0.5 * r, 0.032], [0.15 * r, 0.036]], sides=32)
     grip = handle_part(style, at=(-sign * 0.86 * radius, -0.035, 0.0), vertical=True, room_m=(0.1, 0.16))
@@ -330,7 +278,7 @@ def _round_door(
     return Link(parts, "revolute", hinge, (0.0, 0.0, sign), rng.angle(95, 125))
 
 
-def _washing_machine(rng: Dice) -> ObjectModel:
+def washing_machine(rng: Dice) -> ObjectModel:
     """A washing machine: a round glass door hinged at one side, and a drawer for the powder."""
     width, height, depth = 0.6, rng.real(0.82, 0.88), rng.real(0.45, 0.62)
     surface = rng.pick(["white", "white", "metal", "dark"])
@@ -343,8 +291,8 @@ def _washing_machine(rng: Dice) -> ObjectModel:
     half = np.array([width / 2 - wall, (panel_high - panel_low) / 2])
     middle = np.array([x, (panel_low + panel_high) / 2])
     hole = circle * (radius - 0.025) + [x, z]
-    plate = prism_between(square * half + middle, hole, -wall, 0.0, closed=True).rotated(FRONT)
-    tub = prism_between(circle * (radius - 0.02) + [x, z], hole, -0.3, -wall, closed=True).rotated(FRONT)
+    plate = prism_between(square * half + middle, hole, -wall, 0.0, closed=True).turned("front")
+    tub = prism_between(circle * (radius - 0.02) + [x, z], hole, -0.3, -wall, closed=True).turned("front")
     back = lathe([[radius - 0.02, 0.0], [radius - 0.02, 0.004]], sides=36).moved((x, 0.3, z))
     body = [
         Part("frame", join([
@@ -357,30 +305,18 @@ def _washing_machine(rng: Dice) -> ObjectModel:
     ]  # fmt: skip
     drawer_w, strip = 0.17, 0.105
     z0 = height - 0.02 - strip
-    body.append(
-        Part("control_panel", box((wall + drawer_w + 0.008, -0.004, z0), (width - wall, 0.02, z0 + strip)), "dark")
-    )
+    panel = box((wall + drawer_w + 0.008, -0.004, z0), (width - wall, 0.02, z0 + strip))
+    body.append(Part("control_panel", panel, "dark"))
     dial = lathe([[0.03, -0.001], [0.028, 0.02], [0.024, 0.022]], sides=24)
     body.append(Part("dial", dial.moved((rng.real(0.5, 0.8) * width, -0.004, z0 + strip / 2)), "metal"))
-    style = HandleStyle(
-        rng.pick(_WASHER_GRIPS), 0.11, 0.014, rng.real(0.024, 0.036), 1.0,
-        rng.pick(["dark", "metal", "white"]),
-    )  # fmt: skip
+    kind, reach = rng.pick(_WASHER_GRIPS), rng.real(0.024, 0.036)
+    style = HandleStyle(kind, 0.11, 0.014, reach, 1.0, rng.pick(["dark", "metal", "white"]))
     door = _round_door(rng, style, circle, radius, (x, z), surface)
     tray = _tray(drawer_w - 0.01, 0.2, strip - 0.03).moved((0.005, 0.02, 0.01))
-    lip = handle_part(
-        replace(style, kind="edge_pull", length_m=0.12, reach_m=0.02), at=(drawer_w / 2, 0, 0.6 * strip),
-        vertical=False, room_m=(drawer_w, strip),
-    )  # fmt: skip
+    edge = replace(style, kind="edge_pull", length_m=0.12, reach_m=0.02)
+    lip = handle_part(edge, at=(drawer_w / 2, 0, 0.6 * strip), vertical=False, room_m=(drawer_w, strip))
     front = box((0, 0, 0), (drawer_w, 0.02, strip))
     drawer = (Part("drawer_front", front, surface), Part("drawer_box", tray, "inside"), lip)
     slide = (wall + 0.004, -0.004, z0)
     links = (door, Link(drawer, "prismatic", slide, (0.0, -1.0, 0.0), 0.16))
     return ObjectModel("WashingMachine", tuple(body), links).centred(width, depth, -0.02)
-
-
-APPLIANCES: dict[str, Callable[[Dice], ObjectModel]] = {
-    "rack_dishwasher": _rack_dishwasher,
-    "drawer_oven": _drawer_oven,
-    "washing_machine": _washing_machine,
-}

@@ -11,31 +11,35 @@ import numpy as np
 
 from quest.errors import ConfigError
 from quest.sim.objects import SimObject, object_from_urdf
-from quest.sim.procedural.appliances import APPLIANCES, with_dials
+from quest.sim.procedural import appliances, furniture, things
+from quest.sim.procedural.appliances import with_dials
 from quest.sim.procedural.clutter import with_clutter
-from quest.sim.procedural.furniture import FURNITURE, MORE_FURNITURE, TABLES
 from quest.sim.procedural.handles import with_long_handles
 from quest.sim.procedural.model import Dice, ObjectModel, as_urdf
 from quest.sim.procedural.synthesizer import KITCHEN, build_kitchen
-from quest.sim.procedural.things import LIDDED, THINGS
-from quest.types import GRIPS
 
 
 def _without_handles(model: ObjectModel, rng: Dice) -> ObjectModel:
     """Furniture that opens without handles: its fronts and rims are followed."""
-    links = [replace(link, parts=tuple(p for p in link.parts if p.role not in GRIPS)) for link in model.links]
-    return replace(model, links=tuple(links))
+    return replace(model, links=tuple(replace(link, parts=link.rest) for link in model.links))
 
 
 _BUILDERS: dict[str, Callable[[Dice], ObjectModel]] = {
-    **FURNITURE,
+    "chest": furniture.chest, "night_stand": furniture.night_stand, "cabinet": furniture.cabinet,
+    "lockers": furniture.lockers, "locker_bank": furniture.locker_bank, "wardrobe": furniture.wardrobe,
+    "sideboard": furniture.sideboard, "desk": furniture.desk, "wall_unit": furniture.wall_unit,
+    "french_refrigerator": furniture.french_refrigerator,
     **{name: partial(build_kitchen, name) for name in KITCHEN},
-    **LIDDED,
-    **MORE_FURNITURE,
-    **APPLIANCES,
-    **THINGS,
-    **TABLES,
-}
+    "laptop": things.laptop, "trunk": things.trunk,
+    "drawer_desk": furniture.drawer_desk, "apothecary": furniture.apothecary,
+    "filing_cabinet": furniture.filing_cabinet, "toolbox": furniture.toolbox,
+    "rack_dishwasher": appliances.rack_dishwasher, "drawer_oven": appliances.drawer_oven,
+    "washing_machine": appliances.washing_machine,
+    "eyeglasses": things.eyeglasses, "sunglasses": things.sunglasses, "stapler": things.stapler,
+    "bucket": things.bucket, "pot": things.pot, "room_door": things.room_door,
+    "apron_table": furniture.apron_table,
+}  # fmt: skip
+"""Their order is part of what a seed of a mix means."""
 _CHANGES: dict[str, tuple[Callable[[ObjectModel, Dice], ObjectModel], tuple[str, ...]]] = {
     "bare": (_without_handles, (
         "chest", "night_stand", "cabinet", "wardrobe", "sideboard", "desk", "drawer_desk", "wall_unit", "refrigerator",

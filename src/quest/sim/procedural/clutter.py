@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from quest.sim.procedural.model import UP, Dice, Link, Mesh, ObjectModel, Part, box, join, lathe
-from quest.types import GRIPS
+from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
+from quest.sim.procedural.shapes import Mesh, box, boxes, copies, join, lathe, walls
 
 _SUNK_M = 0.001
 _MARGIN_M = 0.02
@@ -29,8 +29,7 @@ def with_clutter(model: ObjectModel, rng: Dice) -> ObjectModel:
     Its fronts look along -y, and it stands on the ground.
     """
     links = tuple(_decorated(link, rng) for link in model.links)
-    vertices = np.concatenate([part.mesh.vertices for part in model.body])
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low, high = join([part.mesh for part in model.body]).bounds
     body = [*model.body, *things_on(low, high, rng)]
     if rng.chance(0.4):
         body.append(_shelf(low, high, rng))
@@ -44,12 +43,11 @@ def with_clutter(model: ObjectModel, rng: Dice) -> ObjectModel:
 
 def _decorated(link: Link, rng: Dice) -> Link:
     """The link with none to three things on its front, away from its handles."""
-    fronts = [part for part in link.parts if part.role not in GRIPS]
-    if not fronts:
+    if not link.rest:
         return link
-    sizes = [np.ptp(part.mesh.bounds, axis=0) for part in fronts]
-    low, high = fronts[int(np.argmax([size[0] * size[2] for size in sizes]))].mesh.bounds
-    taken = [_rect(part.mesh) for part in link.parts if part.role in GRIPS]
+    bounds = [part.mesh.bounds for part in link.rest]
+    low, high = max(bounds, key=lambda each: np.prod(np.ptp(each, axis=0)[[0, 2]]))
+    taken = [_rect(part.mesh) for part in link.grips]
     added: list[Part] = []
     for _ in range(rng.whole(0, 4)):
         width, height = (high - low)[[0, 2]]
@@ -73,37 +71,27 @@ def _decorated(link: Link, rng: Dice) -> Link:
 def _ornament(kind: str, place: Rect, front: float, rng: Dice) -> Part:
     x0, z0, x1, z1 = place
     if kind in ("display", "badge"):
-        out = 0.002 if kind == "display" else 0.004
-        surface = "dark" if kind == "display" else "metal"
+        out, surface = (0.002, "dark") if kind == "display" else (0.004, "metal")
         return Part(kind, box((x0, front - out, z0), (x1, front + _SUNK_M, z1)), surface)
     if kind == "vent":
         rows = rng.whole(3, 10)
         edges = np.linspace(z0, z1, 2 * rows)
         out = rng.real(0.002, 0.008)
-        slats = [
-            box((x0, front - out, float(a)), (x1, front + _SUNK_M, float(b)))
-            for a, b in zip(edges[::2], edges[1::2], strict=True)
-        ]
-        return Part(kind, join(slats), rng.pick(["dark", "metal", "front"]))
+        slats = boxes(*(((x0, front - out, low), (x1, front + _SUNK_M, high)) for low, high in edges.reshape(-1, 2)))
+        return Part(kind, slats, rng.pick(["dark", "metal", "front"]))
     columns, rows = 3, rng.whole(3, 6)
     across, up = np.linspace(x0, x1, 3 * columns).reshape(-1, 3), np.linspace(z0, z1, 3 * rows).reshape(-1, 3)
-    keys = [
-        box((float(left), front - 0.003, float(below)), (float(right), front + _SUNK_M, float(above)))
+    keys = boxes(*(
+        ((left, front - 0.003, below), (right, front + _SUNK_M, above))
         for left, _, right in across for below, _, above in up
-    ]  # fmt: skip
-    return Part(kind, join(keys), rng.pick(["dark", "white", "metal"]))
+    ))  # fmt: skip
+    return Part(kind, keys, rng.pick(["dark", "white", "metal"]))
 
 
 def _moulding(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"]) -> Mesh:
     """A frame a little inside the edges of a front."""
     (x0, front, z0), (x1, _, z1) = low + _MARGIN_M * _ACROSS, high - _MARGIN_M * _ACROSS
-    wide, out = 0.012, 0.006
-    return join([
-        box((x0, front - out, z0), (x1, front + _SUNK_M, z0 + wide)),
-        box((x0, front - out, z1 - wide), (x1, front + _SUNK_M, z1)),
-        box((x0, front - out, z0 + wide), (x0 + wide, front + _SUNK_M, z1 - wide)),
-        box((x1 - wide, front - out, z0 + wide), (x1, front + _SUNK_M, z1 - wide)),
-    ])  # fmt: skip
+    return walls((x0, front - 0.006, z0), (x1, front + _SUNK_M, z1), 0.012, "-z +z -x +x")
 
 
 def things_on(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice) -> list[Part]:
@@ -115,7 +103,7 @@ def things_on(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Di
         if rng.chance(0.5):
             neck = rng.real(0.3, 1.0) * radius
             profile = [[radius, 0.0], [radius, 0.6 * height], [neck, 0.8 * height], [neck, height]]
-            mesh = lathe(profile).rotated(UP)
+            mesh = lathe(profile).turned("up")
         else:
             deep = radius * rng.real(0.4, 1.0)
             mesh = box((-radius, -deep, 0.0), (radius, deep, height))
@@ -129,10 +117,10 @@ def _shelf(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], rng: Dice)
     x0 = float(high[0]) + 0.004 if rng.chance(0.5) else float(low[0]) - 0.004 - wide
     x1, y0, y1, z0, z1 = x0 + wide, float(low[1]), float(high[1]), float(low[2]), float(high[2])
     levels = np.linspace(z0, z1 - board, rng.whole(3, 7))
-    boards = [box((x0, y0, z0), (x0 + board, y1, z1)), box((x1 - board, y0, z0), (x1, y1, z1))]
-    boards += [box((x0 + board, y0, float(z)), (x1 - board, y1, float(z) + board)) for z in levels]
-    boards.append(box((x0 + board, y1 - 0.5 * board, z0), (x1 - board, y1, z1)))
-    return Part("shelf_case", join(boards), "body")
+    sides = walls((x0, y0, z0), (x1, y1, z1), board, "-x +x")
+    shelves = boxes(*(((x0 + board, y0, z), (x1 - board, y1, z + board)) for z in levels))
+    back = box((x0 + board, y1 - 0.5 * board, z0), (x1 - board, y1, z1))
+    return Part("shelf_case", join([sides, shelves, back]), "body")
 
 
 def _legs(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], height: float, rng: Dice) -> Part:
@@ -141,11 +129,11 @@ def _legs(low: Float[np.ndarray, "3"], high: Float[np.ndarray, "3"], height: flo
     if rng.chance(0.6):
         thin, bulge = half * rng.real(0.4, 0.8), half * rng.real(0.8, 1.0)
         shape = [[thin, 0.0], [thin, 0.3], [bulge, 0.5], [thin, 0.65], [half, 0.9], [half, 1.0]]
-        leg = lathe(np.array(shape) * [1.0, height]).rotated(UP)
+        leg = lathe(np.array(shape) * [1.0, height]).turned("up")
     else:
         leg = box((-half, -half, 0.0), (half, half, height))
-    corners = [(x, y) for x in (low[0] + half, high[0] - half) for y in (low[1] + half, high[1] - half)]
-    return Part("leg", join([leg.moved((float(x), float(y), float(low[2]))) for x, y in corners]), "body")
+    corners = [(x, y, low[2]) for x in (low[0] + half, high[0] - half) for y in (low[1] + half, high[1] - half)]
+    return Part("leg", copies(leg, corners), "body")
 
 
 def _rect(mesh: Mesh) -> Rect:

@@ -8,26 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
 
-from quest.sim.procedural.model import (
-    SIDE,
-    Dice,
-    Link,
-    Mesh,
-    ObjectModel,
-    Part,
-    box,
-    centred_box,
-    join,
-    lathe,
-    prism_between,
-    tube,
-    turn_x,
-)  # fmt: skip
-from quest.types import GRIPS
+from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
+from quest.sim.procedural.shapes import Mesh, box, boxes, centred_box, join, lathe, prism_between, tube
 
 SUNK_M = 0.001
 """How deep feet reach into the front, so that no gap shows between them."""
@@ -118,39 +105,9 @@ def handle_part(
 def _bar(half: float, thickness: float, reach: float, flatness: float, *, sides: int = 10) -> Mesh:
     radius = thickness / 2
     middle = -reach + radius
-    bar = tube(np.array([[x, middle, 0.0] for x in (-half, 0.0, half)]), radius_m=radius, sides=sides)
+    bar = tube(np.array([[x, middle] for x in (-half, 0.0, half)]), radius_m=radius, sides=sides)
     post = (0.8 * thickness, -middle + SUNK_M, 0.8 * thickness)
-    posts = [centred_box((side * 0.82 * half, (middle + SUNK_M) / 2, 0), post) for side in (-1, 1)]
-    return join([bar, *posts])
-
-
-def _square_bar(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    return _bar(half, thickness, reach, flatness, sides=4)
-
-
-def _arched(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    radius = thickness / 2
-    angle = np.linspace(0, np.pi, 17)
-    path = np.stack([-(half - radius) * np.cos(angle), -(reach - radius) * np.sin(angle) ** 0.7, 0 * angle], axis=1)
-    path[[0, -1], 1] = SUNK_M
-    return tube(path, radius_m=radius, flatness=flatness)
-
-
-def _bracket(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    height, bar = thickness * flatness / 2, 0.6 * thickness
-    return join([
-        box((-half, -reach, -height), (half, -reach + bar, height)),
-        box((-half, -reach + bar, -height), (-half + bar, SUNK_M, height)),
-        box((half - bar, -reach + bar, -height), (half, SUNK_M, height)),
-    ])  # fmt: skip
-
-
-def _lip(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    return join([
-        box((-half, -0.003, -0.02), (half, SUNK_M, 0.02)),
-        box((-half, -reach, 0.016), (half, -0.003, 0.02)),
-        box((-half, -reach, 0.006), (half, -reach + 0.004, 0.016)),
-    ])  # fmt: skip
+    return join([bar, *(centred_box((side * 0.82 * half, (middle + SUNK_M) / 2, 0), post) for side in (-1, 1))])
 
 
 def _plate(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
@@ -159,11 +116,53 @@ def _plate(half: float, thickness: float, reach: float, flatness: float) -> Mesh
     return join([plate, _bar(0.7 * half, thickness, reach, flatness)])
 
 
+def _arched(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    radius, angle = thickness / 2, np.linspace(0, np.pi, 17)
+    path = np.stack([-(half - radius) * np.cos(angle), -(reach - radius) * np.sin(angle) ** 0.7], axis=1)
+    path[[0, -1], 1] = SUNK_M
+    return tube(path, radius_m=radius, flatness=flatness)
+
+
+def _bow(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    """A flat arc between two feet."""
+    radius, x = thickness / 2, np.linspace(-1, 1, 17)
+    path = np.stack([(half - radius) * x, -(reach - radius) * (1 - np.abs(x) ** 2.6)], axis=1)
+    path[[0, -1], 1] = SUNK_M
+    return tube(path, radius_m=0.7 * radius, flatness=1.6 * flatness)
+
+
+def _bracket(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    height, bar = thickness * flatness / 2, 0.6 * thickness
+    return boxes(
+        ((-half, -reach, -height), (half, -reach + bar, height)),
+        ((-half, -reach + bar, -height), (-half + bar, SUNK_M, height)),
+        ((half - bar, -reach + bar, -height), (half, SUNK_M, height)),
+    )
+
+
+def _lip(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    return boxes(
+        ((-half, -0.003, -0.02), (half, SUNK_M, 0.02)),
+        ((-half, -reach, 0.016), (half, -0.003, 0.02)),
+        ((-half, -reach, 0.006), (half, -reach + 0.004, 0.016)),
+    )
+
+
+def _edge_pull(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
+    """A thin angle along the front, gripped from below."""
+    reach = min(reach, 0.03)
+    return boxes(
+        ((-half, -reach, 0.0), (half, -0.002, 0.003)),
+        ((-half, -reach, -0.6 * reach), (half, -reach + 0.003, 0.0)),
+        ((-half, -0.002, -0.004), (half, SUNK_M, 0.004 + 0.4 * thickness)),
+    )
+
+
 def _ring(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
     """A hoop that hangs, tilted a little off the front, from a stud."""
-    radius, angle, tilt = min(half, 0.035), 2 * np.pi * np.arange(24) / 24, np.pi / 2 - 0.25
-    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
-    hoop = tube(circle, radius_m=0.3 * thickness, sides=8, closed=True).rotated(turn_x(tilt))
+    radius, tilt, angle = min(half, 0.035), np.pi / 2 - 0.25, 2 * np.pi * np.arange(24) / 24
+    circle = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    hoop = tube(circle, radius_m=0.3 * thickness, sides=8, closed=True).tilted(tilt)
     out = -min(reach, 0.022)
     stud = centred_box((0, (out + SUNK_M) / 2, 0), (0.9 * thickness, -out + SUNK_M, 0.9 * thickness))
     plate = lathe([[0.9 * thickness, -SUNK_M], [0.9 * thickness, 0.004]])
@@ -174,7 +173,7 @@ def _knob(half: float, radius: float, reach: float, flatness: float) -> Mesh:
     angle = np.linspace(0.35, np.pi, 7)
     centre, round_ = 0.62 * reach, 0.38 * reach
     profile = [(0.4, -SUNK_M), (0.35, centre - round_ * np.cos(angle[0]))]
-    profile += [(float(np.sin(a)) + 1e-9, float(centre - round_ * np.cos(a))) for a in angle[1:]]
+    profile += [(np.sin(a) + 1e-9, centre - round_ * np.cos(a)) for a in angle[1:]]
     return lathe([(radius * r, h) for r, h in profile])
 
 
@@ -189,61 +188,37 @@ def _block(half: float, radius: float, reach: float, flatness: float) -> Mesh:
 
 
 def _cup(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    """A cup pull: a quarter of a barrel over a flange, open below."""
+    """A quarter of a barrel over a flange, open below."""
     half, reach = min(half, 0.055), min(reach, 0.032)
     wall = min(0.3 * thickness, 0.2 * reach)
     angle = np.linspace(0, np.pi / 2, 9)
     # Columns are y and z: from the front's face, above, to the lip at the outer end, below.
     quarter = np.stack([-np.sin(angle), np.cos(angle)], axis=1)
-    outer = reach * quarter - np.array([0.0, 0.5 * reach])
-    inner = (reach - wall) * quarter - np.array([0.0, 0.5 * reach])
+    outer, inner = (r * quarter - np.array([0.0, 0.5 * reach]) for r in (reach, reach - wall))
     outer[0, 0] = inner[0, 0] = SUNK_M
     shell = prism_between(outer, inner, -half, half)
     core = np.tile([[SUNK_M, -0.49 * reach]], (9, 1)) + 0.02 * (outer - outer[0])
     ends = [prism_between(outer, core, side * half - wall / 2, side * half + wall / 2) for side in (-1, 1)]
-    barrel = join([shell, *ends]).rotated(SIDE)
+    barrel = join([shell, *ends]).turned("side")
     return join([barrel, box((-half, -0.003, 0.5 * reach), (half, SUNK_M, 0.75 * reach))])
 
 
-def _bow(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    """A bow: a flat arc between two feet."""
-    radius = thickness / 2
-    x = np.linspace(-1, 1, 17)
-    path = np.stack([(half - radius) * x, -(reach - radius) * (1 - np.abs(x) ** 2.6), 0 * x], axis=1)
-    path[[0, -1], 1] = SUNK_M
-    return tube(path, radius_m=0.7 * radius, flatness=1.6 * flatness)
-
-
 def _d_pull(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    """A D: a bar whose ends are bent back to the front with round corners."""
-    radius = thickness / 2
+    """A bar whose ends are bent back to the front with round corners."""
+    radius, angle = thickness / 2, np.linspace(0, np.pi / 2, 6)
     out = reach - radius
     bend = min(0.55 * out, 0.5 * half)
-    angle = np.linspace(0, np.pi / 2, 6)
     left = np.stack([-half + radius + bend * (1 - np.cos(angle)), -out + bend * (1 - np.sin(angle))], axis=1)
-    right = left[::-1] * [-1, 1]
-    ends = np.array([[-half + radius, SUNK_M]])
-    path = np.concatenate([ends, left, right, ends * [-1, 1]])
-    return tube(np.column_stack([path, np.zeros(len(path))]), radius_m=radius, sides=12)
+    left = np.concatenate([[[-half + radius, SUNK_M]], left])
+    return tube(np.concatenate([left, left[::-1] * [-1, 1]]), radius_m=radius, sides=12)
 
 
 def _t_bar(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
     """A bar on one post."""
     radius, half = 0.6 * thickness, min(half, 0.04)
-    bar = tube(np.array([[x, -reach + radius, 0.0] for x in (-half, 0.0, half)]), radius_m=radius)
+    bar = tube(np.array([[x, -reach + radius] for x in (-half, 0.0, half)]), radius_m=radius)
     post = lathe([[0.9 * radius, -SUNK_M], [0.7 * radius, 0.5 * reach], [0.7 * radius, reach - radius]])
     return join([bar, post])
-
-
-def _edge_pull(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
-    """A thin angle along the front, gripped from below."""
-    reach = min(reach, 0.03)
-    depth = 0.6 * reach
-    return join([
-        box((-half, -reach, 0.0), (half, -0.002, 0.003)),
-        box((-half, -reach, -depth), (half, -reach + 0.003, 0.0)),
-        box((-half, -0.002, -0.004), (half, SUNK_M, 0.004 + 0.4 * thickness)),
-    ])  # fmt: skip
 
 
 def _loop(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
@@ -253,27 +228,26 @@ def _loop(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
     outer = np.stack([-reach * np.sin(angle) ** 0.8, tall * np.cos(angle)], axis=1)
     inner = outer * [(reach - thick) / reach, (tall - thick) / tall]
     outer[[0, -1], 0] = inner[[0, -1], 0] = SUNK_M
-    strap = prism_between(outer, inner, -half, half).rotated(SIDE)
+    strap = prism_between(outer, inner, -half, half).turned("side")
     stud = lathe([[0.006, -SUNK_M], [0.006, 0.002], [0.003, 0.004]])
     return join([strap, stud.moved((0, 0, -tall - 0.008)), box((-half, -0.002, -tall - 0.018), (half, SUNK_M, -tall))])
 
 
 def _lever(half: float, thickness: float, reach: float, flatness: float) -> Mesh:
     """A door's lever: a rosette, a neck, and a bar to the right of it, so that the foot is at its left end."""
-    radius = thickness / 2
+    radius, angle = thickness / 2, np.linspace(0, np.pi / 2, 6)
     long, bend = 2 * half - 2 * radius, 0.4 * reach
-    angle = np.linspace(0, np.pi / 2, 6)
     corner = np.stack([bend * (1 - np.cos(angle)), -reach + radius + bend * (1 - np.sin(angle))], axis=1)
     path = np.concatenate([[[0.0, SUNK_M]], corner, [[0.6 * long, -reach + radius], [long, -reach + 1.2 * radius]]])
-    bar = tube(np.column_stack([path, np.zeros(len(path))]), radius_m=radius, flatness=flatness, sides=12)
     rosette = lathe([[2.4 * radius, -SUNK_M], [2.4 * radius, 0.006], [2.0 * radius, 0.009]])
+    bar = tube(path, radius_m=radius, flatness=flatness, sides=12)
     return join([rosette, bar]).moved((-half + radius, 0, 0))
 
 
 _BUILDERS: dict[HandleKind, Callable[[float, float, float, float], Mesh]] = {
-    "bar": _bar, "square_bar": _square_bar, "arched": _arched, "bracket": _bracket, "lip": _lip, "plate": _plate,
-    "ring": _ring, "knob": _knob, "disc": _disc, "block": _block, "cup": _cup, "bow": _bow, "d_pull": _d_pull,
-    "t_bar": _t_bar, "edge_pull": _edge_pull, "loop": _loop, "lever": _lever,
+    "bar": _bar, "square_bar": partial(_bar, sides=4), "arched": _arched, "bracket": _bracket, "lip": _lip,
+    "plate": _plate, "ring": _ring, "knob": _knob, "disc": _disc, "block": _block, "cup": _cup, "bow": _bow,
+    "d_pull": _d_pull, "t_bar": _t_bar, "edge_pull": _edge_pull, "loop": _loop, "lever": _lever,
 }  # fmt: skip
 _LONG_KINDS: tuple[HandleKind, ...] = ("bar", "square_bar", "arched", "bracket", "lip", "bow", "d_pull", "edge_pull")
 
@@ -291,23 +265,20 @@ def with_long_handles(model: ObjectModel, rng: Dice) -> ObjectModel:
     share = rng.real(0.45, 0.98)
 
     def with_long(link: Link) -> Link:
-        old = [part for part in link.parts if part.role in GRIPS]
-        others = tuple(part for part in link.parts if part.role not in GRIPS)
-        if not (old and others):
+        if not (link.grips and link.rest):
             return link
-        bounds = np.stack([part.mesh.bounds for part in others])
-        low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
-        at, foot = old[0].mesh.bounds.mean(axis=0), float(old[0].mesh.bounds[1, 1])
+        low, high = join([part.mesh for part in link.rest]).bounds
+        old = link.grips[0].mesh.bounds
         vertical = link.kind == "revolute" and abs(link.axis[2]) > 0.5
         along = 2 if vertical else 0
-        at[along] = (low[along] + high[along]) / 2
         length = share * float(high[along] - low[along])
         if length < 0.05:
             return link
+        x, foot, z = old.mean(axis=0)[0], float(old[1, 1]), old.mean(axis=0)[2]
+        middle = (low[along] + high[along]) / 2
+        at, room = ((x, foot, middle), (0.1, length / 0.8)) if vertical else ((middle, foot, z), (length / 0.8, 0.1))
         # A bowed door is foremost elsewhere.
-        reach = style.reach_m + max(0.0, foot - float(low[1]))
-        place, room = (float(at[0]), foot, float(at[2])), (0.1, length / 0.8) if vertical else (length / 0.8, 0.1)
-        own = replace(style, length_m=length, reach_m=reach)
-        return replace(link, parts=(*others, handle_part(own, at=place, vertical=vertical, room_m=room)))
+        own = replace(style, length_m=length, reach_m=style.reach_m + max(0.0, foot - float(low[1])))
+        return replace(link, parts=(*link.rest, handle_part(own, at=at, vertical=vertical, room_m=room)))
 
     return replace(model, links=tuple(with_long(link) for link in model.links))

@@ -1,4 +1,4 @@
-"""What a procedural object is made of: chance, meshes, parts, links and joints; and its URDF, in memory.
+"""What a procedural object is made of: chance, parts, links and joints; and its URDF, in memory.
 
 Axes while an object is built: x to the right of someone who stands before it, y into the object (the
 front looks along -y), z up, the ground at z = 0. Metres and radians.
@@ -11,20 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int
+from jaxtyping import Float, Float32
 from numpy.random import Generator
 
+from quest.sim.procedural.shapes import Mesh
 from quest.sim.urdf import MeshData, Urdf, UrdfJoint, UrdfVisual, pose_matrix
 from quest.types import GRIPS
 
-UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-"""Turns a solid of revolution, which grows towards -y, so that it grows towards +z."""
-FRONT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-"""Turns what is drawn in the x-y plane and extruded along +z so that it stands upright, extruded towards -y."""
-SIDE = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-"""Turns what is drawn in the x-y plane and extruded along z so that x becomes y, y becomes z, and z becomes x."""
-
-_UV_UNIT_M = 0.5
 _T = TypeVar("_T")
 
 
@@ -50,216 +43,6 @@ class Dice(Generator):
     def pick(self, options: Sequence[_T], p: Sequence[float] | None = None) -> _T:
         """One of some options, each as likely as ``p`` says."""
         return options[int(self.choice(len(options), p=p))]
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """A triangle mesh whose vertices are not shared across sharp edges."""
-
-    vertices: Float[np.ndarray, "N 3"]
-    """Positions in metres."""
-    faces: Int[np.ndarray, "M 3"]
-    """Vertex indices, counter-clockwise seen from outside."""
-    normals: Float[np.ndarray, "N 3"]
-    """Unit normal per vertex."""
-    uv: Float[np.ndarray, "N 2"]
-    """Texture coordinate per vertex; one unit is half a metre, u runs along the grain."""
-
-    def moved(self, offset: tuple[float, float, float] | np.ndarray) -> Mesh:
-        """The mesh shifted by ``offset`` metres."""
-        return replace(self, vertices=self.vertices + np.asarray(offset, dtype=float))
-
-    def rotated(self, rotation: Float[np.ndarray, "3 3"]) -> Mesh:
-        """The mesh turned about the origin by a rotation matrix."""
-        return replace(self, vertices=self.vertices @ rotation.T, normals=self.normals @ rotation.T)
-
-    @property
-    def bounds(self) -> Float[np.ndarray, "2 3"]:
-        """Smallest and largest coordinates."""
-        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
-
-
-def join(meshes: Sequence[Mesh]) -> Mesh:
-    """One mesh out of several; closed meshes stay closed."""
-    assert meshes, "nothing to join"
-    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
-    return Mesh(
-        np.concatenate([m.vertices for m in meshes]),
-        np.concatenate([m.faces + start for m, start in zip(meshes, starts, strict=True)]),
-        np.concatenate([m.normals for m in meshes]),
-        np.concatenate([m.uv for m in meshes]),
-    )
-
-
-def turn_x(angle_rad: float) -> Float[np.ndarray, "3 3"]:
-    """Rotation about the x axis."""
-    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
-    return np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])
-
-
-def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
-    """An axis-aligned box between two corners, metres; the grain follows its longest edge."""
-    lo, hi = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
-    assert (hi > lo).all(), f"box: empty between {low} and {high}"
-    size = hi - lo
-    vertices, normals, uv = [], [], []
-    for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        columns = [u, v] if size[u] >= size[v] else [v, u]
-        for side in (0, 1):
-            corners = np.empty((4, 3))
-            corners[:, axis] = (lo, hi)[side][axis]
-            corners[:, u] = np.array([lo[u], hi[u], hi[u], lo[u]])
-            corners[:, v] = np.array([lo[v], lo[v], hi[v], hi[v]])
-            if side == 0:
-                corners = corners[::-1]
-            normal = np.zeros(3)
-            normal[axis] = 2 * side - 1
-            vertices.append(corners)
-            normals.append(np.tile(normal, (4, 1)))
-            uv.append(corners[:, columns] / _UV_UNIT_M)
-    faces = (4 * np.arange(6)[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
-    return Mesh(np.concatenate(vertices), faces, np.concatenate(normals), np.concatenate(uv))
-
-
-def centred_box(centre: tuple[float, float, float], size: tuple[float, float, float]) -> Mesh:
-    """An axis-aligned box by its centre and edge lengths in metres."""
-    c, half = np.asarray(centre, dtype=float), np.asarray(size, dtype=float) / 2
-    return box(tuple(c - half), tuple(c + half))
-
-
-def tube(
-    path: Float[np.ndarray, "P 3"], *, radius_m: float, flatness: float = 1.0, sides: int = 10, closed: bool = False
-) -> Mesh:
-    """A tube of elliptic section along a path in the x-y plane.
-
-    Args:
-        path: points along the middle; z must be constant. With ``closed``, the last point joins the first.
-        radius_m: half the width of the section along the path's normal in its plane.
-        flatness: half the height (along z) over ``radius_m``.
-        sides: corners of the section; 4 makes a square bar.
-        closed: whether the path is a ring, which needs no caps.
-    """
-    path = np.asarray(path, dtype=float)
-    if closed:
-        path = np.concatenate([path, path[:1]])
-        tangent = np.roll(path[:-1], -1, axis=0) - np.roll(path[:-1], 1, axis=0)
-        tangent = np.concatenate([tangent, tangent[:1]])
-    else:
-        tangent = np.gradient(path, axis=0)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    across = np.stack([tangent[:, 1], -tangent[:, 0], np.zeros(len(path))], axis=1)
-    up = np.array([0.0, 0.0, 1.0])
-    angle = 2 * np.pi * np.arange(sides + 1) / sides + np.pi / sides
-    stretch = 1 / np.cos(np.pi / sides) if sides == 4 else 1.0
-    cos, sin = np.cos(angle) * stretch, np.sin(angle) * stretch
-    offset = radius_m * (cos[None, :, None] * across[:, None] + flatness * sin[None, :, None] * up)
-    normal = cos[None, :, None] * across[:, None] + sin[None, :, None] * up / max(flatness, 1e-6)
-    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
-    uv = np.stack(np.broadcast_arrays(length[:, None], radius_m * (angle - angle[0])[None, :]), axis=-1).reshape(-1, 2)
-    vertices = (path[:, None] + offset).reshape(-1, 3)
-    mesh = Mesh(vertices, _grid_faces(len(path), sides + 1)[:, ::-1], normal.reshape(-1, 3), uv / _UV_UNIT_M)
-    if sides == 4:
-        mesh = _faceted(mesh)
-    if closed:
-        return mesh
-    first, last = (path[0] + offset[0, :-1])[::-1], path[-1] + offset[-1, :-1]
-    return join([mesh, _cap(first, -tangent[0]), _cap(last, tangent[-1])])
-
-
-def lathe(profile: Float[np.ndarray, "P 2"] | list, *, sides: int = 18) -> Mesh:
-    """A solid of revolution about the y axis, standing on y = 0 and growing towards -y.
-
-    The profile is (radius, height) from the foot to the tip; height grows; the radii at the ends may be 0.
-    """
-    profile = np.asarray(profile, dtype=float)
-    if profile[0, 0] > 0:
-        profile = np.concatenate([[[0.0, profile[0, 1]]], profile])
-    if profile[-1, 0] > 0:
-        profile = np.concatenate([profile, [[0.0, profile[-1, 1]]]])
-    angle = 2 * np.pi * np.arange(sides + 1) / sides
-    radius, height = profile[:, :1], profile[:, 1:]
-    corners = np.broadcast_arrays(radius * np.cos(angle), -height, radius * np.sin(angle))
-    vertices = np.stack(corners, axis=-1).reshape(-1, 3)
-    uv = np.stack(np.broadcast_arrays(angle * 0.02, height), axis=-1).reshape(-1, 2) / _UV_UNIT_M
-    faces = _grid_faces(len(profile), sides + 1)
-    corner = vertices[faces]
-    area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1)
-    return _faceted(Mesh(vertices, faces[area > 1e-12], np.zeros_like(vertices), uv))
-
-
-def prism_between(
-    outer: Float[np.ndarray, "P 2"], inner: Float[np.ndarray, "P 2"], low: float, high: float, *, closed: bool = False
-) -> Mesh:
-    """The solid between two lines in the x-y plane, from z = ``low`` to ``high``: a curved wall, or a frame.
-
-    Args:
-        outer: points of one line, metres.
-        inner: as many points of the other line, at its left as seen from above.
-        low: smallest z.
-        high: largest z.
-        closed: whether the lines are rings (``outer`` counter-clockwise around ``inner``), without ends.
-    """
-    if closed:
-        outer, inner = np.concatenate([outer, outer[:1]]), np.concatenate([inner, inner[:1]])
-    count = len(outer)
-    rows = [(outer, low), (inner, low), (inner, high), (outer, high)]
-    vertices = np.concatenate([np.column_stack([line, np.full(count, z)]) for line, z in rows])
-    faces = []
-    for row in range(4):
-        a = row * count + np.arange(count - 1)
-        b = (row + 1) % 4 * count + np.arange(count - 1)
-        faces += [np.stack([a, b, b + 1], axis=1), np.stack([a, b + 1, a + 1], axis=1)]
-    if not closed:
-        start, end = count * np.arange(4), count * np.arange(4) + count - 1
-        faces += [start[[[0, 2, 1], [0, 3, 2]]], end[[[0, 1, 2], [0, 2, 3]]]]
-    mesh = polygon_flat(vertices, np.concatenate(faces))
-    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
-    if (np.cross(a, b) * c).sum() < 0:  # the lines run the other way round
-        mesh = polygon_flat(vertices, np.concatenate(faces)[:, ::-1])
-    return mesh
-
-
-def polygon_flat(vertices: Float[np.ndarray, "N 3"], faces: Int[np.ndarray, "M 3"]) -> Mesh:
-    """A mesh from bare triangles: flat shading, texture coordinates by projection along each face's main axis."""
-    bare = np.asarray(vertices, dtype=float)
-    zeros = np.zeros_like(bare)
-    flat = _faceted(Mesh(bare, np.asarray(faces, dtype=np.int64), zeros, zeros[:, :2]))
-    main = np.abs(flat.normals).argmax(axis=1)
-    size = np.ptp(bare, axis=0)
-    uv = np.empty((len(flat.vertices), 2))
-    for axis in range(3):
-        u, v = (axis + 1) % 3, (axis + 2) % 3
-        columns = [u, v] if size[u] >= size[v] else [v, u]
-        uv[main == axis] = flat.vertices[main == axis][:, columns] / _UV_UNIT_M
-    return replace(flat, uv=uv)
-
-
-def _grid_faces(rows: int, columns: int) -> np.ndarray:
-    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
-    a = (row * columns + column).ravel()
-    b, c, d = a + 1, a + columns + 1, a + columns
-    return np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]).astype(np.int64)
-
-
-def _faceted(mesh: Mesh) -> Mesh:
-    """The same triangles with their own corners and flat normals."""
-    corner = mesh.vertices[mesh.faces]
-    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
-    faces = np.arange(3 * len(corner), dtype=np.int64).reshape(-1, 3)
-    return Mesh(corner.reshape(-1, 3), faces, np.repeat(normal, 3, axis=0), mesh.uv[mesh.faces].reshape(-1, 2))
-
-
-def _cap(ring: Float[np.ndarray, "S 3"], normal: Float[np.ndarray, "3"]) -> Mesh:
-    """A fan over a convex ring, counter-clockwise about ``normal`` once the ring is put in that order."""
-    a, b = ring[1] - ring[0], ring[2] - ring[0]
-    if np.dot(np.cross(a, b), normal) < 0:
-        ring = ring[::-1]
-    index = np.arange(1, len(ring) - 1)
-    faces = np.stack([np.zeros_like(index), index, index + 1], axis=1).astype(np.int64)
-    return Mesh(ring.copy(), faces, np.tile(normal, (len(ring), 1)), ring[:, [0, 2]] / _UV_UNIT_M)
 
 
 @dataclass(frozen=True)
@@ -303,9 +86,14 @@ class Link:
     """Upper limit in radians or metres; the lower one is 0, which is closed."""
 
     @property
-    def has_handle(self) -> bool:
-        """Whether a handle or a knob is among the parts."""
-        return any(part.role in GRIPS for part in self.parts)
+    def grips(self) -> tuple[Part, ...]:
+        """Its handles and knobs."""
+        return tuple(part for part in self.parts if part.role in GRIPS)
+
+    @property
+    def rest(self) -> tuple[Part, ...]:
+        """All else."""
+        return tuple(part for part in self.parts if part.role not in GRIPS)
 
 
 @dataclass(frozen=True)
@@ -322,10 +110,8 @@ class ObjectModel:
     def moved(self, offset: tuple[float, float, float]) -> ObjectModel:
         """The whole object shifted by ``offset`` metres."""
         body = tuple(replace(part, mesh=part.mesh.moved(offset)) for part in self.body)
-        links = []
-        for link in self.links:
-            x, y, z = np.asarray(link.origin) + np.asarray(offset)
-            links.append(replace(link, origin=(float(x), float(y), float(z))))
+        x, y, z = offset
+        links = (replace(k, origin=(k.origin[0] + x, k.origin[1] + y, k.origin[2] + z)) for k in self.links)
         return ObjectModel(self.model_cat, body, tuple(links))
 
     def centred(self, width: float, depth: float, lift: float = 0.0) -> ObjectModel:

@@ -12,7 +12,8 @@ from jaxtyping import Float
 from quest.errors import MissingExtraError
 from quest.extras import install_command
 from quest.sim.procedural.handles import HandleStyle, handle_part, sample_style
-from quest.sim.procedural.model import Dice, Link, Mesh, ObjectModel, Part, box, join, polygon_flat
+from quest.sim.procedural.model import Dice, Link, ObjectModel, Part
+from quest.sim.procedural.shapes import Mesh, box, centred_box, join, polygon_flat
 
 _OWN_HANDLE_SHARE = 0.5
 _BARE_SHARE = 0.06
@@ -193,8 +194,7 @@ def _visual_mesh(visual: Any) -> Mesh:
     geometry = visual.geometry
     origin = np.eye(4) if visual.origin is None else np.asarray(visual.origin)
     if geometry.box is not None:
-        half = np.asarray(geometry.box.size, dtype=float) / 2
-        return _transformed(box(tuple(-half), tuple(half)), origin)
+        return _transformed(centred_box((0, 0, 0), geometry.box.size), origin)
     if geometry.cylinder is not None:
         bare = trimesh.creation.cylinder(geometry.cylinder.radius, geometry.cylinder.length, sections=24)
     else:
@@ -236,18 +236,15 @@ def _group(meshes: list[tuple[str, Mesh]], *, moving: bool) -> list[Part]:
 def _own_handle(style: HandleStyle, original: Mesh, front: Mesh) -> Part:
     """One of our handles where scene-synthesizer had put its own."""
     low, high = original.bounds
-    size = high - low
-    middle = (low + high) / 2
-    foot = _surface_y(front, float(middle[0]), float(middle[2]))
-    vertical = bool(size[2] > size[0])
-    room = (1.4 * size[0], 0.12) if not vertical else (0.12, 1.4 * size[2])
-    return handle_part(style, at=(float(middle[0]), foot, float(middle[2])), vertical=vertical, room_m=room)
+    (width, _, height), (x, _, z) = high - low, (low + high) / 2
+    vertical = bool(height > width)
+    room = (0.12, 1.4 * height) if vertical else (1.4 * width, 0.12)
+    return handle_part(style, at=(x, _surface_y(front, x, z), z), vertical=vertical, room_m=room)
 
 
 def _surface_y(mesh: Mesh, x: float, z: float) -> float:
     """Smallest y of a surface above the point (x, z) of the front; of its bounding box where there is none."""
-    corner = mesh.vertices[mesh.faces]
-    a, b, c = corner[:, 0], corner[:, 1], corner[:, 2]
+    a, b, c = mesh.vertices[mesh.faces].transpose(1, 0, 2)
     ab, ac = b - a, c - a
     area = ab[:, 0] * ac[:, 2] - ab[:, 2] * ac[:, 0]
     facing = np.abs(area) > 1e-12

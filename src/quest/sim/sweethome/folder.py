@@ -19,7 +19,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from quest.errors import ObjectError
-from quest.sim.articulation import apply
 from quest.sim.description import CREDIT_NAME, DESCRIPTION_NAME
 from quest.sim.sweethome.joints import Link, Note, find_links, grips, notes
 from quest.sim.sweethome.library import Library, Model
@@ -50,13 +49,13 @@ class Imported:
 
     model: str
     """Path in its library."""
-    folder: Path | None
+    folder: Path | None = None
     """None if it was left out."""
-    opens: bool
+    opens: bool = False
     """Whether it has joints."""
-    kept: bool
+    kept: bool = False
     """Whether its folder was there already."""
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def import_library(path: Path, out: Path, tell: Callable[[int, int], None] | None = None) -> Iterator[Imported]:
@@ -77,13 +76,13 @@ def import_library(path: Path, out: Path, tell: Callable[[int, int], None] | Non
         names = {credit.get("model"): folder for folder, credit in credits.items()}
         for done, model in enumerate(models):
             if isinstance(model, ObjectError):
-                yield Imported("", None, False, False, (str(model),))
+                yield Imported("", warnings=(str(model),))
             else:
                 try:
                     with reading(f"{path}: {model.path}", ObjectError, "it is left out"):
                         yield _import_model(library, model, out, names)
                 except ObjectError as error:
-                    yield Imported(model.path, None, False, False, (str(error),))
+                    yield Imported(model.path, warnings=(str(error),))
             if tell is not None:
                 tell(done + 1, len(models))
     shutil.rmtree(out / _PARTIAL, ignore_errors=True)
@@ -119,7 +118,7 @@ def _credit(folder: Path) -> dict[str, str]:
 def _import_model(library: Library, model: Model, out: Path, names: dict[str | None, Path]) -> Imported:
     note = notes().get(model.path, Note())
     if note.skip:
-        return Imported(model.path, None, False, False, (f"{model.path}: left out, {note.skip}",))
+        return Imported(model.path, warnings=(f"{model.path}: left out, {note.skip}",))
     entry = asdict(model) | {"upright": model.upright.tolist()}
     told = [*library.sums(model.path), json.dumps([entry, asdict(note), _FORMAT])]
     digest = hashlib.sha256("\n".join(told).encode()).hexdigest()[:12]
@@ -169,9 +168,8 @@ def _category(model: Model) -> str:
 
 def _standing(shape: Wavefront, model: Model, note: Note) -> Wavefront:
     """The model in metres, z up, front towards +x, on the floor around the origin."""
-    turn = Rotation.from_euler("z", note.turn, degrees=True).as_matrix()
-    turn = turn @ np.roll(np.eye(3), 1, axis=0) @ model.upright
-    size = np.abs(Rotation.from_euler("z", note.turn, degrees=True).as_matrix()) @ model.size_m
+    noted = Rotation.from_euler("z", note.turn, degrees=True).as_matrix()
+    turn, size = noted @ np.roll(np.eye(3), 1, axis=0) @ model.upright, np.abs(noted) @ model.size_m
     used = np.unique(shape.corners[:, 0])
     vertices = shape.vertices @ turn.T
     low, high = vertices[used].min(axis=0), vertices[used].max(axis=0)
@@ -248,11 +246,8 @@ def _urdf(
 ) -> str:  # fmt: skip
     """The URDF's text; its meshes are written into ``folder``."""
     robot = ElementTree.Element("robot", name=name)
-    rest = np.ones(len(shape.group), dtype=bool)
-    for link in links:
-        rest &= ~link.faces
-    moving = [(link.name, link, link.faces) for link in links]
-    for of_link, link, faces in [("base", None, rest), *moving]:
+    rest = ~np.any([np.zeros(len(shape.group), dtype=bool), *(link.faces for link in links)], axis=0)
+    for of_link, link, faces in [("base", None, rest), *((link.name, link, link.faces) for link in links)]:
         element = ElementTree.SubElement(robot, "link", name=of_link)
         origin = np.zeros(3) if link is None else link.origin
         placed = shape if link is None else _closed(shape, link)
@@ -283,13 +278,11 @@ def _closed(shape: Wavefront, link: Link) -> Wavefront:
     """The model with a part that is open in it shut."""
     if link.ajar == 0.0:
         return shape
-    back = np.eye(4)
-    if link.kind == "prismatic":
-        back[:3, 3] = -link.ajar * link.axis
-    else:
-        back[:3, :3] = Rotation.from_rotvec(-link.ajar * link.axis).as_matrix()
-        back[:3, 3] = link.origin - back[:3, :3] @ link.origin
-    return replace(shape, vertices=apply(back, shape.vertices), normals=shape.normals @ back[:3, :3].T)
+    turn, shift = np.eye(3), -link.ajar * link.axis
+    if link.kind == "revolute":
+        turn = Rotation.from_rotvec(shift).as_matrix()
+        shift = link.origin - turn @ link.origin
+    return replace(shape, vertices=shape.vertices @ turn.T + shift, normals=shape.normals @ turn.T)
 
 
 def _parts(

@@ -219,15 +219,18 @@ def _tagged(shape: Wavefront, note: Note) -> list[Link]:
     return links
 
 
+def _middle(points: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, "3"]:
+    return (points.min(axis=0) + points.max(axis=0)) / 2
+
+
 def _on_hinge(
     name: str, shape: Wavefront, faces: Bool[np.ndarray, " F"], pin: Float[np.ndarray, "M 3"], note: Note
 ) -> Link:
-    origin, axis = (pin.min(axis=0) + pin.max(axis=0)) / 2, np.zeros(3)
+    origin, axis = _middle(pin), np.zeros(3)
     axis[int(np.ptp(pin, axis=0).argmax())] = 1.0
     leaf, whole = shape.points(faces), shape.vertices
-    centre = (leaf.min(axis=0) + leaf.max(axis=0)) / 2
-    out = centre - (whole.min(axis=0) + whole.max(axis=0)) / 2
-    flat = np.ptp(leaf, axis=0)[2] < 0.5 * np.ptp(leaf, axis=0)[:2].min()
+    centre, size = _middle(leaf), np.ptp(leaf, axis=0)
+    out, flat = centre - _middle(whole), size[2] < 0.5 * size[:2].min()
     if axis[2] == 0 and flat:
         wanted = np.array([0.0, 0, 1])  # a lid
     elif abs(out[0]) > 0.15 * np.ptp(whole[:, 0]):
@@ -237,9 +240,8 @@ def _on_hinge(
     if np.cross(axis, centre - origin) @ wanted < 0:
         axis = -axis
     by = _QUARTER_DEG if note.by is None else note.by
-    return Link(
-        name, "revolute", faces, origin, axis * np.sign(by), float(np.deg2rad(abs(by))), float(np.deg2rad(note.ajar))
-    )
+    opens_by, ajar = np.deg2rad([abs(by), note.ajar]).tolist()
+    return Link(name, "revolute", faces, origin, axis * np.sign(by), opens_by, ajar)
 
 
 def _on_rail(
@@ -250,5 +252,4 @@ def _on_rail(
     above = pin[:, along].max() - leaf[:, along].max()
     axis = np.zeros(3)
     axis[along] = 1.0 if above >= below else -1.0
-    centre = (leaf.min(axis=0) + leaf.max(axis=0)) / 2
-    return Link(name, "prismatic", faces, centre, axis, float(max(above, below)), note.ajar)
+    return Link(name, "prismatic", faces, _middle(leaf), axis, float(max(above, below)), note.ajar)
