@@ -16,7 +16,7 @@ from typing import Any
 import zarr  # noqa: F401 (a fork of this process finds it imported)
 
 from quest.data.store import TakeStore
-from quest.errors import ObjectError
+from quest.errors import ObjectError, RendererError
 from quest.sim.plan import TakeSpec
 from quest.sim.production import Studio, missing_takes, produce
 from quest.types import Take
@@ -36,8 +36,13 @@ class StubStudio(Studio):
     notes: Path | None = None
     """Folder for what tests want to know: who made what."""
 
+    broken: bool = False
+    """Whether it cannot be set up."""
+
     def open(self, specs: Sequence[TakeSpec], *, complete: bool = False) -> None:
         """Nothing to set up."""
+        if self.broken:
+            raise RendererError("no device can render")
 
     def describe(self) -> dict[str, Any]:
         return {"renderer": "stub"}

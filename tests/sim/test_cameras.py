@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from quest.errors import ConfigError, InputError
@@ -204,6 +204,7 @@ def test_hand_shake_has_the_spectrum_of_hands() -> None:
 
 
 @given(seeds)
+@example(493796795)  # a point lies near to the camera, so that it has less room than the middle
 def test_viewpoints_never_trained_on(seed: int) -> None:
     style = CameraStyle(azimuth_deg=(60, 85), elevation_deg=(55, 75), mirrored=True)
     for path in paths_of(seed, style, frames=1):

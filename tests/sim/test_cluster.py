@@ -132,8 +132,10 @@ def test_a_take_that_kills_is_given_up(cluster: str, tmp_path: Path, monkeypatch
 
 
 def test_what_is_wrong_with_a_node_is_told_with_its_name(cluster: str, tmp_path: Path) -> None:
-    """Such as an object that it lacks: without it, it would depend on who makes a take whether it can be made."""
+    """No renderer, or an object that it lacks: else it would depend on who makes a take whether it can be made."""
     store = TakeStore(tmp_path / "takes")
+    with pytest.raises(RendererError, match=r"node .+/[0-9a-f]{8}: no device can render"):
+        produce_on_cluster(plan(2), store, StubStudio(broken=True), ONE_CORE, report=lambda event: None)
     (tmp_path / "1").mkdir()
     (tmp_path / "1" / "mobility.urdf").write_text("<robot/>")
     specs = [TakeSpec("partnet", object_id, 1, 0) for object_id in ("1", "44817")]

@@ -295,8 +295,9 @@ class PathRequest:
             centre[axis] = (upper + lower) / 2
             distance = max(distance, (upper - lower) / 2 / slope[axis])
         eye_local = np.array([centre[0], centre[1], -distance])
-        # Off-centre by part of the room that the fill factor leaves.
-        eye_local[:2] += self.rng.uniform(-0.5, 0.5, size=2) * (1 - fill) * distance * slope
+        # Off-centre by part of the room that the fill factor leaves, as far as the nearest point has it.
+        room = (1 - fill) / fill * (distance + local[:, 2].min()) * slope
+        eye_local[:2] += np.clip(self.rng.uniform(-0.5, 0.5, size=2) * (1 - fill) * distance * slope, -room, room)
         cam_from_world = np.eye(4)
         cam_from_world[:3, :3] = rotation
         cam_from_world[:3, 3] = -eye_local
