@@ -122,13 +122,13 @@ def ffmpeg_libraries() -> str:
 
 def weights() -> str:
     """Table of the weights that ship."""
-    heads = ("name", "MB", "licence", "for", "score")
+    heads = ("name", "MB", "licence", "for", "score", "on two processor cores")
     rows = []
     for name, path in shipped_weights().items():
         if name == path.stem:
             stated = read_tensors(path, ())[0].get("licence") or "not stated"
             size = f"{path.stat().st_size / 1e6:.1f}"
-            rows.append(line((f"`{name}`", size, stated, PURPOSE[name], scores(name))))
+            rows.append(line((f"`{name}`", size, stated, PURPOSE[name], scores(name), speed(name))))
     return "\n".join([line(heads), line(["---"] * len(heads)), *rows])
 
 
@@ -142,6 +142,17 @@ def scores(name: str) -> str:
     row = next(row for row in read_report(RESULTS / "real" / "images.json")["rows"] if matches(row, asked))
     missed, right = cell(row, "!%measures.recall"), cell(row, "%measures.precision")
     return f"real pictures: {missed} % of handles not found, {right} % of answers right"
+
+
+def speed(name: str) -> str:
+    """How long they take, out of the result file of the tracker's speed."""
+    if name == "quest-paper":
+        return "not measured"
+    found = read_report(RESULTS / "speed" / "tracking.json")
+    own = {"engine": "torch", "queries": 8}
+    frame_ms = next(row for row in found["rows"] if matches(row, own))["median_ms"]
+    look_ms = next(row for row in found["discovery"] if row["engine"] == "torch")["median_ms"]
+    return f"{look_ms:.0f} ms a look, {frame_ms:.0f} ms a frame of 640 × 480 with 8 queries"
 
 
 def written() -> dict[Path, str]:
