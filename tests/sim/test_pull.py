@@ -214,6 +214,7 @@ def test_a_gripper_comes_and_goes_in_straight_lines_with_the_handle_between_its_
     assert (np.diff(going[end - 1 :]) >= -1e-9).all()
     for straight in (path[first - 9 : first], path[end + 3 : end + 6]):
         np.testing.assert_allclose(straight[:, 1:], straight[:1, 1:] + np.zeros((len(straight), 1)), atol=1e-6)
+    assert not meets(gripper, entity_points(chest.entities[:1], poses)[:8, 0], 0)
     parts = [np.asarray(chest.articulation.parts[i].surface.vertices) for i in chest.entities[0].parts]
     bar = apply(poses[first, 1], np.concatenate(parts))
     gap = opened(gripper)[first] - 2 * half_m(gripper, PADS[0])[1]
@@ -277,6 +278,12 @@ def test_seeds(chest: SimObject, noun: str) -> None:
     np.testing.assert_array_equal(world_from_part(one), world_from_part(same))
     assert [part.surface for part in one.parts] == [part.surface for part in same.parts]  # type: ignore[attr-defined]
     assert (world_from_part(one)[:, :3] != world_from_part(other)[:, :3]).any()
+    if noun == "hand":
+        assert isinstance(one, Hand)
+        assert isinstance(other, Hand)
+        assert one.build != other.build
+        for mine, its in zip(one.parts, same.parts, strict=True):
+            np.testing.assert_array_equal(mine.mesh.vertices, its.mesh.vertices)  # type: ignore[attr-defined]
 
 
 def test_looks_and_builds_differ() -> None:

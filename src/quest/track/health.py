@@ -43,8 +43,8 @@ _SHIFTS_PX = 160
 _OFTEN = 5.0
 """Times by which depth moves further against the colours than is usual, above which it may be shifted ..."""
 _BETTER = 0.03
-"""... and is, if its edges correlate so much better with those of the colours once it is moved back. Of 1,250 healthy
-frames, real and simulated, one came to both, of a camera whose depth is late."""
+"""... and is, if its edges correlate so much better with those of the colours once it is moved back. None of
+the healthy frames of ``benchmarks/sensor_faults.py`` came to both."""
 _USUAL, _KNOWN = 0.5, 20
 """Pixels of that width that are usual, and how many frames that counts as, before the first."""
 _SHARPEST_GREY, _SHARPEST_DEPTH = 200.0, 0.3
