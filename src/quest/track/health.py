@@ -40,13 +40,14 @@ _RARELY = 0.1
 picture than any so far, below which noise is known."""
 _SHIFTS_PX = 160
 """Width at which colours and depth are compared with those before."""
-_OFTEN = 5.0
-"""Times by which depth moves further against the colours than is usual, above which it may be shifted ..."""
+_OFTEN = 4.0
+"""Times by which depth moves further against the colours than is usual, for how far these move, above which it may be
+shifted ..."""
 _BETTER = 0.03
 """... and is, if its edges correlate so much better with those of the colours once it is moved back. None of
 the healthy frames of ``benchmarks/sensor_faults.py`` came to both."""
-_USUAL, _KNOWN = 0.5, 20
-"""Pixels of that width that are usual, and how many frames that counts as, before the first."""
+_USUAL, _KNOWN = 0.4, 20
+"""Share of how far the colours move, and a pixel, that is usual before the first, and as how many frames it counts."""
 _SHARPEST_GREY, _SHARPEST_DEPTH = 200.0, 0.3
 """Differences across a pixel, grey values and logarithms of depth, above which all edges are alike."""
 _TURNED = {(-1, -1): "upside down", (1, -1): "mirrored", (-1, 1): "flipped"}
@@ -106,7 +107,7 @@ class Alignment:
     depth: Float32[np.ndarray, "h w"] | None = None
     """Edges of that depth."""
     usual: float = _KNOWN * float(np.log(_USUAL))
-    """Sum of the logarithms of how far depth moved against the colours ..."""
+    """Sum of the logarithms of how far depth moved against the colours, for how far these moved ..."""
     count: int = _KNOWN
     """... of so many."""
     off: tuple[float, float] | None = None
@@ -119,16 +120,17 @@ class Alignment:
             return
         log_depth = np.log(np.where(some > 0, some, np.median(some[some > 0])))
         depth, colours = _edges(log_depth, _SHARPEST_DEPTH), _edges(_smaller(grey, cv2.INTER_AREA), _SHARPEST_GREY)
-        far, may_be = _OFTEN * np.exp(self.usual / self.count), [] if self.off is None else [self.off]
+        may_be = [] if self.off is None else [self.off]
         if self.grey is not None and self.depth is not None:
-            (x, y), (u, v) = _step(self.depth, depth), _step(self.grey, colours)
-            moved = float(np.hypot(x - u, y - v))
-            if moved > far:
-                so_far = self.off or (0.0, 0.0)
-                may_be.append((so_far[0] + x - u, so_far[1] + y - v))
+            colours_px, depth_px = (np.array(_step(*pair)) for pair in ((self.grey, colours), (self.depth, depth)))
+            # Depth that is late, and parallax, are off by a share of the motion.
+            moved = float(np.hypot(*(depth_px - colours_px)) / (1 + np.hypot(*colours_px)))
+            if moved > _OFTEN * np.exp(self.usual / self.count):
+                x, y = (depth_px - colours_px).tolist()
+                may_be.append((x, y) if self.off is None else (self.off[0] + x, self.off[1] + y))
             self.usual, self.count = self.usual + float(np.log(max(moved, 0.1 * _USUAL))), self.count + 1
         self.grey, self.depth = colours, depth
-        better = {off: _better(depth, colours, off) for off in may_be if np.hypot(*off) > far}
+        better = {off: _better(depth, colours, off) for off in may_be if np.hypot(*off) > 1}
         self.off = max(better, key=better.__getitem__, default=None)
         if self.off is not None and better[self.off] < _BETTER:
             self.off = None
