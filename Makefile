@@ -17,11 +17,11 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n $(WORKERS) --dist loadgro
 
 export PYRIGHT_PYTHON_IGNORE_WARNINGS := 1
 
-.PHONY: demo test lint format types pytest fuzz soak lowest render-deps site dist clean help
+.PHONY: demo test lint format types pytest fuzz soak lowest audit render-deps site dist clean help
 .DELETE_ON_ERROR:
 
 help:
-	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | lowest | render-deps | site | dist | clean"
+	@sed -n 's/^# //p' Makefile | head -n 2; echo "also: make lint | format | types | pytest | fuzz | soak | lowest | audit | render-deps | site | dist | clean"
 
 demo: $(BASE)
 	$(BIN)/quest demo --out $(DEMO_OUT)
@@ -69,6 +69,11 @@ lowest:
 	  beartype hypothesis "pandas<3" pytest pytest-timeout pytest-xdist
 	$(LOWEST)/bin/python -m pip install --quiet --no-deps --editable .
 	$(LOWEST)/bin/python -m pytest -n $(WORKERS) tests/data tests/filter tests/geometry tests/monitor tests/track tests/test_tracks.py
+
+# Known holes in the versions that are tested; asks the databases of PyPI and OSV.
+audit: $(BIN)/python
+	$(PIP) pip-audit
+	$(BIN)/pip-audit --requirement constraints.txt --no-deps --disable-pip
 
 # The documentation as a web site, in site/.
 site: $(ALL)

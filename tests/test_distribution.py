@@ -36,7 +36,7 @@ def test_the_demo_tracks_both_clips(
     assert str(tmp_path / "demo-alarm" / "overlay.mp4") in said
 
 
-@pytest.mark.parametrize("workflow", ["ci.yml", "release.yml"])
+@pytest.mark.parametrize("workflow", ["ci.yml", "release.yml", "weekly.yml"])
 def test_workflows_are_well_formed_and_name_what_exists(workflow: str):
     assert workflow in {path.name for path in WORKFLOWS}
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
@@ -50,7 +50,10 @@ def test_workflows_are_well_formed_and_name_what_exists(workflow: str):
             assert ("uses" in step) != ("run" in step)
             if "uses" in step:
                 assert re.fullmatch(r"[\w-]+/[\w-]+@(v\d+|release/v\d+)", step["uses"]), "pinned to a major version"
-            for target in re.findall(r"\bmake ([a-z-]+)", step.get("run", "")):
+            targets = re.findall(r"\bmake ([a-z-]+)", step.get("run", ""))
+            if "make ${{ matrix.what }}" in step.get("run", ""):
+                targets += job["strategy"]["matrix"]["what"]
+            for target in targets:
                 assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
             for file in re.findall(r"\b[\w./-]+\.(?:txt|py)\b", step.get("run", "") + str(step.get("with", ""))):
                 assert (ROOT / file).is_file(), file
