@@ -2,8 +2,8 @@
 
 Two branches see the picture: a vision transformer, coarsely, knows what things are; EfficientNet-Lite0 sees them at up
 to a quarter of the picture's resolution. They are joined at a stride of 16 pixels, where the doors and drawers are read
-off; going down from there to a stride of 4 pixels, what one takes hold of. A second look
-(:mod:`quest.model.second_look`) finds the edges of both.
+off; going down from there to a stride of 4 pixels, what one takes hold of. Second looks
+(:mod:`quest.model.second_look`) find the edges of both.
 
 References: Zhou et al., Objects as Points, 2019, for maps of centres; Lin et al., Feature Pyramid Networks, CVPR 2017.
 """
@@ -20,7 +20,7 @@ from torch import Tensor, nn
 from quest.model.config import NetworkConfig
 from quest.model.efficientnet import WIDTHS, EfficientNet
 from quest.model.encoder import Encoder
-from quest.model.second_look import SecondLook
+from quest.model.second_look import SecondLooks
 
 PLACES = ("grip", "rim", "front", "hinge")
 """What the fine map finds; a grip is a handle or a knob."""
@@ -80,7 +80,7 @@ class FinderMaps:
     opening: Float[Tensor, "B O H W"]
     """Logits of :data:`OPENINGS`, which exclude each other."""
     features: Float[Tensor, "B C h w"]
-    """What the second look sees, at a stride of :data:`FINE_PX` ..."""
+    """What the second looks see, at a stride of :data:`FINE_PX` ..."""
     deep_features: Float[Tensor, "B D H W"]
     """... and at one of :data:`COARSE_PX`."""
 
@@ -156,7 +156,7 @@ class FinderNetwork(nn.Module):
         self.fine = _Head(width, len(PLACES) + 2, rare=len(PLACES), stride=FINE_PX)
         self.coarse = _Head(deep, len(PANELS) + len(OPENINGS), rare=len(PANELS), stride=COARSE_PX)
         self.longer, self.longest = _LongHead(width, stride=MIDDLE_PX), _LongHead(deep, stride=COARSE_PX)
-        self.second = SecondLook((width, deep), strides=(FINE_PX, COARSE_PX))
+        self.second = SecondLooks((width, deep), strides=(FINE_PX, COARSE_PX))
         self.dropout = nn.Dropout2d(0.1)
         self.to(memory_format=torch.channels_last)  # type: ignore[call-overload]  # twice as fast on processors
 

@@ -14,7 +14,7 @@ from scipy.special import expit, log_expit
 from torch import Tensor
 
 from quest.model.finder import COARSE_PX, FINE_PX, MIDDLE_PX, OPENINGS, PLACES, FinderMaps, FinderNetwork
-from quest.model.second_look import SecondLook
+from quest.model.second_look import SecondLook, SecondLooks
 from quest.types import LABELS
 
 LABELS_FOUND = (*LABELS, "hinge")
@@ -140,20 +140,20 @@ def placed(rgb: UInt8[np.ndarray, "H W 3"], size_px: int) -> tuple[UInt8[np.ndar
 
 
 def read_off(
-    maps: FinderMaps, second: SecondLook, *, scale: Float[np.ndarray, "2"], size: tuple[int, int], odds: Odds
+    maps: FinderMaps, second: SecondLooks, *, scale: Float[np.ndarray, "2"], size: tuple[int, int], odds: Odds
 ) -> Found:
     """What the maps of one picture (B = 1) show, and doors and drawers without a handle or knob.
 
     Args:
         maps: of the network.
-        second: the network's second look.
+        second: the network's second looks.
         scale: pixels of what the network saw per pixel of the source, along x and y.
         size: width and height of the source.
         odds: of the maps' logits.
     """
     two = np.tile(scale, 2)
     end = np.array(size, np.float64)
-    panels = _panels(maps, second, two, np.tile(end, 2), odds)
+    panels = _panels(maps, second.panel, two, np.tile(end, 2), odds)
     levels = (
         _level(maps.place[0], maps.extent[0], FINE_PX),
         _level(maps.longer, maps.longer_extent[0], MIDDLE_PX),
@@ -175,7 +175,7 @@ def read_off(
         else:
             label_p[own, LABELS_FOUND.index(name)] = 1
     keep = _apart(uv, box, place)
-    box[keep] = _looked_at_again(box[keep], maps, second)
+    box[keep] = _looked_at_again(box[keep], maps, second.grip)
     uv = _within_grip(uv, box)
     uv, box = np.clip(uv[keep] / scale, 0, end), np.clip(box[keep] / two, 0, np.tile(end, 2))
     logit = odds.gain * logit[keep] + odds.bias

@@ -110,6 +110,19 @@ class SecondLook(nn.Module):
         return (((before + fit).softmax(dim=-1) - before.softmax(dim=-1)) * place).sum(dim=-1)
 
 
+class SecondLooks(nn.Module):
+    """One for grips and one for doors and drawers: an edge of a thin bar does not look like one of a door.
+
+    Args:
+        channels: of the features, level by level.
+        strides: of the features, pixels.
+    """
+
+    def __init__(self, channels: Sequence[int], *, strides: Sequence[int]) -> None:
+        super().__init__()
+        self.grip, self.panel = (SecondLook(channels, strides=strides) for _ in range(2))
+
+
 def _grid(
     features: Float[Tensor, "B C h w"],
     stride: int,

@@ -19,7 +19,7 @@ from quest.model.finder import FinderConfig, FinderNetwork
 from quest.model.hub import FILE, LIBRARY, TAGS, HubId, download, explained, model_card
 from quest.model.tensor_file import fetch_shared, read_tensors, save_half
 
-FORMAT = "quest-finder-4"
+FORMAT = "quest-finder-5"
 
 DEFAULTS = {"quest-s16": "quest-s16-apache"}
 """Names that leave the licence open, and which of the weights that ship they stand for."""

@@ -6,7 +6,7 @@ Intersection over Union, CVPR 2019, for that of extents.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +19,7 @@ from quest.data.boxed_pictures import in_boxes
 from quest.errors import ConfigError
 from quest.model.finder import COARSE_PX, CONTEXT_BLOCKS, FINE_PX, MIDDLE_PX, PLACES, FinderMaps, FinderNetwork
 from quest.model.found import Odds, read_off, shared
+from quest.model.second_look import SecondLook
 from quest.train.finding.marks import UNKNOWN
 from quest.train.finding.sampler import FinderInputs, FinderSampler, FinderTruth, whole_view
 from quest.train.finding.settings import VIEW_PX
@@ -31,7 +32,7 @@ WEIGHTS = {
 }  # fmt: skip
 """How much every loss counts."""
 _LOOKS = 128
-"""How many second looks a step learns from."""
+"""How many second looks of a kind a step learns from."""
 _MOVED, _MOVED_PX = 0.1, 1.5
 """Standard deviation by which edges are moved before the second look, in sides of the box and in pixels."""
 _LEAST_SIDE_PX = 4.0
@@ -75,7 +76,7 @@ class StageFind:
         network: the finder.
         changes: weights of losses that are to differ; 0 turns one off.
         learned_blocks: last blocks of the transformer that learn too.
-        second_alone: whether only the second look learns.
+        second_alone: whether only the second looks learn.
 
     Raises:
         ConfigError: the transformer has fewer blocks.
@@ -104,7 +105,7 @@ class StageFind:
     def trained(self) -> list[nn.Parameter]:
         """The transformer's last blocks and all outside of it, or all but the first stages of EfficientNet.
 
-        The second look's alone, if it learns alone.
+        The second looks' alone, if they learn alone.
         """
         if self._second_alone:
             return list(self.network.second.parameters())
@@ -117,7 +118,7 @@ class StageFind:
         return list(self._blocks.parameters())
 
     def losses(self, frames: FinderInputs, truth: FinderTruth) -> dict[str, Float[Tensor, ""]]:
-        """Every loss, unweighted; that of the second look alone, if it learns alone."""
+        """Every loss, unweighted; that of the second looks alone, if they learn alone."""
         if self._second_alone:  # all else is as it will be when it is used
             self.network.eval()
             self.network.second.train()
@@ -143,39 +144,16 @@ class StageFind:
         }
 
     def _second(self, maps: FinderMaps, truth: FinderTruth) -> Float[Tensor, ""]:
-        """How far boxes are off after the second look; every grip, door and drawer counts as much.
-
-        It looks at what the first look said in some of their cells, moved by chance: the first look is nearer to the
-        truth where it has learned than where it is used.
-        """
-        levels = (
+        """How far boxes are off after the second looks; of those of one look every one counts as much."""
+        looks = self.network.second
+        grips = (
             (maps.extent, truth.extent, truth.weight, FINE_PX),
             (maps.longer_extent, truth.longer_extent, truth.longer_share[:, 0], MIDDLE_PX),
             (maps.longest_extent, truth.longest_extent, truth.longest_share[:, 0], COARSE_PX),
-            (maps.panel_extent, truth.panel_extent, truth.panel_weight, COARSE_PX),
         )
-        parts: list[tuple[Tensor, ...]] = []
-        for said, true, weight, stride in levels:
-            picture, row, column = weight.nonzero(as_tuple=True)
-            centre = (torch.stack((column, row), dim=1) + 0.5) * stride
-            first, goal = (
-                torch.cat((centre - out[:, :2], centre + out[:, 2:]), dim=1)
-                for out in (each[picture, :, row, column].detach() for each in (said, true))
-            )
-            parts.append((first, goal, weight[picture, row, column], picture))
-        first, goal, share, picture = (torch.cat(part) for part in zip(*parts, strict=True))
-        drawn = torch.multinomial(share, min(_LOOKS, len(share))) if len(share) else picture
-        first, goal, picture = first[drawn], goal[drawn], picture[drawn]
-        side = (goal[:, 2:] - goal[:, :2]).clamp(min=_LEAST_SIDE_PX).repeat(1, 2)
-        first = first + torch.randn_like(first) * (_MOVED * side + _MOVED_PX)
-        levels = maps.features.detach(), maps.deep_features.detach()
-        second = self.network.second(levels, first, picture)
-        off = (second - goal) / side
-        edges = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none", beta=_SHARP).sum()
-        middle = (goal[:, :2] + goal[:, 2:]).repeat(1, 2) / 2
-        outward = torch.tensor([-1, -1, 1, 1], device=goal.device)
-        said, true = (((box - middle) * outward)[..., None, None] for box in (second, goal))
-        return edges / pooled(edges.new_tensor(len(off))).clamp(min=1) + _giou(said, true, torch.ones_like(said[:, 0]))
+        panels = ((maps.panel_extent, truth.panel_extent, truth.panel_weight, COARSE_PX),)
+        features = maps.features.detach(), maps.deep_features.detach()
+        return (_looked_again(looks.grip, grips, features) + _looked_again(looks.panel, panels, features)) / 2
 
     def validate(self, sampler: FinderSampler, *, batches: int, device: torch.device) -> FinderScores:
         """Scores on the same whole views at every call, as many as ``batches`` batches have."""
@@ -212,6 +190,42 @@ def _average_precision(right: Bool[np.ndarray, " N"], present: int) -> float:
     """Mean precision over the things that are there, of answers, best first."""
     precision = np.cumsum(right) / np.arange(1, len(right) + 1)
     return float(precision[right].sum() / max(present, 1))
+
+
+def _looked_again(
+    look: SecondLook, levels: Iterable[tuple[Tensor, Tensor, Tensor, int]], features: Sequence[Tensor]
+) -> Float[Tensor, ""]:
+    """How far boxes are off after a second look.
+
+    It looks at what the first look said in some of their cells, moved by chance: the first look is nearer to the
+    truth where it has learned than where it is used.
+
+    Args:
+        look: the look.
+        levels: extents as the first look said and as they are, what each cell counts, and the stride, pixels.
+        features: of the maps.
+    """
+    parts: list[tuple[Tensor, ...]] = []
+    for said, true, weight, stride in levels:
+        picture, row, column = weight.nonzero(as_tuple=True)
+        centre = (torch.stack((column, row), dim=1) + 0.5) * stride
+        first, goal = (
+            torch.cat((centre - out[:, :2], centre + out[:, 2:]), dim=1)
+            for out in (each[picture, :, row, column].detach() for each in (said, true))
+        )
+        parts.append((first, goal, weight[picture, row, column], picture))
+    first, goal, share, picture = (torch.cat(part) for part in zip(*parts, strict=True))
+    drawn = torch.multinomial(share, min(_LOOKS, len(share))) if len(share) else picture
+    first, goal, picture = first[drawn], goal[drawn], picture[drawn]
+    side = (goal[:, 2:] - goal[:, :2]).clamp(min=_LEAST_SIDE_PX).repeat(1, 2)
+    first = first + torch.randn_like(first) * (_MOVED * side + _MOVED_PX)
+    second = look(features, first, picture)
+    off = (second - goal) / side
+    edges = F.smooth_l1_loss(off, torch.zeros_like(off), reduction="none", beta=_SHARP).sum()
+    middle = (goal[:, :2] + goal[:, 2:]).repeat(1, 2) / 2
+    outward = torch.tensor([-1, -1, 1, 1], device=goal.device)
+    said, true = (((box - middle) * outward)[..., None, None] for box in (second, goal))
+    return edges / pooled(edges.new_tensor(len(off))).clamp(min=1) + _giou(said, true, torch.ones_like(said[:, 0]))
 
 
 def _focal(

@@ -20,7 +20,7 @@ class FinderSamplerConfig:
     """Last blocks of the vision transformer that learn too, and with them all of EfficientNet. That takes a GPU. With
     0 what the transformer sees in a picture is kept, and a step takes a tenth of the time."""
     second_alone: bool = False
-    """Only the second look learns, and all else of the finder stays as it is."""
+    """Only the second looks learn, and all else of the finder stays as it is."""
     cut_px: int = 320
     """Side of a cut, a multiple of 32."""
     take_share: float = 0.3
@@ -35,6 +35,6 @@ class FinderSamplerConfig:
         if self.learned_blocks < 0:
             raise ConfigError(f"finding: expected learned_blocks of at least 0, got {self.learned_blocks}")
         if self.second_alone and self.learned_blocks:
-            raise ConfigError("finding: if the second look learns alone, no block of the transformer does; choose one")
+            raise ConfigError("finding: if the second looks learn alone, no block of the transformer does; choose one")
         if self.cut_px % 32 or not 32 <= self.cut_px <= VIEW_PX:
             raise ConfigError(f"finding: expected cuts of a multiple of 32 up to {VIEW_PX} px, got {self.cut_px}")
