@@ -40,7 +40,8 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LoadedNetwork]:
     """A finder with one block where there are many, because tracing takes its time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(efficientnet, "_STAGES", tuple((*stage[:4], 1) for stage in efficientnet._STAGES))
-        patch.setattr(finder, "CONTEXT_BLOCKS", (0,))
+        for name, one in (("CONTEXT_BLOCKS", (0,)), ("_STEPS", (1,)), ("_MIDDLE_STEPS", (1,))):
+            patch.setattr(finder, name, one)
         encoder = EncoderConfig(image_size=64, patch_size=16, width=24, depth=1, heads=2)
         path = tmp_path_factory.mktemp("weights") / "tiny.safetensors"
         network = make_finder(replace(FINDER, encoder=encoder))

@@ -320,10 +320,11 @@ def _apart(uv: Float[np.ndarray, "N 2"], box: Float[np.ndarray, "N 4"], place: I
 
 
 def shared(box: Float[np.ndarray, "4"], others: Float[np.ndarray, "N 4"]) -> Float[np.ndarray, " N"]:
-    """Intersection of a box with others over their union."""
+    """Intersection of a box with others over their union; 0 of boxes without an area."""
     both = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
     inner = both.clip(0).prod(axis=1)
-    return inner / ((box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1) - inner)
+    union = (box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1) - inner
+    return inner / np.maximum(union, np.finfo(float).tiny)
 
 
 def _inside(uv: Float[np.ndarray, "N 2"], panels: Panels) -> Bool[np.ndarray, "N M"]:
