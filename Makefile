@@ -61,7 +61,7 @@ soak: $(ALL)
 
 # The tests of recordings and of tracking with the lowest versions that pyproject.toml allows, but for torch.
 LOWEST = $(VENV)-lowest
-PINS = import tomllib; names = tomllib.load(open("pyproject.toml", "rb"))["project"]["dependencies"]
+PINS = import tomllib; own = tomllib.load(open("pyproject.toml", "rb"))["project"]; names = own["dependencies"] + own["optional-dependencies"]["ros"]
 lowest:
 	$(PYTHON) -m venv $(LOWEST)
 	$(LOWEST)/bin/python -c '$(PINS); print(*(n.replace(">=", "==") + ".*" for n in names if "torch" not in n), sep="\n")' > $(LOWEST)/pins.txt

@@ -110,10 +110,11 @@ def _open(where: str, options: ReadOptions) -> FrameSource:
 
 def _pictures(device: str) -> Generator[np.ndarray]:
     """Pictures of a camera, sRGB, until it sends no more."""
-    said = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)  # what cannot be opened is told below, in one line
+    log: Any = getattr(cv2.utils, "logging", cv2)  # OpenCV 5, and 4
+    said = log.getLogLevel()
+    log.setLogLevel(0)  # what cannot be opened is told below, in one line
     capture = cv2.VideoCapture(int(device) if device.isdigit() else device)
-    cv2.utils.logging.setLogLevel(said)
+    log.setLogLevel(said)
     if not capture.isOpened():
         raise RecordingError(
             f"camera {device}: cannot be opened; check its number or address, that nothing else uses it, and that "
