@@ -144,7 +144,7 @@ class StageFind:
         }
 
     def _second(self, maps: FinderMaps, truth: FinderTruth) -> Float[Tensor, ""]:
-        """How far boxes are off after the second looks; of those of one look every one counts as much."""
+        """How far boxes are off after the second looks, both of which count the same."""
         looks = self.network.second
         grips = (
             (maps.extent, truth.extent, truth.weight, FINE_PX),
