@@ -33,7 +33,9 @@ def opened(twist: np.ndarray, way: np.ndarray, *, jitter: float = 0.0) -> Landma
 def joint(landmarks: Landmarks) -> Joint:
     """Of a query that rides on that body."""
     place = np.repeat(REST[:, None], len(landmarks.pose), axis=1)
-    named = Queries.named(PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST, None)
+    named = Queries.named(
+        PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST, None, np.tile(np.eye(4), (place.shape[1], 1, 1))
+    )
     riding = replace(named, log_odds=np.array([[-5.0, 5.0]]))
     (found,) = joints_of(riding, landmarks, NOISE)
     assert found is not None
@@ -88,6 +90,8 @@ def test_the_world_is_static() -> None:
 
 def test_what_was_found_again_elsewhere_has_no_joint() -> None:
     place = np.repeat(REST[:, None], 2, axis=1)
-    named = Queries.named(PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST, None)
+    named = Queries.named(
+        PICTURE, np.full((1, 2), 30.0), np.ones(1), place, 0 * REST, None, np.tile(np.eye(4), (place.shape[1], 1, 1))
+    )
     there = replace(named, log_odds=np.array([[5.0, -5.0]]), anew=np.ones(1, dtype=bool))
     assert joints_of(there, opened(np.zeros(6), np.zeros(0)), NOISE) == (None,)

@@ -61,6 +61,7 @@ def make_stream(
         inputs=inputs,
         stamp_s=np.arange(frames) / FRAMES_PER_S,
         log_odds=log_odds.astype(np.float32),
+        readings=np.full((frames, queries, 1), np.nan, np.float32),
         band=band,
         asked=np.zeros(queries, np.int64),
         moved=np.ones(queries, bool),

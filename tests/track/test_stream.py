@@ -374,7 +374,7 @@ def test_what_is_no_saved_stream_is_refused(clip: Clip, monkeypatch: pytest.Monk
 def test_why_something_is_lost():
     at = np.array([[30.0, 30.0]])
     picture = Picture(np.zeros((64, 64), np.uint8), np.ones((2, 8, 8), np.float32))
-    named = Queries.named(picture, at, np.ones(1), np.zeros((1, 1, 3)), np.zeros((1, 3)), None)
+    named = Queries.named(picture, at, np.ones(1), np.zeros((1, 1, 3)), np.zeros((1, 3)), None, np.eye(4)[None])
     queries = replace(named, rival_px=np.array([[33.0, 34.0]]))
     for changes, words in (
         ({"seen_log_odds": -4.0}, "behind something or out of view"),

@@ -17,6 +17,7 @@ from quest.errors import ConfigError, InputError
 from quest.evaluation.metrics import INPUT_PX, distance_px
 from quest.evaluation.protocols import true_queries
 from quest.evaluation.selection import Chosen, Shard
+from quest.filter.queries import READINGS
 from quest.monitor import Inputs
 from quest.monitor.calibration import Unit
 from quest.track import Tracker
@@ -39,7 +40,7 @@ LIFTING_PX = 8.0
 LEAST_S = 0.1
 """What is lost for a shorter time is unclear, seconds."""
 
-FORMAT = 3
+FORMAT = 4
 """Version of the files."""
 
 
@@ -59,6 +60,8 @@ class StreamRecord:
     """Time of each frame, seconds."""
     log_odds: Float32[np.ndarray, "T K"]
     """The tracker's own, that the query is lost; NaN until it is asked."""
+    readings: Float32[np.ndarray, "T K R"]
+    """What tells that (:data:`quest.filter.queries.READINGS`); NaN where nothing does, and of colours alone."""
     band: Int8[np.ndarray, "T K"]
     """:data:`RIGHT`, :data:`UNCLEAR` or :data:`LOST`."""
     asked: Int[np.ndarray, " K"]
@@ -178,7 +181,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs:
     queries = true_queries(truth, entities, [0] * len(entities))
     stream = tracker.stream(truth.clip.camera, queries, alpha=None)
     t, k = len(take), len(entities)
-    log_odds = np.full((t, k), np.nan, np.float32)
+    log_odds, readings = np.full((t, k), np.nan, np.float32), np.full((t, k, len(READINGS)), np.nan, np.float32)
     uv_px = np.full((t, k, 2), np.nan, np.float32)
     point_world = np.full((t, k, 3), np.nan, np.float32)
     for i in range(t):
@@ -187,6 +190,8 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs:
         state = stream.step(frame.rgb, depth_m, frame.stamp_s, frame.cam_from_world)
         rows = list(state.query)
         log_odds[i, rows], uv_px[i, rows], point_world[i, rows] = state.lost_log_odds, state.uv_px, state.point_world
+        if inputs == "depth" and (followed := stream.memory.filter) is not None:
+            readings[i, rows] = followed.queries.readings
     return StreamRecord(
         take=take.info.name,
         view=view,
@@ -197,6 +202,7 @@ def record_stream(tracker: Tracker, take: Take, view: int, *, part: str, inputs:
         inputs=inputs,
         stamp_s=take.stamp_s,
         log_odds=log_odds,
+        readings=readings,
         band=bands(take, view, uv_px, point_world, entities, inputs=inputs),
         asked=np.zeros(k, np.int64),
         moved=take.moved[entities],

@@ -10,11 +10,12 @@ Reference: McFadden, Conditional logit analysis of qualitative choice behavior, 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
@@ -33,8 +34,8 @@ class Likeness:
     """How like K anchors a frame is."""
 
     picture: Picture
-    cosine: Float[np.ndarray, "K h w"]
-    """Of each cell's descriptor with that of the most like view."""
+    by_view: Float[np.ndarray, "K V h w"]
+    """Cosine of each cell's descriptor with that of each view."""
     patch: Float[np.ndarray, "K V S S"]
     """Grey values around the entity in some views."""
 
@@ -45,8 +46,12 @@ class Likeness:
         """Compare a frame with views of entities."""
         # Not by NumPy: threads of OpenBLAS keep all cores busy with waiting long after such a product.
         one, other = torch.from_numpy(descriptor).float(), torch.from_numpy(picture.descriptors)
-        cosine = torch.einsum("kvd,dhw->kvhw", one, other).amax(dim=1).numpy()
-        return cls(picture, cosine, patch)
+        return cls(picture, torch.einsum("kvd,dhw->kvhw", one, other).numpy(), patch)
+
+    @cached_property
+    def cosine(self) -> Float[np.ndarray, "K h w"]:
+        """Of each cell's descriptor with that of the most like view."""
+        return np.asarray(self.by_view.max(axis=1))
 
     def at(self, uv_px: Float[np.ndarray, "K C 2"], noise: Noise, reach_px: int = _REACH_PX) -> Places:
         """How like the anchor C places of each query are; the best correlation may be ``reach_px`` off."""
@@ -58,10 +63,9 @@ class Likeness:
     ) -> tuple[Float[np.ndarray, "K C 2"], Float[np.ndarray, "K C"], Float[np.ndarray, "K C"]]:
         """Where the correlation is best, and the logarithms of what the cosine and it fall short of one, negative."""
         count, places = uv_px.shape[:2]
-        rows, columns = self.cosine.shape[1:]
         around = np.array([cv2.dilate(each, np.ones((3, 3), np.uint8)) for each in self.cosine])
-        cell = np.floor(uv_px / self.picture.cell_px).astype(np.int64).clip(0, (columns - 1, rows - 1))
-        cosine = around[np.arange(count)[:, None], cell[..., 1], cell[..., 0]]
+        column, row = np.moveaxis(self._cell(uv_px), -1, 0)
+        cosine = around[np.arange(count)[:, None], row, column]
         best = [
             max(
                 (
@@ -77,11 +81,28 @@ class Likeness:
         wide, near = (-np.log(1 + _SHORT - each.clip(-1, 1)) for each in (cosine.astype(np.float64), correlation))
         return uv_px + shift, wide, near
 
+    def by_each_view(
+        self, uv_px: Float[np.ndarray, "K 2"]
+    ) -> tuple[Float[np.ndarray, "K V"], Float[np.ndarray, "K V"], Float[np.ndarray, "K V"]]:
+        """How like each view a place is.
+
+        Returns:
+            The cosine; the logarithm of what the correlation falls short of one, negative; the best cosine elsewhere.
+        """
+        count, views = self.by_view.shape[:2]
+        flat = self.by_view.reshape(count * views, *self.by_view.shape[2:])
+        alone = Likeness(self.picture, flat[:, None], self.patch.reshape(-1, 1, *self.patch.shape[2:]))
+        at_px = np.repeat(uv_px, views, axis=0)
+        _, wide, near = alone.terms(at_px[:, None])
+        best = alone.terms(alone.elsewhere_px(at_px, 1))[1]
+        cosine, other = (1 + _SHORT - np.exp(-each.reshape(count, views)) for each in (wide, best))
+        return cosine, near.reshape(count, views), other
+
     def elsewhere_px(self, uv_px: Float[np.ndarray, "K 2"], count: int) -> Float[np.ndarray, "K C 2"]:
         """The cells most like the anchor, none of them near where it is followed, or near another."""
         cosine, cells = self.cosine.copy(), []
         rows, columns = cosine.shape[1:]
-        at = np.floor(uv_px / self.picture.cell_px).astype(np.int64).clip(0, (columns - 1, rows - 1))
+        at = self._cell(uv_px)
         row, column = np.arange(rows)[None, :, None], np.arange(columns)[None, None]
         for _ in range(count):
             off = np.maximum(abs(row - at[:, 1, None, None]), abs(column - at[:, 0, None, None]))
@@ -89,6 +110,11 @@ class Likeness:
             at = np.stack(np.unravel_index(cosine.reshape(len(at), -1).argmax(axis=1), (rows, columns))[::-1], axis=-1)
             cells.append((at + 0.5) * self.picture.cell_px)
         return np.stack(cells, axis=1)
+
+    def _cell(self, uv_px: Float[np.ndarray, "*N 2"]) -> Int[np.ndarray, "*N 2"]:
+        """Column and row of the cell of each place."""
+        rows, columns = self.by_view.shape[2:]
+        return np.floor(uv_px / self.picture.cell_px).astype(np.int64).clip(0, (columns - 1, rows - 1))
 
     def elsewhere(self, uv_px: Float[np.ndarray, "K 2"], count: int, noise: Noise) -> Places:
         """How like the anchor the likest places elsewhere are."""

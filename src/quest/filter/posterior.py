@@ -18,6 +18,7 @@ from quest.filter.layers import GATE, Layers
 from quest.filter.noise import Noise
 from quest.filter.picture import Picture
 from quest.filter.queries import Queries
+from quest.filter.readings import Weighed, read
 from quest.filter.surfaces import depth_error, in_front, occluded_ratio, seen_ratio
 from quest.filter.view import View, in_image, move, move_back
 
@@ -32,7 +33,7 @@ _TOGETHER_PX = 2.0
 _CARRIES_AT_LEAST = np.array([0.1, 1e-3])
 """How probable it is that the world, or that any one of the others, carries what nothing around it is on."""
 _HALF, _HARDLY = 0.5, 0.05
-_MOST = 9.0
+_MOST, _IMPOSSIBLE = 9.0, 20.0
 """Log-odds are kept within this."""
 
 
@@ -102,8 +103,11 @@ def weigh(
     if layers is not None:
         last_px = np.where(jumps[:, None], judged.rival_px, at_px)
         judged = judged.seen_at(last_px, jumps | (judged.seen_log_odds > 0), layers)
+    judged = replace(judged, anew=queries.anew | (anew & queries.known))
+    told = read(judged, _weighed(queries, places, log_odds, here, left), likeness, landmarks, view, noise)
     return replace(
         _viewed(judged, confirmed, at_px, picture),
+        readings=np.where((jumps | ~queries.known)[:, None], np.nan, told),
         own_px=own_px,
         own_variance=np.where(
             jumps, noise.anchor_px**2, np.where(caught, places.ride_px2[each, best], queries.own_variance)
@@ -113,12 +117,34 @@ def weigh(
         error=np.where(anew[:, None], ray_error(view, own_px, point[:, 0], noise), queries.error),
         told_along=np.where(anew[:, None], 0.0, judged.told_along),
         along_m=np.where(anew, 0.0, judged.along_m),
-        anew=queries.anew | (anew & queries.known),
         log_odds=np.where(anew[:, None], 0.0, np.clip(log_odds, -SURE, SURE)),
         seen_log_odds=np.where(jumps, judged.rival_log_odds, judged.seen_log_odds),
         lost_log_odds=np.where(jumps, -judged.rival_log_odds, judged.lost_log_odds),
         unseen_s=np.where(jumps, 0.0, judged.unseen_s),
         rival_log_odds=np.where(jumps, -SURE, judged.rival_log_odds),
+    )
+
+
+def _weighed(
+    queries: Queries,
+    places: _Places,
+    log_odds: Float[np.ndarray, "K B"],
+    here: Int[np.ndarray, " K"],
+    left: Float[np.ndarray, " K"],
+) -> Weighed:
+    """What is read off, of the most probable places."""
+    each, rides, body = np.arange(len(queries)), here > 0, np.maximum(here - 1, 0)
+    carried = np.where(places.possible, np.clip(log_odds, -SURE, SURE), -_IMPOSSIBLE)
+    return Weighed(
+        at_px=places.uv_px[each, here],
+        place_px=places.uv_px,
+        log_odds=np.concatenate([np.zeros((len(queries), 1)), carried], axis=1),
+        rides=rides,
+        body=body,
+        depth_m=np.where(rides, places.depth_m[each, body], queries.own_depth),
+        looks=places.looks[each, here],
+        covered=places.covered[each, here],
+        elsewhere=left,
     )
 
 

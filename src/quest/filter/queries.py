@@ -17,6 +17,14 @@ from quest.filter.ray import ALONG_M, depths_told, most_probable
 from quest.filter.surfaces import depth_error
 from quest.filter.view import View, move
 
+READINGS = (
+    "lost", "seen", "rival", "unseen s", "elsewhere", "covered", "own variance", "own found", "told anew", "rides",
+    "rides on world", "own apart", "spread", "margin", "looks", "anchor cosine", "newest cosine", "anchor correlation",
+    "newest correlation", "anchor elsewhere", "tile of own patch", "tile", "turn", "distance", "roll", "went",
+    "depth off", "body seen s", "body error", "screw", "off screw", "share",
+)  # fmt: skip
+"""Names of what tells whether a query is lost (:mod:`quest.filter.readings`), in their order."""
+
 
 @dataclass(frozen=True)
 class Queries:
@@ -44,6 +52,8 @@ class Queries:
     """Log-likelihood, by the depths since, of each place along that ray (:data:`quest.filter.ray.ALONG_M`)."""
     along_m: Float[np.ndarray, " K"]
     """How far along it the place is, metres."""
+    camera: Float[np.ndarray, "K B 4 4"]
+    """Pose of the camera in which it was named, on each body (``cam_from_body``)."""
     anew: Bool[np.ndarray, " K"]
     """Whether the place was told anew since it was first known: how it came there is not known."""
     log_odds: Float[np.ndarray, "K B"]
@@ -62,6 +72,8 @@ class Queries:
     """The most probable place elsewhere."""
     rival_log_odds: Float[np.ndarray, " K"]
     """That it is there."""
+    readings: Float[np.ndarray, "K N"]
+    """What tells in this frame whether it is lost (:data:`READINGS`); NaN where nothing does."""
 
     @classmethod
     def named(
@@ -72,6 +84,7 @@ class Queries:
         place: Float[np.ndarray, "K B 3"],
         error: Float[np.ndarray, "K 3"],
         layers: Layers | None,
+        camera: Float[np.ndarray, "B 4 4"],
     ) -> Queries:
         """Pixels of a frame that are named in it."""
         count, bodies = place.shape[:2]
@@ -88,6 +101,7 @@ class Queries:
             error=error,
             told_along=np.zeros((count, len(ALONG_M))),
             along_m=np.zeros(count),
+            camera=np.repeat(camera[None], count, axis=0),
             anew=np.zeros(count, dtype=bool),
             log_odds=np.zeros((count, bodies)),
             seen_log_odds=np.full(count, SURE),
@@ -97,6 +111,7 @@ class Queries:
             seen_share=seen_share,
             rival_px=uv_px,
             rival_log_odds=np.full(count, -SURE),
+            readings=np.full((count, len(READINGS)), np.nan),
         )
 
     def __len__(self) -> int:
@@ -118,6 +133,7 @@ class Queries:
             lost_log_odds=np.where(at, -SURE, self.lost_log_odds),
             unseen_s=np.where(at, 0.0, self.unseen_s),
             rival_log_odds=np.where(at, -SURE, self.rival_log_odds),
+            readings=np.where(at[:, None], np.nan, self.readings),
         )
 
     def seen_at(self, uv_px: Float[np.ndarray, "K 2"], which: Bool[np.ndarray, " K"], layers: Layers) -> Queries:
@@ -192,6 +208,7 @@ class Queries:
             seen_place=place,
             seen_share=share,
             place=np.concatenate([self.place, np.repeat(self.place[:, :1], new, axis=1)], axis=1),
+            camera=np.concatenate([self.camera, np.repeat(self.camera[:, :1], new, axis=1)], axis=1),
             log_odds=np.concatenate([self.log_odds, np.repeat(self.log_odds[:, :1], new, axis=1)], axis=1),
         )
 

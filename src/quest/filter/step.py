@@ -50,7 +50,8 @@ def begin(picture: Picture, view: View, stamp_s: float, noise: Noise) -> FilterS
     nowhere = np.zeros((0, 2))
     layers = Layers.none(picture.size) if view.depth_m is None else None
     landmarks, layers = _sown(Landmarks.none(), layers, picture, view, nowhere, noise)
-    queries = Queries.named(picture, nowhere, np.zeros(0), np.zeros((0, 1, 3)), np.zeros((0, 3)), layers)
+    place, error = np.zeros((0, 1, 3)), np.zeros((0, 3))
+    queries = Queries.named(picture, nowhere, np.zeros(0), place, error, layers, view.cam_from_world[None])
     return FilterState(picture, view, stamp_s, landmarks, queries, layers)
 
 
@@ -119,7 +120,8 @@ def ask(state: FilterState, uv_px: Float[np.ndarray, "K 2"], noise: Noise) -> Fi
     point = state.view.lift(uv_px, depth_m)
     place = move_back(pose, np.repeat(point[:, None], len(pose), axis=1))
     error = ray_error(state.view, uv_px, point, noise)
-    new = Queries.named(state.picture, uv_px, depth_m, place, error, state.layers)
+    camera = state.view.cam_from_world @ pose
+    new = Queries.named(state.picture, uv_px, depth_m, place, error, state.layers, camera)
     landmarks, layers = _sown(state.landmarks, state.layers, state.picture, state.view, uv_px, noise)
     return replace(state, landmarks=landmarks, layers=layers, queries=state.queries.join(new))
 
@@ -199,6 +201,8 @@ class Answer:
     visible: Bool[np.ndarray, " K"]
     lost_log_odds: Float[np.ndarray, " K"]
     """That it is not there."""
+    readings: Float[np.ndarray, "K N"]
+    """What tells whether it is lost (:data:`quest.filter.queries.READINGS`); NaN where nothing does."""
     joint: tuple[Joint | None, ...]
     """What moves it, in the filter's world; None where that is not known."""
 
@@ -218,4 +222,5 @@ def read_off(state: FilterState, noise: Noise) -> Answer:
     point = np.where(rides[:, None], ride, own)
     visible = in_image(uv_px, state.picture.size) & ~hidden & (queries.seen_log_odds > 0)
     seen_px = state.picture.to_camera(uv_px)
-    return Answer(seen_px, point, visible, queries.lost_log_odds, joints_of(queries, state.landmarks, noise))
+    joints = joints_of(queries, state.landmarks, noise)
+    return Answer(seen_px, point, visible, queries.lost_log_odds, queries.readings, joints)

@@ -9,7 +9,7 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.found import Odds
 from quest.untrusted import build, parse_json, reading
 
-REVISION = 15
+REVISION = 16
 """Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
 _SIZES_PX = (16, 4096)
 """Smallest and largest side that pictures are brought to."""

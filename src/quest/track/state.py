@@ -43,7 +43,7 @@ class StreamState:
     """Where on its joint each query is, radians or metres; NaN without a joint, on one that does not move, and where
     the point is unknown."""
     lost_log_odds: Float32[np.ndarray, " K"]
-    """That the identity is lost, by the filter."""
+    """That the identity is lost, by the filter, and with depth by what its readings taught."""
     lost_p: Float32[np.ndarray, " K"]
     """The same as a calibrated probability; NaN where nothing is watched."""
     alarm: tuple[Alarm | None, ...]

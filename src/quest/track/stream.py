@@ -18,6 +18,7 @@ from quest.filter.noise import Noise
 from quest.filter.picture import GreyPicture
 from quest.filter.step import Answer, FilterState
 from quest.filter.view import View, in_image, move
+from quest.model.doubt import Doubt
 from quest.model.finder import FinderNetwork
 from quest.model.found import Found, find
 from quest.model.xfeat import XFeat
@@ -73,6 +74,7 @@ class Stream:
         queries: Sequence[Query] | None,
         *,
         calibrations: Mapping[Inputs, Calibration],
+        doubt: Doubt,
         budget: Budget | None,
         finding: Finding | None = None,
     ) -> None:
@@ -80,6 +82,7 @@ class Stream:
         self._base_noise = noise
         self._config = config
         self._calibrations = calibrations
+        self._doubt = doubt
         self._preprocessor = Preprocessor(camera, config.follow_px)
         self._network = network
         self._queries = StreamQueries(config, camera, queries if finding is None else ())
@@ -334,7 +337,7 @@ class Stream:
     def _answer(self, state: FilterState, stamp_s: float, *, has_depth: bool) -> tuple[StreamState, tuple[Alarm, ...]]:
         """What is said of the newest frame, and the alarms that are raised in it."""
         memory, following, told = self._memory, self._queries.state.following, self._preprocessor.state
-        answer, numbers = filtering.read_off(state, self.noise), [f.number for f in following]
+        answer, numbers = self._doubted(filtering.read_off(state, self.noise)), [f.number for f in following]
         lost_p, alarms, raised = self._watch(numbers, answer, state, stamp_s)
         doubt, blind_s = probability(answer.lost_log_odds), told.now_s - state.stamp_s
         if blind_s > 0:  # while nothing is seen, everything may come to move
@@ -371,6 +374,13 @@ class Stream:
             flags=told.flags,
         )
         return answered, raised
+
+    def _doubted(self, answer: Answer) -> Answer:
+        """With learned log odds of a loss, where depth tells more than colours alone."""
+        if not (self._preprocessor.state.has_depth and len(answer.readings)):
+            return answer
+        told = self._doubt.log_odds(answer.readings)
+        return replace(answer, lost_log_odds=np.where(np.isnan(told), answer.lost_log_odds, told))
 
     def _watch(
         self, numbers: list[int], answer: Answer, state: FilterState, stamp_s: float
