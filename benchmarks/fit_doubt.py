@@ -29,6 +29,7 @@ from quest.data.store import TakeStore
 from quest.evaluation.drift import auroc
 from quest.evaluation.real.run import shown
 from quest.evaluation.real.sets import LabelledClip, open_set
+from quest.evaluation.report import provenance, write_report
 from quest.evaluation.selection import Shard, select_takes
 from quest.evaluation.stream_record import record_streams
 from quest.filter.queries import READINGS
@@ -97,9 +98,9 @@ class FitDoubt:
             told += [each for clip in found.clips for each in _followed(tracker, clip, found.far_px)]
         teach = [t for t in told if not t.real or t.of in self.teaching]
         doubt = self._fit(teach)
-        result = {"told": self._figures(teach, [t for t in told if t not in teach], doubt), "by": self._settings(teach)}
-        self.results.write_text(json.dumps(result, indent=1) + "\n")
-        print(json.dumps(result, indent=1))
+        rows = self._figures(teach, [t for t in told if t not in teach], doubt)
+        write_report(provenance() | {"by": self._settings(teach), "rows": rows}, self.results)
+        print(json.dumps(rows, indent=1))
         about = f"fitted to {len(recorded.records)} simulated streams and {sum(t.real for t in teach)} real ones"
         save_doubt(doubt, self.out, readings=READINGS, about=about)
 
@@ -115,11 +116,11 @@ class FitDoubt:
         }
         return {name: getattr(self, name) for name in names} | counts
 
-    def _figures(self, teach: Sequence[Told], others: Sequence[Told], doubt: Doubt) -> dict[str, dict[str, Any]]:
+    def _figures(self, teach: Sequence[Told], others: Sequence[Told], doubt: Doubt) -> list[dict[str, Any]]:
         """Of answers by networks that were not taught by them, beside networks of the filter's own odds alone."""
         of, own = sorted({t.of for t in teach}), READINGS.index("lost")
         fold = dict(zip(of, np.random.default_rng(0).permutation(len(of)) % FOLDS, strict=True))
-        order, network, odds = list(others), [doubt.log_odds(t.readings) for t in others], []
+        order, network = list(others), [doubt.log_odds(t.readings) for t in others]
         alone = self._fit(teach, only=own)
         odds = [alone.log_odds(t.readings[:, own : own + 1]) for t in others]
         for k in range(FOLDS):
@@ -130,11 +131,12 @@ class FitDoubt:
             odds += [alone.log_odds(t.readings[:, own : own + 1]) for t in held_out]
         lost, moved = (np.concatenate([getattr(t, name) for t in order]) for name in ("lost", "moved"))
         kind = np.repeat([1 if t in others else 2 if t.real else 0 for t in order], [len(t.lost) for t in order])
-        rows = {"simulated": kind == 0, "simulated, moved": (kind == 0) & moved, "real": kind == 1}
-        return {
-            name: {row: _measures(np.concatenate(values)[which], lost[which]) for row, which in rows.items()}
+        rows = {"simulated": kind == 0, "simulated, of what moves": (kind == 0) & moved, "real": kind == 1}
+        return [
+            {"by": name, "answers": row} | _measures(np.concatenate(values)[which], lost[which])
             for name, values in (("network", network), ("own odds", odds))
-        }
+            for row, which in rows.items()
+        ]
 
     def _fit(self, told: Sequence[Told], only: int | None = None) -> Doubt:
         """Some networks, averaged; by one reading alone a network that is monotonic for all that matters."""
@@ -201,7 +203,7 @@ def _measures(score: np.ndarray, lost: np.ndarray) -> dict[str, float | None]:
     p = expit(score)
     told = p > 0.5
     return {
-        "answers": len(lost),
+        "n": len(lost),
         "lost": float(lost.mean()),
         "auroc": auroc(score, lost),
         "log_loss": float(-(np.log(p[lost] + 1e-9).sum() + np.log(1 - p[~lost] + 1e-9).sum()) / len(lost)),

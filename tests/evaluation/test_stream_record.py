@@ -41,7 +41,7 @@ NAMES = ("panels-100001", "panels-100002")
 
 
 def equal(a: StreamRecord, b: StreamRecord) -> bool:
-    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=f.name == "log_odds")
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name), equal_nan=f.name in ("log_odds", "readings"))
                for f in fields(StreamRecord))  # fmt: skip
 
 
