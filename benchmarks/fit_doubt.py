@@ -2,8 +2,9 @@
 
     python -m benchmarks.fit_doubt --takes STORE... --real SETS... --records DIR --out doubt.safetensors
 
-Every view of takes of training objects is followed by the true pixels of the first frame, and so are labelled real
-recordings with depth, with their poses and without. Answers that are right or lost teach. Simulated objects are parted
+Every view of takes of training objects is followed by the true pixels of the first frame, half of them from pixels
+anywhere as well, also where depth comes at half the rate, and so are labelled real recordings with depth, with their
+poses and without. Answers that are right or lost teach. Simulated objects are parted
 in five, and each part is told by a network that the others taught; of real recordings only some teach, and the others
 are told by the network that is written. These figures, beside those of the filter's own odds, go into
 ``benchmarks/results/doubt.json``.
@@ -11,12 +12,14 @@ are told by the network that is written. These figures, beside those of the filt
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -31,12 +34,19 @@ from quest.evaluation.real.run import shown
 from quest.evaluation.real.sets import LabelledClip, open_set
 from quest.evaluation.report import provenance, write_report
 from quest.evaluation.selection import Shard, select_takes
-from quest.evaluation.stream_record import record_streams
+from quest.evaluation.stream_record import FAR_PX, WIDTH_PX, record_streams
 from quest.filter.queries import READINGS
+from quest.filter.view import View, in_image, move
 from quest.model.doubt import LIMIT, Doubt, save_doubt
 from quest.track import Tracker
+from quest.types import Clip, Take
+from quest.whole_file import whole_file
 
 FOLDS = 5
+POINTS = 10
+"""That are drawn from a picture."""
+_AWAY_PX = 9
+"""Side of the square around each that is on one link."""
 NEAR_PX = 16.0
 """An answer in a real recording is right up to here; it is lost beyond its set's own distance."""
 
@@ -84,11 +94,14 @@ class FitDoubt:
         """Record, cross-validate, fit to all of it, write."""
         tracker = quest.load(monitor=False)
         chosen = [(store, select_takes(store.infos(), split=["train"])) for store in map(TakeStore, self.takes)]
-        recorded = record_streams(tracker, chosen, self.records, inputs="depth", shard=Shard.parse(self.shard))
+        shard = Shard.parse(self.shard)
+        for store, names in chosen:
+            self._points(tracker, store, [name for i, name in enumerate(names) if i in shard])
+        recorded = record_streams(tracker, chosen, self.records, inputs="depth", shard=shard)
         if recorded.missing:
             print(f"left to other shards: {recorded.missing} streams; nothing is fitted yet")
             return
-        told = []
+        told = [each for store, names in chosen for each in self._points(tracker, store, list(names))]
         for r in recorded.records:
             known = r.judged & np.isfinite(r.readings).all(axis=-1)
             moved = np.broadcast_to(r.moved, known.shape)[known]
@@ -103,6 +116,22 @@ class FitDoubt:
         print(json.dumps(rows, indent=1))
         about = f"fitted to {len(recorded.records)} simulated streams and {sum(t.real for t in teach)} real ones"
         save_doubt(doubt, self.out, readings=READINGS, about=about)
+
+    def _points(self, tracker: Tracker, store: TakeStore, names: Sequence[str]) -> list[Told]:
+        """What is told of points anywhere, of every second take; of every third of these by depth at half the rate."""
+        told = []
+        for name in names:
+            drawn = _number(name)
+            if drawn % 2:
+                continue
+            path = self.records / f"{name}-points.npz"
+            if not path.exists():
+                followed = _anywhere(tracker, store.read(name), half=drawn % 3 == 0)
+                with whole_file(path) as partial:
+                    np.savez_compressed(partial, **vars(followed))
+            with np.load(path) as file:
+                told.append(Told(str(file["of"]), file["readings"], file["lost"], file["moved"], real=False))
+        return told
 
     def _settings(self, teach: Sequence[Told]) -> dict[str, Any]:
         names = ("hidden", "networks", "steps", "decay", "real_weight", "teaching")
@@ -174,6 +203,50 @@ class FitDoubt:
         return network
 
 
+def _anywhere(tracker: Tracker, take: Take, *, half: bool) -> Told:
+    """What is told of points that are drawn from the first picture, wherever they are."""
+    view, rng = take.views[0], np.random.default_rng(_number(take.info.name) >> 224)
+    clip, links = view.clip, view.link_id[0]
+    assert clip.depth_m is not None
+    around = np.ones((_AWAY_PX, _AWAY_PX), np.uint8)
+    inside = (cv2.erode(links, around) == cv2.dilate(links, around)) & (clip.depth_m[0] > 0)
+    row, column = rng.permutation(np.argwhere(inside))[:POINTS].T
+    at_px = np.stack([column, row], axis=-1) + 0.5
+    seen = [View(clip.camera.matrix.astype(np.float64), clip.frame(t).cam_from_world, None) for t in range(len(clip))]
+    point, link = seen[0].lift(at_px, clip.depth_m[0][row, column].astype(np.float64)), links[row, column].astype(int)
+    poses = np.concatenate([np.tile(np.eye(4), (len(take), 1, 1, 1)), take.link_pose.astype(np.float64)], axis=1)
+    true = move(poses[:, link] @ np.linalg.inv(poses[0, link]), point[None])
+    true_px = np.stack([one.project(each)[0] for one, each in zip(seen, true, strict=True)])
+    queries = [quest.Query.point(0, *map(float, each)) for each in at_px]
+    uv_px, readings = _read(tracker, clip, queries, every=2 if half else 1)
+    off = np.linalg.norm(uv_px - true_px, axis=-1) * WIDTH_PX / clip.camera.width
+    known = np.isfinite(readings).all(axis=-1) & in_image(true_px, (clip.camera.width, clip.camera.height))
+    known &= (off <= NEAR_PX) | (off > FAR_PX)
+    moved = np.broadcast_to(
+        np.linalg.norm(true - true[:1], axis=-1).max(axis=0) > 0.1 * take.info.half_diagonal_m, off.shape
+    )
+    return Told(take.info.object_id, readings[known], off[known] > NEAR_PX, moved[known], real=False)
+
+
+def _number(name: str) -> int:
+    """Of 256 bits, drawn for a name."""
+    return int(hashlib.sha256(name.encode()).hexdigest(), 16)
+
+
+def _read(tracker: Tracker, clip: Clip, queries: list[quest.Query], every: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels and readings of queries in every frame, of which every so many bring depth; NaN until they are asked."""
+    stream, shape = tracker.stream(clip.camera, queries, alpha=None), (len(clip), len(queries))
+    uv_px, readings = np.full((*shape, 2), np.nan), np.full((*shape, len(READINGS)), np.nan, np.float32)
+    for t in range(len(clip)):
+        frame = clip.frame(t)
+        depth_m = frame.depth_m if t % every == 0 else None
+        state = stream.step(frame.rgb, depth_m, frame.stamp_s, frame.cam_from_world)
+        uv_px[t, list(state.query)] = state.uv_px
+        if (followed := stream.memory.filter) is not None:
+            readings[t, list(state.query)] = followed.queries.readings
+    return uv_px, readings
+
+
 def _followed(tracker: Tracker, labelled: LabelledClip, far_px: float) -> list[Told]:
     """What is told of the visible labels of a recording, followed with depth, with poses and without."""
     labels, made = labelled.labels, []
@@ -181,15 +254,7 @@ def _followed(tracker: Tracker, labelled: LabelledClip, far_px: float) -> list[T
     for inputs, clip in shown(labelled.read()).items():
         if inputs == "colours":
             continue
-        stream = tracker.stream(clip.camera, labels.queries(), alpha=None)
-        shape = len(clip), len(labels.names)
-        uv_px, readings = np.full((*shape, 2), np.nan), np.full((*shape, len(READINGS)), np.nan, np.float32)
-        for t in range(len(clip)):
-            frame = clip.frame(t)
-            state = stream.step(frame.rgb, frame.depth_m, frame.stamp_s, frame.cam_from_world)
-            uv_px[t, list(state.query)] = state.uv_px
-            if (followed := stream.memory.filter) is not None:
-                readings[t, list(state.query)] = followed.queries.readings
+        uv_px, readings = _read(tracker, clip, labels.queries())
         error_px = np.linalg.norm(uv_px[at] - labels.uv_px[labels.scored], axis=-1)
         known = (labels.state[labels.scored] == "visible") & np.isfinite(readings[at]).all(axis=-1)
         known &= (error_px <= NEAR_PX) | (error_px > far_px)
