@@ -2,12 +2,13 @@
 
     python -m benchmarks.fit_doubt --takes STORE... --real SETS... --records DIR --out doubt.safetensors
 
-Every view of takes of training objects is followed by the true pixels of the first frame, half of them from pixels
-anywhere as well, also where depth comes at half the rate, and so are labelled real recordings with depth, with their
-poses and without. Answers that are right or lost teach. Simulated objects are parted
-in five, and each part is told by a network that the others taught; of real recordings only some teach, and the others
-are told by the network that is written. These figures, beside those of the filter's own odds, go into
-``benchmarks/results/doubt.json``.
+Three kinds of streams teach, by answers that are right or lost: every view of takes of training objects, followed by
+the true pixels of entities; half of these takes once more, followed by pixels anywhere, a third of them with depth at
+half the rate; and labelled real recordings, with their poses and without.
+
+Simulated objects are parted in five, and each part is told by a network that the others taught. Of real recordings
+some teach, and the others are told by the network that is written. These figures, beside those of the filter's own
+odds, go into ``benchmarks/results/doubt.json``.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from quest.evaluation.real.run import shown
 from quest.evaluation.real.sets import LabelledClip, open_set
 from quest.evaluation.report import provenance, write_report
 from quest.evaluation.selection import Shard, select_takes
-from quest.evaluation.stream_record import FAR_PX, WIDTH_PX, record_streams
+from quest.evaluation.stream_record import FAR_PX, WIDTH_PX, record_streams, tracker_id
 from quest.filter.queries import READINGS
 from quest.filter.view import View, in_image, move
 from quest.model.doubt import LIMIT, Doubt, save_doubt
@@ -48,7 +49,7 @@ POINTS = 10
 _AWAY_PX = 9
 """Side of the square around each that is on one link."""
 NEAR_PX = 16.0
-"""An answer in a real recording is right up to here; it is lost beyond its set's own distance."""
+"""An answer is right up to here: of a real recording, or of a point anywhere in a picture 640 px wide."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ class FitDoubt:
             drawn = _number(name)
             if drawn % 2:
                 continue
-            path = self.records / f"{name}-points.npz"
+            path = self.records / f"{name}-points-{tracker_id(tracker)}.npz"
             if not path.exists():
                 followed = _anywhere(tracker, store.read(name), half=drawn % 3 == 0)
                 with whole_file(path) as partial:
@@ -168,7 +169,7 @@ class FitDoubt:
         ]
 
     def _fit(self, told: Sequence[Told], only: int | None = None) -> Doubt:
-        """Some networks, averaged; by one reading alone a network that is monotonic for all that matters."""
+        """Some networks, averaged; of width 1 where ``only`` one reading tells."""
         columns = slice(None) if only is None else slice(only, only + 1)
         readings = torch.from_numpy(np.concatenate([t.readings[:, columns] for t in told]))
         lost = torch.from_numpy(np.concatenate([t.lost for t in told])).float()

@@ -180,8 +180,9 @@ RESULTS = Page(
             "answers = answers | told by = by | n = n | lost % = %lost | AUROC = auroc | log-loss = log_loss | "
             "P(lost) at lost = p_lost_median | at right = p_right_median | 90 % below = p_right_90 | "
             "of lost above 0.5 % = %told_lost | of these right % = %told_rightly",
-            about="Answers that taught nothing, before calibration: simulated objects by networks that others taught, "
-            "and four real recordings; beside a fit of the filter's own odds alone. P(lost) is a median. Takes: "
+            about="Answers that taught nothing, before calibration: entities and points of simulated objects by "
+            "networks that others taught, and four real recordings; beside a fit of the filter's own odds alone. "
+            "P(lost) is a median. Takes: "
             "`quest generate --split train --no-partnet --procedural 110 --mix broad --level 1 --views 1 --size 480 "
             "--sensor stereo --out runs/takes/teach`, and with `--seeds 111..134 --camera mixed` in place of "
             "`--procedural 110` into `runs/takes/teach_moving`.",

@@ -25,7 +25,7 @@ from quest.model.tensor_file import read_tensors, save_tensors
 
 FORMAT = "quest-doubt-1"
 PACKAGED = Path(str(resources.files("quest") / "assets" / "doubt.safetensors"))
-"""File of the networks that ship."""
+"""File of the network that ships."""
 LIMIT = 4.0
 """Readings are kept within so many of their standard deviations."""
 

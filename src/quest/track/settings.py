@@ -10,7 +10,7 @@ from quest.model.found import Odds
 from quest.untrusted import build, parse_json, reading
 
 REVISION = 16
-"""Grows when the filter gives other answers, so that no monitor is calibrated on streams of before."""
+"""Grows when the filter or the network of losses gives other answers: no monitor is calibrated on those of before."""
 _SIZES_PX = (16, 4096)
 """Smallest and largest side that pictures are brought to."""
 

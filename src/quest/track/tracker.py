@@ -17,7 +17,7 @@ from quest.errors import ConfigError, InputError, WeightsError
 from quest.filter.joints import Joint, JointKind
 from quest.filter.noise import Noise
 from quest.filter.queries import READINGS
-from quest.model.doubt import Doubt, read_doubt
+from quest.model.doubt import read_doubt
 from quest.model.finder import FinderNetwork
 from quest.model.found import Found, find
 from quest.model.weights import load_network
@@ -72,7 +72,6 @@ class Tracker:
         calibrations: of the monitor, by what frames bring; without any there are no alarms.
         noise: parameters of the filter.
         features: dense features, by which the filter finds again what it follows; by default the packaged ones.
-        doubt: weighs the filter's readings, for the log odds of a loss; by default the packaged one.
     """
 
     name = "quest"
@@ -87,7 +86,6 @@ class Tracker:
         calibrations: Mapping[Inputs, Calibration] | None = None,
         noise: Noise | None = None,
         features: XFeat | None = None,
-        doubt: Doubt | None = None,
     ) -> None:
         self.network = network.to(device).eval()
         self.config = config
@@ -96,7 +94,7 @@ class Tracker:
         self.calibrations: dict[Inputs, Calibration] = dict(calibrations or {})
         self.noise = Noise() if noise is None else noise
         self.features = (XFeat.from_package() if features is None else features).to(device)
-        self._doubt = read_doubt(READINGS) if doubt is None else doubt
+        self._doubt = read_doubt(READINGS)
 
     def __repr__(self) -> str:
         weights = "unnamed weights" if self.weights_hash is None else f"weights {self.weights_hash[:8]}"
