@@ -40,7 +40,7 @@ LIFTING_PX = 8.0
 LEAST_S = 0.1
 """What is lost for a shorter time is unclear, seconds."""
 
-FORMAT = 4
+FORMAT = 5
 """Version of the files."""
 
 

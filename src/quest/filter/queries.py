@@ -18,8 +18,8 @@ from quest.filter.surfaces import depth_error
 from quest.filter.view import View, move
 
 READINGS = (
-    "lost", "seen", "rival", "unseen s", "elsewhere", "covered", "own variance", "own found", "told anew", "rides",
-    "rides on world", "own apart", "spread", "margin", "looks", "anchor cosine", "newest cosine", "anchor correlation",
+    "lost", "seen", "rival", "unseen s", "elsewhere", "covered", "own variance", "own found", "rides", "rides on world",
+    "own apart", "spread", "margin", "looks", "anchor cosine", "newest cosine", "anchor correlation",
     "newest correlation", "anchor elsewhere", "tile of own patch", "tile", "turn", "distance", "roll", "went",
     "depth off", "body seen s", "body error", "screw", "off screw", "share",
 )  # fmt: skip

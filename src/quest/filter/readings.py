@@ -75,7 +75,6 @@ def _of_posterior(queries: Queries, weighed: Weighed) -> dict[str, np.ndarray]:
         "covered": weighed.covered,
         "own variance": np.log(queries.own_variance),
         "own found": queries.own_found.astype(np.float64),
-        "told anew": queries.anew.astype(np.float64),
         "rides": weighed.rides.astype(np.float64),
         "rides on world": (weighed.rides & (weighed.body == 0)).astype(np.float64),
         "own apart": np.log1p(np.linalg.norm(queries.own_px - weighed.place_px[each, weighed.body + 1], axis=-1)),

@@ -9,7 +9,7 @@ from quest.errors import ConfigError, WeightsError
 from quest.model.found import Odds
 from quest.untrusted import build, parse_json, reading
 
-REVISION = 16
+REVISION = 17
 """Grows when the filter or the network of losses gives other answers: no monitor is calibrated on those of before."""
 _SIZES_PX = (16, 4096)
 """Smallest and largest side that pictures are brought to."""
