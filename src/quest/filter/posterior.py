@@ -103,8 +103,10 @@ def weigh(
     if layers is not None:
         last_px = np.where(jumps[:, None], judged.rival_px, at_px)
         judged = judged.seen_at(last_px, jumps | (judged.seen_log_odds > 0), layers)
-    judged = replace(judged, anew=queries.anew | (anew & queries.known))
+    ever = queries.anew | (anew & queries.known)
+    judged = replace(judged, anew=ever, named_place=np.where(ever[:, None, None], queries.named_place, judged.place))
     told = read(judged, _weighed(queries, places, log_odds, here, left), likeness, landmarks, view, noise)
+    place = np.where(anew[:, None, None], move_back(landmarks.pose, point), judged.place)
     return replace(
         _viewed(judged, confirmed, at_px, picture),
         readings=np.where((jumps | ~queries.known)[:, None], np.nan, told),
@@ -113,7 +115,8 @@ def weigh(
             jumps, noise.anchor_px**2, np.where(caught, places.ride_px2[each, best], queries.own_variance)
         ),
         own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
-        place=np.where(anew[:, None, None], move_back(landmarks.pose, point), judged.place),
+        place=place,
+        named_place=np.where(ever[:, None, None], judged.named_place, place),
         error=np.where(anew[:, None], ray_error(view, own_px, point[:, 0], noise), queries.error),
         told_along=np.where(anew[:, None], 0.0, judged.told_along),
         along_m=np.where(anew, 0.0, judged.along_m),

@@ -21,7 +21,7 @@ READINGS = (
     "lost", "seen", "rival", "unseen s", "elsewhere", "covered", "own variance", "own found", "rides", "rides on world",
     "own apart", "spread", "margin", "looks", "anchor cosine", "newest cosine", "anchor correlation",
     "newest correlation", "anchor elsewhere", "tile of own patch", "tile", "turn", "distance", "roll", "went",
-    "depth off", "body seen s", "body error", "screw", "off screw", "share",
+    "off named", "depth off", "body seen s", "body error", "screw", "off screw", "share",
 )  # fmt: skip
 """Names of what tells whether a query is lost (:mod:`quest.filter.readings`), in their order."""
 
@@ -46,6 +46,8 @@ class Queries:
     """Whether that patch was found in this frame, with nothing in front of it."""
     place: Float[np.ndarray, "K B 3"]
     """On each body, metres; NaN without depth."""
+    named_place: Float[np.ndarray, "K B 3"]
+    """The same as it was named, however often it was told anew since."""
     error: Float[np.ndarray, "K 3"]
     """Standard deviation of the place, along the ray on which it was seen, metres in the world; NaN without depth."""
     told_along: Float[np.ndarray, "K R"]
@@ -98,6 +100,7 @@ class Queries:
             own_depth=depth_m,
             own_found=np.ones(count, dtype=bool),
             place=place,
+            named_place=place,
             error=error,
             told_along=np.zeros((count, len(ALONG_M))),
             along_m=np.zeros(count),
@@ -130,6 +133,7 @@ class Queries:
         at = np.arange(len(self)) == row
         return replace(
             self,
+            named_place=np.where(at[:, None, None], self.place, self.named_place),
             lost_log_odds=np.where(at, -SURE, self.lost_log_odds),
             unseen_s=np.where(at, 0.0, self.unseen_s),
             rival_log_odds=np.where(at, -SURE, self.rival_log_odds),
@@ -207,9 +211,10 @@ class Queries:
             self,
             seen_place=place,
             seen_share=share,
-            place=np.concatenate([self.place, np.repeat(self.place[:, :1], new, axis=1)], axis=1),
-            camera=np.concatenate([self.camera, np.repeat(self.camera[:, :1], new, axis=1)], axis=1),
-            log_odds=np.concatenate([self.log_odds, np.repeat(self.log_odds[:, :1], new, axis=1)], axis=1),
+            **{
+                name: np.concatenate([on := getattr(self, name), np.repeat(on[:, :1], new, axis=1)], axis=1)
+                for name in ("place", "named_place", "camera", "log_odds")
+            },
         )
 
 

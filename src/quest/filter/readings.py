@@ -103,7 +103,10 @@ def _of_looks(queries: Queries, weighed: Weighed, likeness: Likeness) -> dict[st
 
 
 def _of_side(queries: Queries, weighed: Weighed, landmarks: Landmarks, view: View) -> dict[str, np.ndarray]:
-    """From how far another side it is seen than when it was named: degrees, and the logarithm of the distance."""
+    """From how far another side it is seen than when it was named, degrees and the logarithm of the distance.
+
+    Also how far its body took it, and how far it is from where any body would have taken the place that was named.
+    """
     each, pose = np.arange(len(queries)), landmarks.pose[weighed.body]
     named, now = queries.camera[each, weighed.body], view.cam_from_world @ pose
     rest = queries.place[each, weighed.body]
@@ -114,11 +117,13 @@ def _of_side(queries: Queries, weighed: Weighed, landmarks: Landmarks, view: Vie
         nearer = np.log(far[1] / far[0])
     upright = (named[:, 1, :3] * now[:, 1, :3]).sum(axis=-1)
     went = np.linalg.norm(move(pose, rest) - rest, axis=-1)
+    off = np.linalg.norm(queries.place - queries.named_place, axis=-1).min(axis=1)
     return {
         "turn": turn,
         "distance": nearer,
         "roll": np.degrees(np.arccos(upright.clip(-1, 1))),
         "went": np.log1p(100 * np.nan_to_num(went)),
+        "off named": np.log1p(100 * np.nan_to_num(off)),
     }
 
 
