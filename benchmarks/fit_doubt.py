@@ -112,11 +112,11 @@ class FitDoubt:
             told += [each for clip in found.clips for each in _followed(tracker, clip, found.far_px)]
         teach = [t for t in told if not t.real or t.of in self.teaching]
         doubt = self._fit(teach)
+        about = f"fitted to {len(recorded.records)} simulated streams and {sum(t.real for t in teach)} real ones"
+        save_doubt(doubt, self.out, readings=READINGS, about=about)
         rows = self._figures(teach, [t for t in told if t not in teach], doubt)
         write_report(provenance() | {"by": self._settings(teach), "rows": rows}, self.results)
         print(json.dumps(rows, indent=1))
-        about = f"fitted to {len(recorded.records)} simulated streams and {sum(t.real for t in teach)} real ones"
-        save_doubt(doubt, self.out, readings=READINGS, about=about)
 
     def _points(self, tracker: Tracker, store: TakeStore, names: Sequence[str]) -> list[Told]:
         """What is told of points anywhere, of every second take; of every third of these by depth at half the rate."""

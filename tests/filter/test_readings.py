@@ -65,6 +65,26 @@ def test_what_is_in_front(covered: bool) -> None:
     assert (told["anchor cosine"][-1, 0] < 0.9) == covered
 
 
+@pytest.mark.parametrize("explained", [True, False])
+def test_what_was_found_again_where_a_body_brought_it(explained: bool) -> None:
+    way = np.stack([20 + 4.0 * np.arange(FRAMES), np.full(FRAMES, 40.0)], -1)
+    clip = scene(STILL, Board(way, (50, 40), 1.7, seed=5))
+    stream = make_tracker().stream(clip.camera, [Query.point(0, 45.0, 60.0)])
+    for t in range(FRAMES - 1):
+        stream.step(**vars(clip.frame(t)))
+    state = stream.memory.filter
+    assert state is not None
+    queries = state.queries
+    assert queries.place.shape[1] > 1, "the board is a body"
+    first = queries.place + np.array([0.3, 0.0, 0.0])
+    if explained:
+        first[:, 1] = queries.place[:, 1]
+    stream.memory.filter = replace(state, queries=replace(queries, named_place=first, anew=np.ones(1, dtype=bool)))
+    stream.step(**vars(clip.frame(FRAMES - 1)))
+    off = stream.memory.filter.queries.readings[0, READINGS.index("off named")]
+    assert_allclose(off, 0 if explained else 1, atol=0.01)
+
+
 def test_nothing_is_told_without_depth_or_of_what_somebody_confirms() -> None:
     clip = scene(STILL, depth=False)
     assert np.isnan(readings(clip, Query.point(0, 70.0, 60.0))["lost"]).all()

@@ -54,9 +54,12 @@ def read(
         | _of_side(queries, weighed, landmarks, view)
         | _of_body(queries, weighed, landmarks)
     )
-    off = view.near_depth_at(weighed.at_px) - weighed.depth_m
-    deviations = off / depth_error(weighed.depth_m, noise)
+    error_m = depth_error(weighed.depth_m, noise)
+    deviations = (view.near_depth_at(weighed.at_px) - weighed.depth_m) / error_m
     found["depth off"] = deviations.clip(-_MOST_DEVIATIONS, _MOST_DEVIATIONS)
+    # What was found again may be where some body would have brought the place that was named.
+    off_m = np.linalg.norm(queries.place - queries.named_place, axis=-1).min(axis=1)
+    found["off named"] = 1 - np.exp(-((off_m / error_m) ** 2) / 2)
     return np.nan_to_num(np.stack([found[name] for name in READINGS], axis=1).astype(np.float64))
 
 
@@ -103,10 +106,7 @@ def _of_looks(queries: Queries, weighed: Weighed, likeness: Likeness) -> dict[st
 
 
 def _of_side(queries: Queries, weighed: Weighed, landmarks: Landmarks, view: View) -> dict[str, np.ndarray]:
-    """From how far another side it is seen than when it was named, degrees and the logarithm of the distance.
-
-    Also how far its body took it, and how far it is from where any body would have taken the place that was named.
-    """
+    """From how far another side it is seen than when it was named: degrees, and the logarithm of the distance."""
     each, pose = np.arange(len(queries)), landmarks.pose[weighed.body]
     named, now = queries.camera[each, weighed.body], view.cam_from_world @ pose
     rest = queries.place[each, weighed.body]
@@ -117,13 +117,11 @@ def _of_side(queries: Queries, weighed: Weighed, landmarks: Landmarks, view: Vie
         nearer = np.log(far[1] / far[0])
     upright = (named[:, 1, :3] * now[:, 1, :3]).sum(axis=-1)
     went = np.linalg.norm(move(pose, rest) - rest, axis=-1)
-    off = np.linalg.norm(queries.place - queries.named_place, axis=-1).min(axis=1)
     return {
         "turn": turn,
         "distance": nearer,
         "roll": np.degrees(np.arccos(upright.clip(-1, 1))),
         "went": np.log1p(100 * np.nan_to_num(went)),
-        "off named": np.log1p(100 * np.nan_to_num(off)),
     }
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 from quest.errors import InputError
 from quest.untrusted import reading
 
-FORMAT = "quest-stream-21"
+FORMAT = "quest-stream-22"
 _KEY = "quest-stream"
 _T = TypeVar("_T")
 
