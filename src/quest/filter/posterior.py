@@ -85,9 +85,9 @@ def weigh(
     here = np.where(rides, best + 1, 0)
     at_px = places.uv_px[each, here]
     judged, left = _judged(queries, places, here, layers, likeness, dt_s, noise)
-    ahead_m, measured_m = places.depth_m[each, best], np.where(rides, view.near_depth_at(at_px), np.nan)
-    # Both against being there and occluded.
-    seen, elsewhere = places.looks[each, here] - np.log(_HALF), left - np.log(_HALF)
+    ahead_m, ride_px2 = places.depth_m[each, best], places.ride_px2[each, best]
+    measured_m = np.where(rides, view.near_depth_at(at_px), np.nan)
+    seen, elsewhere = places.looks[each, here] - np.log(_HALF), left - np.log(_HALF)  # against being there occluded
     judged = judged.deeper(best, ahead_m, measured_m, seen, elsewhere, new, landmarks.pose, view, noise)
 
     jumps = judged.rival_log_odds > 0
@@ -103,20 +103,17 @@ def weigh(
     if layers is not None:
         last_px = np.where(jumps[:, None], judged.rival_px, at_px)
         judged = judged.seen_at(last_px, jumps | (judged.seen_log_odds > 0), layers)
-    ever = queries.anew | (anew & queries.known)
-    judged = replace(judged, anew=ever, named_place=np.where(ever[:, None, None], queries.named_place, judged.place))
+    judged = replace(judged, anew=queries.anew | (anew & queries.known))
     told = read(judged, _weighed(queries, places, log_odds, here, left), likeness, landmarks, view, noise)
     place = np.where(anew[:, None, None], move_back(landmarks.pose, point), judged.place)
     return replace(
         _viewed(judged, confirmed, at_px, picture),
         readings=np.where((jumps | ~queries.known)[:, None], np.nan, told),
         own_px=own_px,
-        own_variance=np.where(
-            jumps, noise.anchor_px**2, np.where(caught, places.ride_px2[each, best], queries.own_variance)
-        ),
-        own_depth=np.where(jumps, depth_m, np.where(caught, places.depth_m[each, best], queries.own_depth)),
+        own_variance=np.where(jumps, noise.anchor_px**2, np.where(caught, ride_px2, queries.own_variance)),
+        own_depth=np.where(jumps, depth_m, np.where(caught, ahead_m, queries.own_depth)),
         place=place,
-        named_place=np.where(ever[:, None, None], judged.named_place, place),
+        named_place=np.where(judged.anew[:, None, None], queries.named_place, place),
         error=np.where(anew[:, None], ray_error(view, own_px, point[:, 0], noise), queries.error),
         told_along=np.where(anew[:, None], 0.0, judged.told_along),
         along_m=np.where(anew, 0.0, judged.along_m),

@@ -59,7 +59,7 @@ def read(
     found["depth off"] = deviations.clip(-_MOST_DEVIATIONS, _MOST_DEVIATIONS)
     # What was found again may be where some body would have brought the place that was named.
     off_m = np.linalg.norm(queries.place - queries.named_place, axis=-1).min(axis=1)
-    found["off named"] = 1 - np.exp(-((off_m / error_m) ** 2) / 2)
+    found["off named"] = np.where(queries.anew, 1 - np.exp(-((off_m / error_m) ** 2) / 2), 0.0)
     return np.nan_to_num(np.stack([found[name] for name in READINGS], axis=1).astype(np.float64))
 
 
